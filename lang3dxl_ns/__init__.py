@@ -1,0 +1,1 @@
+"""Language in large 3D scenes: Lang3D-XL as a nerfstudio plugin."""

@@ -1,0 +1,92 @@
+"""The `lang3dxl` command: everything that is not training, rendering or viewing (those are ns-* commands)."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
+from lang3dxl_ns.preparation.prepare import PreparationConfig
+
+
+@dataclass(kw_only=True)
+class Prepare(PreparationConfig):
+    """Make the targets that training learns from: CLIP features of crops in physical scale, dense features.
+
+    `ns-train lang3dxl` does this by itself where it is missing; this command does it ahead of time. It can
+    be stopped and started again at any moment.
+    """
+
+    data: Path
+    """Folder with images/ and sparse/0/."""
+    cache_dir: Path | None = None
+    """Where to keep the targets (default: lang3dxl_cache inside the data folder)."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.datamanager import Lang3DXLDataManagerConfig
+        from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
+        from lang3dxl_ns.methods import DEVICE
+
+        settings = {f.name: getattr(self, f.name) for f in fields(PreparationConfig)}
+        config = Lang3DXLDataManagerConfig(
+            dataparser=PhotoCollectionDataParserConfig(data=self.data),
+            data=self.data,
+            cache_dir=self.cache_dir,
+            **settings,
+        )
+        datamanager = config.setup(device=DEVICE, test_mode="test")
+        if datamanager.targets is not None:
+            print(f"Targets of {len(datamanager.targets)} photos are in {datamanager.cache_dir}")
+
+
+@dataclass
+class BenchmarkTraining:
+    """Train with and without semantics, evaluate on held-out photos, and time every part of a step."""
+
+    data: Path
+    """Folder with images/ and sparse/0/."""
+    out: Path
+    """Folder for training.md and training.json."""
+    clip: str = "openai/clip-vit-base-patch32"
+    """CLIP: a Hugging Face name or directory."""
+    dense: str = "facebook/dinov2-small"
+    """Dense encoder: a Hugging Face name or directory, or none."""
+    iterations: int = 1_000
+    """Iterations of each run."""
+    scale: float = 0.25
+    """Size of the training photos against those on disk."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.training_benchmark import benchmark_training
+
+        benchmark_training(self.data, self.out, self.clip, self.dense, self.iterations, self.scale)
+
+
+Benchmark = (
+    Annotated[RasterizerBenchmark, tyro.conf.subcommand("rasterizer")]
+    | Annotated[BenchmarkTraining, tyro.conf.subcommand("training")]
+)
+Command = (
+    Annotated[Prepare, tyro.conf.subcommand("prepare")]
+    | Annotated[
+        Benchmark,
+        tyro.conf.subcommand("benchmark", description="Measure: time, memory and error, side by side."),
+    ]
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the `lang3dxl` command."""
+    try:
+        tyro.cli(Command, args=arguments, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)).main()
+    except UserError as error:
+        sys.exit(f"Error: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,323 @@
+"""Hands the trainer one photo at a time with its targets, out of core.
+
+Photos come through a bounded cache with read-ahead, targets straight from the memory-mapped store.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import (
+    FullImageDatamanager,
+    FullImageDatamanagerConfig,
+)
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.collection import prepare_collection
+from lang3dxl_ns.preparation.photo import Photo, scaled_size
+from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, points_in_view
+from lang3dxl_ns.preparation.prepare import PreparationConfig, TargetReader
+from lang3dxl_ns.timing import part
+
+
+@dataclass
+class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
+    """Photos and their targets. `--pipeline.datamanager.clip none` trains colours only."""
+
+    _target: type = field(default_factory=lambda: Lang3DXLDataManager)
+    cache_dir: Path | None = None
+    """Where prepared targets are kept (default: lang3dxl_cache inside the data folder)."""
+    photo_cache_gb: float = 4.0
+    """Memory for decoded photos, in gigabytes; the least recently used ones make room."""
+    read_ahead: int = 4
+    """Photos decoded ahead of the training step."""
+
+
+class PhotoDataset(InputDataset):
+    """nerfstudio's dataset over `Photo`s: read, undistorted and resized on demand, pinhole cameras."""
+
+    def __init__(self, outputs: DataparserOutputs, scale: float):
+        super().__init__(outputs)
+        self.scale = scale
+        self.photos: list[Photo] = outputs.metadata["photos"]
+        self.cameras = pinhole_cameras(self.photos, outputs.cameras, scale)
+
+    def read(self, index: int) -> dict[str, Tensor]:
+        """`image` [h, w, 3] uint8 and, where the photo has one, `mask` [h, w, 1] bool."""
+        photo = self.photos[index]
+        data = {"image": photo.read_uint8(self.scale)}
+        mask = photo.read_mask(self.scale)
+        if mask is not None:
+            data["mask"] = mask[..., None]
+        return data
+
+    def get_data(self, image_idx: int, image_type: str = "float32") -> dict:
+        data = self.read(image_idx)
+        if image_type == "float32":
+            data["image"] = data["image"].float() / 255
+        return {"image_idx": image_idx, **data}
+
+    def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
+        return self.photos[image_idx].read(self.scale)
+
+
+class PhotoCache:
+    """Keeps decoded photos up to a number of bytes and reads ahead in a thread."""
+
+    def __init__(self, read: Callable[[int], dict[str, Tensor]], max_bytes: float):
+        self._read = read
+        self._max_bytes = max_bytes
+        self._entries: OrderedDict[int, Future[dict[str, Tensor]]] = OrderedDict()
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photo-reader")
+
+    def get(self, index: int, upcoming: list[int]) -> dict[str, Tensor]:
+        """The photo at `index`; starts reading the `upcoming` ones."""
+        for i in (index, *upcoming):
+            if i not in self._entries:
+                self._entries[i] = self._pool.submit(self._read, i)
+            self._entries.move_to_end(i)
+        data = self._entries[index].result()
+        self._make_room(keep={index, *upcoming})
+        return dict(data)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the photos that are decoded."""
+        done = [f.result() for f in self._entries.values() if f.done() and not f.exception()]
+        return sum(t.numel() * t.element_size() for data in done for t in data.values())
+
+    def _make_room(self, keep: set[int]) -> None:
+        excess = self.bytes - self._max_bytes
+        for i in [i for i in self._entries if i not in keep]:
+            if excess <= 0:
+                return
+            future = self._entries.pop(i)
+            if not future.cancel():
+                excess -= sum(t.numel() * t.element_size() for t in future.result().values())
+
+
+class Lang3DXLDataManager(FullImageDatamanager):
+    """One photo a step: camera, image, mask, and the targets of the semantic losses."""
+
+    config: Lang3DXLDataManagerConfig
+    train_dataset: PhotoDataset
+    eval_dataset: PhotoDataset
+
+    def __init__(self, *args, **kwargs):
+        self._left_out: set[int] = set()
+        super().__init__(*args, **kwargs)
+
+    def create_train_dataset(self) -> PhotoDataset:
+        return self._dataset(self.train_dataparser_outputs)
+
+    def create_eval_dataset(self) -> PhotoDataset:
+        return self._dataset(self.dataparser.get_dataparser_outputs(split=self.test_split))
+
+    def _dataset(self, outputs: DataparserOutputs) -> PhotoDataset:
+        if "photos" not in outputs.metadata:  # one of nerfstudio's own dataparsers
+            outputs.metadata["photos"] = photos_of(outputs, Path(self.config.dataparser.data))
+        return PhotoDataset(outputs, self.config.camera_res_scale_factor)
+
+    def setup_train(self) -> None:
+        """Before training, prepare what is missing and tell the model what there is to learn."""
+        if self.test_mode == "val" and self.targets is not None:
+            names = [photo.name for photo in self.train_dataset.photos]
+            self.train_dataset.metadata["feature_statistics"] = self.targets.feature_statistics(names)
+
+    @cached_property
+    def targets(self) -> TargetReader | None:
+        """The prepared targets of all photos, or None where only colours are trained. Made on first use,
+        so that the viewer and exports never wait for them."""
+        if self.config.clip == "none":
+            return None
+        return prepare_collection(
+            [*self.train_dataset.photos, *self.eval_dataset.photos],
+            self._reconstruction(),
+            self.config,
+            self.cache_dir,
+            self.device,
+            log=CONSOLE.log,
+        ).reader
+
+    @property
+    def cache_dir(self) -> Path:
+        """Folder of prepared targets."""
+        data = Path(self.config.dataparser.data)
+        return self.config.cache_dir or (data if data.is_dir() else data.parent) / "lang3dxl_cache"
+
+    def _reconstruction(self) -> Reconstruction:
+        """The model in its own units: COLMAP's, or for other dataparsers one made of the seed points."""
+        own = getattr(self.dataparser, "reconstruction", None)
+        if own is not None:
+            return own
+        return reconstruction_of([self.train_dataparser_outputs, self.eval_dataset._dataparser_outputs])
+
+    @cached_property
+    def _train_cache(self) -> PhotoCache:
+        return PhotoCache(self.train_dataset.read, self.config.photo_cache_gb * 1e9)
+
+    def sample_train_cameras(self) -> list[int]:
+        """A new round of all training photos that can be used."""
+        rounds = super().sample_train_cameras()
+        usable = [i for i in rounds if i not in self._left_out]
+        if not usable:
+            raise UserError("none of the training photos can be used: see the reasons above")
+        return usable
+
+    def next_train(self, step: int) -> tuple[Cameras, dict]:
+        """Camera and batch of the next training photo; every photo once before any comes again.
+
+        A photo that turns out to be damaged is left out from then on, with a line in the log.
+        """
+        index = self.train_unseen_cameras.pop(0)
+        if not self.train_unseen_cameras:
+            self.train_unseen_cameras = self.sample_train_cameras()
+        try:
+            with part("data"):
+                data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
+                camera, batch = self._batch(self.train_dataset, index, data)
+        except UserError as reason:
+            CONSOLE.log(f"[yellow]{self.train_dataset.photos[index].name} is left out of training: {reason}")
+            self._left_out.add(index)
+            self.train_unseen_cameras = self.sample_train_cameras()
+            return self.next_train(step)
+        camera.metadata = {"cam_idx": index}
+        return camera, batch
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
+        """Camera and batch of a held-out photo, in turn."""
+        index = self.eval_unseen_cameras.pop(0)
+        if not self.eval_unseen_cameras:
+            self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
+        return self._batch(self.eval_dataset, index, self.eval_dataset.read(index))
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> EvalPhotos:
+        """All held-out photos, read one at a time."""
+        return EvalPhotos(self)
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of a typical photo, for nerfstudio's speed display."""
+        return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
+
+    def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Tensor]) -> tuple[Cameras, dict]:
+        """Everything a step needs of one photo:
+
+        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, `name`, and with semantics `clip_target`
+        [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D].
+        """
+        photo = dataset.photos[index]
+        batch = {key: value.to(self.device) for key, value in data.items()}
+        batch |= {"image_idx": index, "name": photo.name}
+        if self.targets is not None:
+            clip, dense = self.targets.clip(photo.name), self.targets.dense(photo.name)
+            batch["clip_target"] = clip.features.to(self.device).float()
+            batch["crop_sides"] = clip.crop_fractions
+            if dense is not None:
+                batch["dense_target"] = dense.to(self.device).float()
+        return dataset.cameras[index : index + 1].to(self.device), batch
+
+
+class EvalPhotos:
+    """The held-out photos as (camera, batch) pairs; holds one photo at a time."""
+
+    def __init__(self, datamanager: Lang3DXLDataManager):
+        self._datamanager = datamanager
+
+    def __len__(self) -> int:
+        return len(self._datamanager.eval_dataset)
+
+    def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
+        dataset = self._datamanager.eval_dataset
+        for index in range(len(dataset)):
+            yield self._datamanager._batch(dataset, index, dataset.read(index))
+
+
+def pinhole_cameras(photos: list[Photo], posed: Cameras, scale: float) -> Cameras:
+    """Cameras of the photos as they are read at `scale`: exact intrinsics for the rounded sizes."""
+    sizes = torch.tensor([scaled_size(p.width, p.height, scale) for p in photos])
+    full = torch.tensor([[p.width, p.height] for p in photos], dtype=torch.float64)
+    zoom = sizes / full
+    return Cameras(
+        camera_to_worlds=posed.camera_to_worlds,
+        fx=(torch.tensor([p.fx for p in photos]) * zoom[:, 0]).float(),
+        fy=(torch.tensor([p.fy for p in photos]) * zoom[:, 1]).float(),
+        cx=(torch.tensor([p.cx for p in photos]) * zoom[:, 0]).float(),
+        cy=(torch.tensor([p.cy for p in photos]) * zoom[:, 1]).float(),
+        width=sizes[:, 0],
+        height=sizes[:, 1],
+    )
+
+
+def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
+    """`Photo`s for the outputs of any of nerfstudio's dataparsers (perspective cameras)."""
+    cameras, folder = outputs.cameras, data if data.is_dir() else data.parent
+    photos = []
+    for i, path in enumerate(outputs.image_filenames):
+        k1, k2, k3, _, p1, p2 = (
+            cameras.distortion_params[i].tolist() if cameras.distortion_params is not None else [0.0] * 6
+        )
+        photos.append(
+            Photo(
+                name=path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name,
+                path=path,
+                mask_path=outputs.mask_filenames[i] if outputs.mask_filenames else None,
+                width=int(cameras.width[i]),
+                height=int(cameras.height[i]),
+                fx=float(cameras.fx[i]),
+                fy=float(cameras.fy[i]),
+                cx=float(cameras.cx[i]),
+                cy=float(cameras.cy[i]),
+                distortion=(k1, k2, p1, p2, k3) if any((k1, k2, k3, p1, p2)) else (),
+            )
+        )
+    return photos
+
+
+def reconstruction_of(splits: list[DataparserOutputs]) -> Reconstruction:
+    """A reconstruction in the scene's original units made of cameras and seed points, for scenes that
+    come without tracks: a photo's points are the seed points that project into it."""
+    metadata = splits[0].metadata
+    scale = splits[0].dataparser_scale
+    points = (
+        metadata["points3D_xyz"].double().numpy() / scale if "points3D_xyz" in metadata else np.zeros((0, 3))
+    )
+    photos = {}
+    for outputs in splits:
+        for photo, pose in zip(outputs.metadata["photos"], outputs.cameras.camera_to_worlds, strict=True):
+            geometry = _geometry(photo, pose.double().numpy(), scale)
+            photos[photo.name] = replace(geometry, points=points_in_view(points, geometry))
+    colours = metadata["points3D_rgb"].numpy() if len(points) else np.zeros((0, 3))
+    return Reconstruction(photos=dict(sorted(photos.items())), points=points, colours=colours)
+
+
+def _geometry(photo: Photo, world_from_camera: np.ndarray, scale: float) -> PhotoGeometry:
+    rotation = (world_from_camera[:, :3] * [1, -1, -1]).T  # OpenGL camera axes to OpenCV's, inverted
+    camera_from_world = np.hstack([rotation, -rotation @ world_from_camera[:, 3:] / scale])
+    return PhotoGeometry(
+        name=photo.name,
+        width=photo.width,
+        height=photo.height,
+        fx=photo.fx,
+        fy=photo.fy,
+        cx=photo.cx,
+        cy=photo.cy,
+        distortion=photo.distortion,
+        fisheye=False,
+        camera_from_world=camera_from_world,
+        points=np.zeros((0, 3)),
+        pixels=np.zeros((0, 2)),
+    )

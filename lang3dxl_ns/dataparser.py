@@ -1,0 +1,151 @@
+"""Photo collections with a COLMAP model: a camera for every photo, masks, and the original scale kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.photo import Photo
+from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, read_reconstruction
+
+MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
+IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+
+
+@dataclass
+class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
+    """A folder with images/ and a COLMAP model, and perhaps masks/."""
+
+    _target: type = field(default_factory=lambda: PhotoCollectionDataParser)
+    colmap_path: Path = Path("sparse/0")
+    """COLMAP model, relative to the data folder; sparse, colmap/sparse/0 and dense/sparse are tried too."""
+    images_path: Path = Path("images")
+    """Photos, relative to the data folder; dense/images is tried too."""
+    masks_path: Path | None = Path("masks")
+    """Foreground masks, white = keep, named like the photos (.png or .jpg); a photo without one is used
+    whole."""
+    downscale_factor: int | None = 1
+    """Left at 1: photos are resized as they are read (--pipeline.datamanager.camera-res-scale-factor)."""
+
+
+@dataclass
+class PhotoCollectionDataParser(ColmapDataParser):
+    """Reads any COLMAP model, lens and size per photo. Photos are undistorted as they are read
+    (`Photo.read`), so every camera handed on is a pinhole."""
+
+    config: PhotoCollectionDataParserConfig
+
+    def __init__(self, config: PhotoCollectionDataParserConfig):
+        super().__init__(config)
+        self.reconstruction: Reconstruction | None = None
+        self.photos: dict[Path, Photo] = {}
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
+        data = self.config.data = Path(self.config.data).expanduser().absolute()
+        if not data.is_dir():
+            raise UserError(
+                f"{data} is not a folder: pass the folder that holds images/ and sparse/0 as --data"
+            )
+        self.config.colmap_path = _first_folder(data, (self.config.colmap_path, *MODEL_FOLDERS), "*.*")
+        self.config.images_path = _first_folder(data, (self.config.images_path, *IMAGE_FOLDERS), "*")
+        if self.reconstruction is None:
+            self._read_collection()
+        # The parent would demand a mask for every photo; ours are optional and found per photo.
+        masks, self.config.masks_path = self.config.masks_path, None
+        try:
+            outputs = super()._generate_dataparser_outputs(split, **kwargs)
+        finally:
+            self.config.masks_path = masks
+        outputs.metadata["photos"] = [self.photos[path] for path in outputs.image_filenames]
+        return outputs
+
+    def _get_image_indices(self, image_filenames, split):
+        indices = super()._get_image_indices(image_filenames, split)
+        if len(indices) == 0:
+            raise UserError(
+                f"the {split} split of {self.config.data} has no photo (of {len(image_filenames)} in all): "
+                f"add photos, or choose another split with `lang3dxl-colmap --eval-mode …` after the other options"
+            )
+        return indices
+
+    def _get_all_images_and_cameras(self, recon_dir: Path) -> dict:
+        """Frames for the parent, sorted by name (interval splits then do not depend on COLMAP's ids)."""
+        assert self.reconstruction is not None
+        frames = [self._frame(geometry) for geometry in self.reconstruction.photos.values()]
+        applied = np.eye(4)[:3][[0, 2, 1]]
+        applied[2] *= -1
+        return {"frames": frames, "camera_model": "PINHOLE", "applied_transform": applied.tolist()}
+
+    def _frame(self, geometry: PhotoGeometry) -> dict:
+        world_from_camera = np.linalg.inv(np.vstack([geometry.camera_from_world, [0, 0, 0, 1]]))
+        world_from_camera[:3, 1:3] *= -1  # OpenCV axes to OpenGL's
+        world_from_camera = world_from_camera[[0, 2, 1, 3]]  # COLMAP guesses gravity along -y; here z is up
+        world_from_camera[2] *= -1
+        return {
+            "file_path": self._image_path(geometry.name).as_posix(),
+            "transform_matrix": world_from_camera,
+            "camera_model": "PINHOLE",
+            "fl_x": geometry.fx,
+            "fl_y": geometry.fy,
+            "cx": geometry.cx,
+            "cy": geometry.cy,
+            "w": geometry.width,
+            "h": geometry.height,
+        }
+
+    def _image_path(self, name: str) -> Path:
+        return self.config.data / self.config.images_path / name
+
+    def _read_collection(self) -> None:
+        """The model's photos that can be used; says which are left out, and why."""
+        reconstruction = read_reconstruction(self.config.data / self.config.colmap_path)
+        left_out = {}
+        for name, geometry in reconstruction.photos.items():
+            path = self._image_path(name)
+            try:
+                if not path.is_file():
+                    raise UserError(f"there is no {path}")
+                self.photos[path] = Photo.from_geometry(geometry, path, self._mask_path(name))
+            except UserError as reason:
+                left_out[name] = reason
+        if not self.photos:
+            raise UserError(
+                f"none of the model's {len(left_out)} photos can be used; "
+                f"the first: {next(iter(left_out.values()))}. Name the photos' folder with "
+                f"`lang3dxl-colmap --images-path FOLDER` after the other options"
+            )
+        if left_out:
+            CONSOLE.log(f"[yellow]{len(left_out)} photos of the model are left out:[/yellow]")
+            for name, reason in left_out.items():
+                CONSOLE.log(f"  {name}: {reason}")
+        kept = {name: g for name, g in reconstruction.photos.items() if name not in left_out}
+        self.reconstruction = replace(reconstruction, photos=kept)
+
+    def _mask_path(self, name: str) -> Path | None:
+        """The photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""
+        if self.config.masks_path is None:
+            return None
+        mask = self.config.data / self.config.masks_path / name
+        candidates = [mask.with_suffix(suffix) for suffix in IMAGE_SUFFIXES] + [
+            mask.with_name(mask.name + ".png")
+        ]
+        return next((path for path in candidates if path.is_file()), None)
+
+
+def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Path:
+    """The first of the folders (relative to `data`) that exists and holds files; else the first named."""
+    return next((c for c in candidates if any(p.is_file() for p in (data / c).glob(contents))), candidates[0])
+
+
+photo_collection = DataParserSpecification(
+    config=PhotoCollectionDataParserConfig(),
+    description="A folder of photos with a COLMAP model: images/, sparse/0/, perhaps masks/.",
+)

@@ -1,0 +1,80 @@
+"""The methods that `ns-train` offers."""
+
+from __future__ import annotations
+
+import torch
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from lang3dxl_ns.datamanager import Lang3DXLDataManagerConfig
+from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.model import Lang3DXLModelConfig
+from lang3dxl_ns.pipeline import Lang3DXLPipelineConfig
+from lang3dxl_ns.trainer import Lang3DXLTrainerConfig, RunAdamConfig, RunScheduleConfig
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _optimizers() -> dict[str, dict]:
+    """Groups and schedules of the paper, in fractions of the run; rates for short runs beside them."""
+    field_schedule = {"start": 0.1, "warm": 0.05, "end": 0.01, "power": 2.0}
+    return {
+        "means": {
+            "optimizer": RunAdamConfig(lr=1.6e-4),
+            "scheduler": RunScheduleConfig(shape="log-linear", end=0.01),
+        },
+        "features_dc": {
+            "optimizer": RunAdamConfig(lr=2.5e-3),
+            "scheduler": RunScheduleConfig(end=0.1, power=2.0),
+        },
+        "features_rest": {
+            "optimizer": RunAdamConfig(lr=2.5e-3 / 20),
+            "scheduler": RunScheduleConfig(end=0.1, power=2.0),
+        },
+        "opacities": {"optimizer": RunAdamConfig(lr=0.05), "scheduler": None},
+        "scales": {"optimizer": RunAdamConfig(lr=5e-3), "scheduler": None},
+        "quats": {"optimizer": RunAdamConfig(lr=1e-3), "scheduler": None},
+        "codes": {
+            "optimizer": RunAdamConfig(lr=1e-3, short_lr=3e-2),
+            "scheduler": RunScheduleConfig(end=0.05),
+        },
+        "field_encoding": {
+            "optimizer": RunAdamConfig(lr=5e-4, short_lr=1e-2),
+            "scheduler": RunScheduleConfig(**field_schedule),
+        },
+        "field_decoder": {
+            "optimizer": RunAdamConfig(lr=5e-4, short_lr=1e-2, weight_decay=1e-5),
+            "scheduler": RunScheduleConfig(**field_schedule),
+        },
+        "downsampler": {
+            "optimizer": RunAdamConfig(lr=5e-4, short_lr=5e-3, weight_decay=1e-5),
+            "scheduler": RunScheduleConfig(**field_schedule),
+        },
+        "camera_opt": {
+            "optimizer": AdamOptimizerConfig(lr=1e-4, eps=1e-15),
+            "scheduler": RunScheduleConfig(shape="log-linear", end=5e-3),
+        },
+    }
+
+
+lang3dxl = MethodSpecification(
+    config=Lang3DXLTrainerConfig(
+        method_name="lang3dxl",
+        machine=MachineConfig(device_type=DEVICE),
+        # On a CPU a step takes a tenth of a second or more: a run of minutes is the sensible default.
+        max_num_iterations=30_000 if DEVICE == "cuda" else 3_000,
+        steps_per_save=2_000,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=500,
+        steps_per_eval_all_images=0,
+        pipeline=Lang3DXLPipelineConfig(
+            datamanager=Lang3DXLDataManagerConfig(dataparser=PhotoCollectionDataParserConfig()),
+            model=Lang3DXLModelConfig(),
+        ),
+        optimizers=_optimizers(),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
+        vis="viewer",
+    ),
+    description="Lang3D-XL: language in large 3D scenes, from photo collections; on CUDA and on any CPU.",
+)

@@ -1,0 +1,81 @@
+"""From a photo collection to its targets: choose the crop sizes, say why, and prepare."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.photo import Photo
+from lang3dxl_ns.preparation.physical_scale import (
+    Reconstruction,
+    ScaleRange,
+    physical_scales,
+    pixel_sizes,
+    propose_scale_range,
+    relative_scales,
+)
+from lang3dxl_ns.preparation.prepare import PreparationConfig, PreparedTargets, prepare
+from lang3dxl_ns.preparation.store import FeatureStore
+
+
+def prepare_collection(
+    photos: Sequence[Photo],
+    reconstruction: Reconstruction,
+    config: PreparationConfig,
+    cache_dir: Path,
+    device: torch.device | str,
+    log: Callable[[str], None] = print,
+) -> PreparedTargets:
+    """Make the missing targets of the photos in `cache_dir`; crops in the reconstruction's units.
+
+    Physical sizes need points: without any, crops are fractions of the photo's width, and the log says so.
+    """
+    physical = config.scale_mode == "physical" and len(reconstruction.points) > 0
+    if not physical:
+        if config.scale_mode == "physical":
+            log(
+                "the scene has no 3D points: crops are fractions of the photo's width, not sizes in the world"
+            )
+        scales = relative_scales(**_named_range(config.scale_range))
+        log(f"crops of {_listed(scales)} of the photo's width")
+        return prepare(photos, None, config, scales, FeatureStore(cache_dir), device)
+    sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
+    if untracked:
+        log(
+            f"{len(untracked)} photos have no tracked points; their scale is that of the points in their view, "
+            f"or the scene's median: {_some(untracked)}"
+        )
+    chosen = _scale_range(config, reconstruction, sizes)
+    scales = physical_scales(chosen.smallest, chosen.largest)
+    log(f"{chosen.reason}; crop sides: {_listed(scales)} (--pipeline.datamanager.scale-range overrides)")
+    # The reconstruction's sizes are per pixel of the model's photos; a file may be a resized copy.
+    per_file_pixel = {p.name: sizes[p.name] * reconstruction.photos[p.name].width / p.width for p in photos}
+    return prepare(photos, per_file_pixel, config, scales, FeatureStore(cache_dir), device)
+
+
+def _scale_range(
+    config: PreparationConfig, reconstruction: Reconstruction, sizes: dict[str, float]
+) -> ScaleRange:
+    if config.scale_range is None:
+        return propose_scale_range(reconstruction, sizes)
+    smallest, largest = config.scale_range
+    if not 0 < smallest <= largest:
+        raise UserError(
+            f"the scale range {smallest} {largest} is not a range: give the smallest crop first, both above 0"
+        )
+    return ScaleRange(smallest, largest, f"crops of {smallest:.3g}–{largest:.3g} world units, as asked")
+
+
+def _named_range(scale_range: tuple[float, float] | None) -> dict[str, float]:
+    return {} if scale_range is None else {"smallest": scale_range[0], "largest": scale_range[1]}
+
+
+def _listed(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
+def _some(names: Sequence[str], shown: int = 10) -> str:
+    return ", ".join(names[:shown]) + (", …" if len(names) > shown else "")

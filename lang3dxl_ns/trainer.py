@@ -1,0 +1,173 @@
+"""A run that fits its length: schedules in fractions of it, and a resume that ends where it should."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from lang3dxl_ns.components import schedules
+from lang3dxl_ns.errors import UserError
+
+SHORT_RUN = 1_000
+"""Iterations of a run that takes the short-run rates."""
+LONG_RUN = 30_000
+"""Iterations of a run that takes the published rates."""
+
+
+def run_length_weight(iterations: int) -> float:
+    """Where a run lies between the short (0) and the long one (1), on a logarithmic scale."""
+    position = math.log(max(iterations, 1) / SHORT_RUN) / math.log(LONG_RUN / SHORT_RUN)
+    return min(max(position, 0.0), 1.0)
+
+
+@dataclass
+class RunAdamConfig(AdamOptimizerConfig):
+    """Adam whose rate suits the length of the run."""
+
+    eps: float = 1e-15
+    """As in 3D Gaussian splatting: the first gradients of codes and tables are tiny."""
+    short_lr: float | None = None
+    """Rate for runs of up to 1,000 iterations (None: the same as `lr`, which is for 30,000 and more).
+    In between, the two are interpolated on a logarithmic scale."""
+
+    def fit(self, iterations: int) -> None:
+        """Settle `lr` for a run of this many iterations."""
+        if self.short_lr is not None:
+            self.lr = schedules.log_linear(run_length_weight(iterations), self.short_lr, self.lr)
+            self.short_lr = None
+
+    def setup(self, params) -> Optimizer:
+        return torch.optim.Adam(params, lr=self.lr, eps=self.eps, weight_decay=self.weight_decay)
+
+
+@dataclass
+class RunScheduleConfig(SchedulerConfig):
+    """A learning-rate curve in fractions of the run: warm-up (log-linear), then decay."""
+
+    _target: type = field(default_factory=lambda: RunSchedule)
+    start: float = 1.0
+    """Multiple of the rate at the first iteration."""
+    warm: float = 0.0
+    """Fraction of the run until the full rate."""
+    end: float = 1.0
+    """Multiple of the rate at the end."""
+    shape: Literal["cosine", "log-linear"] = "cosine"
+    """How the rate falls after the warm-up."""
+    power: float = 1.0
+    """Cosine only: the fraction is raised to this power first (2 keeps the rate high for longer)."""
+    until: float = 1.0
+    """Fraction of the run at which the end is reached; constant afterwards."""
+    total_steps: int = LONG_RUN
+    """Iterations of the run; set by the trainer."""
+
+
+class RunSchedule(Scheduler):
+    """Makes the scheduler of a `RunScheduleConfig`."""
+
+    config: RunScheduleConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
+        # A plain function: LambdaLR would try to put a callable object's state into the checkpoint.
+        return LambdaLR(optimizer, lambda step: self.multiple(step))
+
+    def multiple(self, step: int) -> float:
+        """Multiple of the rate at an iteration, as a Python float (a NumPy one would end up in the
+        checkpoint, which torch's weights-only loader then refuses)."""
+        c = self.config
+        x = min(step / max(c.total_steps, 1) / c.until, 1.0)
+        if x < c.warm:
+            return schedules.log_linear(x / c.warm, c.start, 1.0)
+        rest = (x - c.warm) / (1.0 - c.warm) if c.warm < 1.0 else 1.0
+        if c.shape == "log-linear":
+            return schedules.log_linear(rest, 1.0, c.end)
+        return schedules.cosine_decay(rest, 1.0, c.end, c.power)
+
+
+@dataclass
+class Lang3DXLTrainerConfig(TrainerConfig):
+    """Training configuration; `--max-num-iterations` alone rescales every schedule."""
+
+    _target: type = field(default_factory=lambda: Lang3DXLTrainer)
+
+    def set_timestamp(self) -> None:
+        """Called once before the configuration is printed and saved: settle what depends on the run."""
+        super().set_timestamp()
+        self.fit_to_run()
+
+    def fit_to_run(self) -> None:
+        """Settle rates, schedules and presets for this number of iterations; make paths absolute, so
+        that config.yml is complete and can be read from any folder."""
+        iterations = self.max_num_iterations
+        for group in self.optimizers.values():
+            if isinstance(group["optimizer"], RunAdamConfig):
+                group["optimizer"].fit(iterations)
+            if isinstance(group["scheduler"], RunScheduleConfig):
+                group["scheduler"].total_steps = iterations
+        self.pipeline.model.fit_to_run(iterations)
+        self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
+        datamanager = self.pipeline.datamanager
+        datamanager.data = _absolute(datamanager.data or self.data)
+        self.data = datamanager.data
+        self.output_dir = Path(self.output_dir).expanduser().absolute()
+        self.load_dir, self.load_checkpoint = _absolute(self.load_dir), _absolute(self.load_checkpoint)
+
+
+class Lang3DXLTrainer(Trainer):
+    """nerfstudio's trainer with atomic checkpoints, and a resumed run that ends at the asked iteration."""
+
+    config: Lang3DXLTrainerConfig
+
+    def train(self) -> None:
+        """Train up to `max_num_iterations` in all (nerfstudio would add that many to a resumed run)."""
+        total = self.config.max_num_iterations
+        if self._start_step >= total:
+            raise UserError(
+                f"the checkpoint in {self.config.load_dir or self.config.load_checkpoint} already has "
+                f"{self._start_step} iterations and the run was asked for {total}: "
+                f"pass --max-num-iterations with a larger number"
+            )
+        if self._start_step:
+            CONSOLE.log(f"Resuming at iteration {self._start_step} of {total}")
+        self.config.max_num_iterations = total - self._start_step
+        try:
+            super().train()
+        finally:
+            self.config.max_num_iterations = total
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Write the checkpoint beside its folder and move it in: a killed run never leaves half of one."""
+        self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
+        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        partial = self.base_dir / f"{path.name}.partial"
+        torch.save(
+            {
+                "step": step,
+                "pipeline": self.pipeline.state_dict(),
+                "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
+                "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+                "scalers": self.grad_scaler.state_dict(),
+            },
+            partial,
+        )
+        os.replace(partial, path)
+        if self.config.save_only_latest_checkpoint:
+            for other in self.checkpoint_dir.glob("*.ckpt"):
+                if other != path:
+                    other.unlink()
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else Path(path).expanduser().absolute()

@@ -1,0 +1,154 @@
+"""What semantics cost: the same scene trained with and without them, evaluated on held-out photos."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ProcessPoolExecutor
+from copy import deepcopy
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, write_report
+
+PARTS = ("data", "render", "decode", "downsample", "losses", "backward", "optimiser")
+
+
+def benchmark_training(data: Path, out: Path, clip: str, dense: str, iterations: int, scale: float) -> None:
+    """Train twice, with the targets of `clip` and `dense` and with neither, and write out/training.md/.json.
+
+    Each run has a process of its own, so that its peak memory is its own. Runs follow one another: quote
+    the split of a step and the ratios rather than absolute seconds.
+    """
+    results = {}
+    for name, encoder in (("joint", clip), ("rgb only", "none")):
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            results[name] = pool.submit(
+                _train_and_evaluate, data, out, encoder, dense, iterations, scale
+            ).result()
+    write_report(out, "training", _markdown(results, data, iterations, scale), results)
+    print(f"Wrote {out / 'training.md'}")
+
+
+def _train_and_evaluate(
+    data: Path, out: Path, clip: str, dense: str, iterations: int, scale: float
+) -> dict[str, Any]:
+    import resource
+
+    import torch
+
+    from lang3dxl_ns import timing
+    from lang3dxl_ns.methods import lang3dxl
+    from lang3dxl_ns.trainer import Lang3DXLTrainer
+
+    config = deepcopy(lang3dxl.config)
+    config.data = config.pipeline.datamanager.data = data
+    config.output_dir = out / "runs"
+    config.experiment_name = "joint" if clip != "none" else "rgb"
+    config.vis = "tensorboard"
+    config.steps_per_eval_image = 0
+    config.max_num_iterations = iterations
+    config.pipeline.datamanager.clip, config.pipeline.datamanager.dense = clip, dense
+    config.pipeline.datamanager.camera_res_scale_factor = scale
+    config.set_timestamp()
+    config.save_config()
+    torch.manual_seed(config.machine.seed)
+    trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    _time_parts(trainer)
+    start = time.perf_counter()
+    with timing.measure() as seconds:
+        trainer.train()
+    total = time.perf_counter() - start
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    step = median(seconds["step"])
+    # "losses" is visited twice in a step with semantics.
+    split = {name: sum(seconds[name]) / len(seconds["step"]) for name in PARTS if name in seconds}
+    cuda = torch.cuda.is_available()
+    return {
+        "metrics": metrics,
+        "seconds_per_step": step,
+        "split_seconds": split,
+        "training_seconds": total,
+        "peak_memory_mb": torch.cuda.max_memory_allocated() / 2**20
+        if cuda
+        else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "gaussians": trainer.pipeline.model.num_points,
+        "machine": describe_machine(trainer.device),
+    }
+
+
+def _time_parts(trainer: Any) -> None:
+    """Wrap the trainer's own methods, which cannot name their parts themselves."""
+    from lang3dxl_ns.timing import part
+
+    def timed(name, function):
+        def run(*args, **kwargs):
+            with part(name):
+                return function(*args, **kwargs)
+
+        return run
+
+    trainer.train_iteration = timed("step", trainer.train_iteration)
+    trainer.optimizers.optimizer_scaler_step_some = timed(
+        "optimiser", trainer.optimizers.optimizer_scaler_step_some
+    )
+    scaled = trainer.grad_scaler.scale
+
+    class _TimedLoss:
+        def __init__(self, loss):
+            self.loss = loss
+
+        def backward(self):
+            with part("backward"):
+                self.loss.backward()
+
+    trainer.grad_scaler.scale = lambda loss: _TimedLoss(scaled(loss))
+
+
+def _markdown(results: dict[str, dict], data: Path, iterations: int, scale: float) -> str:
+    joint, rgb = results["joint"], results["rgb only"]
+    names = [name for name in joint["metrics"] if name not in ("num_rays_per_sec", "fps")]
+    quality = markdown_table(
+        ["held-out photos", "joint", "rgb only"],
+        [[name, *(_figure(r["metrics"].get(name)) for r in (joint, rgb))] for name in names],
+    )
+    cost = markdown_table(
+        ["", "joint", "rgb only"],
+        [
+            [f"{p} (ms)", *(_figure(_milliseconds(r["split_seconds"].get(p))) for r in (joint, rgb))]
+            for p in PARTS
+        ]
+        + [
+            ["median step (ms)", *(_figure(_milliseconds(r["seconds_per_step"])) for r in (joint, rgb))],
+            ["whole training (s)", *(_figure(r["training_seconds"]) for r in (joint, rgb))],
+            ["peak memory (MB)", *(_figure(r["peak_memory_mb"]) for r in (joint, rgb))],
+            ["Gaussians at the end", *(r["gaussians"] for r in (joint, rgb))],
+        ],
+    )
+    return f"""# Training on `{data.name}`: with and without semantics
+
+`lang3dxl benchmark training`, {iterations} iterations, photos at {scale} of their size.
+{joint["machine"]}
+
+## Quality
+
+{quality}
+
+`*_of_mean` is the same figure for predicting the mean feature of the training photos everywhere.
+
+## Cost of a step
+
+Mean milliseconds by part; the median step beside them.
+
+{cost}
+"""
+
+
+def _milliseconds(seconds: float | None) -> float | None:
+    return None if seconds is None else 1000 * seconds
+
+
+def _figure(value: float | None) -> str | None:
+    return None if value is None else f"{value:.4g}"

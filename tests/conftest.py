@@ -1,0 +1,78 @@
+"""What tests share: small scenes, tiny encoders, and a short training run."""
+
+import os
+from copy import deepcopy
+from pathlib import Path
+
+import pytest
+import torch
+from scenes import write_scene
+from tiny_models import make_tiny_clip, make_tiny_dinov2
+
+# Nothing in a test may reach for a model hub.
+os.environ["HF_HUB_OFFLINE"] = "1"
+torch.set_num_threads(min(torch.get_num_threads(), 2))
+
+
+@pytest.fixture(scope="session")
+def tiny_clip(tmp_path_factory) -> Path:
+    """Directory of a CLIP of random weights."""
+    return make_tiny_clip(tmp_path_factory.mktemp("models") / "clip")
+
+
+@pytest.fixture(scope="session")
+def tiny_dense(tmp_path_factory) -> Path:
+    """Directory of a DINOv2 of random weights."""
+    return make_tiny_dinov2(tmp_path_factory.mktemp("models") / "dinov2")
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory) -> Path:
+    """A collection of twelve photos of mixed sizes with a COLMAP model."""
+    return write_scene(tmp_path_factory.mktemp("scene"), photos=12, points=400, mixed=True)
+
+
+@pytest.fixture
+def train(tiny_clip, tiny_dense, tmp_path):
+    """Trains as `ns-train lang3dxl` does, in this process; returns the trainer."""
+
+    def run(data: Path, iterations: int = 40, output_dir: Path = tmp_path, semantics: bool = True, **changes):
+        """`changes` are set by their dotted path, with __ for each dot."""
+        trainer = make_trainer(data, tiny_clip, tiny_dense, output_dir, iterations, semantics, **changes)
+        trainer.setup()
+        trainer.train()
+        return trainer
+
+    return run
+
+
+def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, **changes):
+    """A trainer of the registered method, configured as the command line would."""
+    from lang3dxl_ns.methods import lang3dxl
+
+    config = deepcopy(lang3dxl.config)
+    config.data = config.pipeline.datamanager.data = data
+    config.output_dir, config.vis, config.max_num_iterations = output_dir, "tensorboard", iterations
+    config.pipeline.datamanager.clip = str(clip) if semantics else "none"
+    config.pipeline.datamanager.dense = str(dense) if semantics else "none"
+    config.viewer.quit_on_train_completion = True
+    for path, value in changes.items():
+        *owners, name = path.split("__")
+        owner = config
+        for part in owners:
+            owner = getattr(owner, part)
+        assert hasattr(owner, name), path
+        setattr(owner, name, value)
+    torch.manual_seed(config.machine.seed)
+    config.set_timestamp()
+    config.save_config()
+    return config.setup(local_rank=0, world_size=1)
+
+
+@pytest.fixture(scope="session")
+def real_scenes() -> Path:
+    """Folder of the two real photo scenes."""
+    folder = os.environ.get("LANG3DXL_REAL_SCENES")
+    if not folder:
+        pytest.skip("set LANG3DXL_REAL_SCENES to the folder that holds sceaux and sceaux_wild")
+    return Path(folder)

@@ -1,0 +1,177 @@
+"""The commands of the README, run as a newcomer types them."""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("commands")
+
+
+def command(*words: object, cwd: Path) -> str:
+    """Run a command to its end; its output."""
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "COLUMNS": "200"}
+    done = subprocess.run(
+        [str(word) for word in words], cwd=cwd, env=environment, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def run(scene, tiny_clip, tiny_dense, folder) -> Path:
+    """A run folder made by ns-train."""
+    command(
+        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 30, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--output-dir", folder / "outputs", "--timestamp", "first"),
+        cwd=folder,
+    )
+    return folder / "outputs" / scene.name / "lang3dxl" / "first"
+
+
+def test_prepare_alone(scene, tiny_clip, tiny_dense, folder):
+    words = ("lang3dxl", "prepare", "--data", scene, "--clip", tiny_clip, "--dense", tiny_dense)
+    words += ("--cache-dir", folder / "cache")
+    assert "preparing 12 photos" in command(*words, cwd=folder)
+    assert "preparing" not in command(*words, cwd=folder)
+
+
+def test_eval(run, folder):
+    command("ns-eval", "--load-config", run / "config.yml", "--output-path", folder / "eval.json", cwd=folder)
+    results = json.loads((folder / "eval.json").read_text())["results"]
+    assert {"psnr", "ssim", "clip_l1", "clip_psnr", "clip_cosine", "psnr_std"} <= set(results)
+
+
+def test_resume(run, scene, tiny_clip, tiny_dense, folder):
+    output = command(
+        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 40, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *(
+            "--output-dir",
+            folder / "outputs",
+            "--timestamp",
+            "second",
+            "--load-dir",
+            run / "nerfstudio_models",
+        ),
+        cwd=folder,
+    )
+    assert "Resuming at iteration 30 of 40" in output
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("interpolate", "--interpolation-steps", "2", "--rendered-output-names", "rgb", "semantics"),
+        ("dataset", "--split", "test", "--rendered-output-names", "rgb", "semantics"),
+    ],
+)
+def test_render(run, folder, words):
+    target = folder / ("video.mp4" if words[0] == "interpolate" else "pictures")
+    command(
+        "ns-render",
+        words[0],
+        "--load-config",
+        run / "config.yml",
+        "--output-path",
+        target,
+        *words[1:],
+        cwd=folder,
+    )
+    assert target.exists()
+
+
+def test_export_splat(run, folder):
+    command(
+        "ns-export",
+        "gaussian-splat",
+        "--load-config",
+        run / "config.yml",
+        "--output-dir",
+        folder / "ply",
+        cwd=folder,
+    )
+    header = (folder / "ply" / "splat.ply").read_bytes()[:2000]
+    assert header.startswith(b"ply")
+    assert b"f_dc_0" in header
+
+
+def test_transforms_json_scenes_train_too(scene, tiny_clip, tiny_dense, folder):
+    """nerfstudio-data, as LERF-OVS and DL3DV scenes come: no tracks, so sizes come from the seed points."""
+    data = transforms_scene(scene, folder / "transforms_scene")
+    output = command(
+        *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 5, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--output-dir", folder / "outputs", "nerfstudio-data"),
+        cwd=folder,
+    )
+    assert "world units" in output
+
+
+def test_transforms_json_without_points_takes_relative_crops(scene, tiny_clip, tiny_dense, folder):
+    data = transforms_scene(scene, folder / "no_points", points=False)
+    output = command(
+        *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 3, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--pipeline.model.random-init", "True", "--pipeline.model.num-random", 200),
+        *("--output-dir", folder / "outputs", "nerfstudio-data"),
+        cwd=folder,
+    )
+    assert "fractions of the photo's width" in output
+
+
+def test_a_mistake_is_one_sentence_without_traceback(folder):
+    done = subprocess.run(
+        [
+            "ns-train",
+            "lang3dxl",
+            "--data",
+            "nowhere",
+            "--vis",
+            "tensorboard",
+            "--output-dir",
+            folder / "outputs",
+        ],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 1
+    assert "nowhere is not a folder" in done.stdout
+    assert "Traceback" not in done.stdout + done.stderr
+
+
+def transforms_scene(scene: Path, target: Path, points: bool = True) -> Path:
+    """The COLMAP scene rewritten as nerfstudio's transforms.json."""
+    import numpy as np
+
+    from lang3dxl_ns.preparation.physical_scale import read_reconstruction
+
+    reconstruction = read_reconstruction(scene / "sparse" / "0")
+    target.mkdir()
+    os.symlink(scene / "images", target / "images")
+    frames = []
+    for g in reconstruction.photos.values():
+        pose = np.linalg.inv(np.vstack([g.camera_from_world, [0, 0, 0, 1]]))
+        pose[:3, 1:3] *= -1
+        intrinsics = {"fl_x": g.fx, "fl_y": g.fy, "cx": g.cx, "cy": g.cy, "w": g.width, "h": g.height}
+        frames.append({"file_path": f"images/{g.name}", "transform_matrix": pose.tolist(), **intrinsics})
+    meta = {"camera_model": "OPENCV", "frames": frames}
+    if points:
+        meta["ply_file_path"] = "points.ply"
+        lines = [f"{x} {y} {z} 128 128 128" for x, y, z in reconstruction.points]
+        header = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n"
+        header += "".join(f"property float {a}\n" for a in "xyz")
+        header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+        (target / "points.ply").write_text(header + "\n".join(lines) + "\n")
+    (target / "transforms.json").write_text(json.dumps(meta))
+    return target

@@ -1,0 +1,141 @@
+"""Training, evaluation and resume through nerfstudio's own trainer."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+
+from lang3dxl_ns.errors import UserError
+
+
+def parameters(trainer) -> dict[str, torch.Tensor]:
+    return {name: p.detach().clone() for name, p in trainer.pipeline.model.named_parameters() if p.numel()}
+
+
+def test_every_parameter_learns_and_the_loss_falls(train, scene):
+    trainer = train(scene, iterations=1)
+    before = parameters(trainer)
+    trainer = train(scene, iterations=60)
+    after = parameters(trainer)
+    still = [name for name in after if torch.equal(before[name], after[name][: len(before[name])])]
+    # Harmonics of degree 1 and up open later; everything else has moved.
+    assert set(still) <= {"gauss_params.features_rest"}
+    assert all(torch.isfinite(value).all() for value in after.values())
+
+
+def test_without_clip_there_is_nothing_semantic(train, scene):
+    model = train(scene, iterations=2, semantics=False).pipeline.model
+    assert "codes" not in model.gauss_params
+    assert model.semantic_field is None and model.downsampler is None
+    assert not (scene / "none").exists()
+
+
+def test_semantics_leave_colours_and_geometry_as_they_are(train, scene):
+    """Joint training moves Gaussians exactly as training of colours alone does."""
+    joint, alone = (parameters(train(scene, iterations=12, semantics=s)) for s in (True, False))
+    for name in ("means", "scales", "quats", "features_dc", "opacities"):
+        torch.testing.assert_close(joint[f"gauss_params.{name}"], alone[f"gauss_params.{name}"])
+
+
+def test_feature_gradient_reaches_geometry_only_on_request(train, scene):
+    plain = parameters(train(scene, iterations=6))
+    coupled = parameters(train(scene, iterations=6, pipeline__model__feature_gradient_to_geometry=True))
+    assert not torch.equal(plain["gauss_params.means"], coupled["gauss_params.means"])
+
+
+def test_two_runs_with_one_seed_agree(train, scene):
+    first, second = (parameters(train(scene, iterations=8)) for _ in range(2))
+    for name in first:
+        assert torch.equal(first[name], second[name]), name
+
+
+def test_densification_carries_the_codes(train, scene):
+    trainer = train(scene, iterations=60, pipeline__model__densify_grad_thresh=1e-7)
+    model = trainer.pipeline.model
+    assert model.num_points > 400
+    assert {len(p) for p in model.gauss_params.values()} == {model.num_points}
+
+
+def test_warm_up_trains_no_code_and_frozen_geometry_does_not_move(train, scene):
+    options = {"pipeline__model__warm_up": 0.5, "pipeline__model__densify_until": 0.0}
+    warm = train(scene, iterations=20, **options)
+    frozen = train(scene, iterations=20, pipeline__model__freeze_geometry_after_warm_up=True, **options)
+    assert not torch.equal(warm.pipeline.model.means, frozen.pipeline.model.means)
+    assert frozen.pipeline.model.codes.requires_grad
+
+
+def test_resume_goes_on_where_the_run_stopped_and_ends_at_the_asked_iteration(train, scene):
+    first = train(scene, iterations=30, pipeline__model__densify_grad_thresh=1e-7)
+    before = parameters(first)
+    resumed = train(scene, iterations=50, load_dir=first.checkpoint_dir)
+    after = parameters(resumed)
+    assert resumed._start_step == 30
+    assert [p.name for p in resumed.checkpoint_dir.iterdir()] == ["step-000000049.ckpt"]
+    for name in ("means", "opacities", "codes", "features_dc"):
+        key = f"gauss_params.{name}"
+        assert before[key].shape[1:] == after[key].shape[1:]
+        assert not torch.equal(before[key], after[key][: len(before[key])])
+
+
+def test_resuming_a_finished_run_says_so(train, scene):
+    first = train(scene, iterations=3)
+    with pytest.raises(UserError, match="max-num-iterations"):
+        train(scene, iterations=3, load_dir=first.checkpoint_dir)
+
+
+def test_evaluation_of_a_checkpoint_gives_what_the_trainer_gave(train, scene):
+    trainer = train(scene, iterations=20)
+    expected = trainer.pipeline.get_average_eval_image_metrics()
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+    metrics = pipeline.get_average_eval_image_metrics(get_std=True)
+    for name in ("psnr", "ssim", "clip_l1", "clip_psnr", "clip_cosine", "clip_l1_of_mean", "dense_l1"):
+        assert metrics[name] == pytest.approx(expected[name], rel=1e-4), name
+    assert "lpips" not in metrics  # no weights offline
+    json.dumps(metrics, allow_nan=False)
+
+
+def test_checkpoint_of_another_clip_is_refused(train, scene, tmp_path):
+    from tiny_models import make_tiny_clip
+
+    first = train(scene, iterations=2)
+    other = make_tiny_clip(tmp_path / "other_clip", dim=48)
+    with pytest.raises(UserError, match="width 64, but the prepared targets have 48"):
+        train(scene, iterations=4, load_dir=first.checkpoint_dir, pipeline__datamanager__clip=str(other))
+
+
+def test_config_is_complete_and_readable_from_any_folder(train, scene, tmp_path, monkeypatch):
+    trainer = train(scene, iterations=2)
+    monkeypatch.chdir(tmp_path)
+    config, pipeline, _, step = eval_setup(Path(trainer.base_dir / "config.yml"), test_mode="inference")
+    assert step == 1
+    assert config.pipeline.model.semantic_field.preset == "short"
+    assert pipeline.model.num_points > 0
+
+
+def test_masked_pixels_have_no_say(train, scene, tmp_path):
+    """Photos that differ only off the mask train the same model."""
+    import shutil
+
+    import numpy as np
+    from PIL import Image
+
+    results = []
+    for paint in (0, 255):
+        folder = tmp_path / f"scene{paint}"
+        shutil.copytree(scene, folder, ignore=shutil.ignore_patterns("lang3dxl_cache"))
+        for path in (folder / "images").iterdir():
+            pixels = np.array(Image.open(path))
+            mask = np.full(pixels.shape[:2], 255, dtype=np.uint8)
+            mask[:, : pixels.shape[1] // 4] = 0
+            pixels[mask == 0] = paint
+            (folder / "masks").mkdir(exist_ok=True)
+            Image.fromarray(pixels).save(path.with_suffix(".png"))
+            path.unlink()
+            path.with_suffix(".png").rename(path)
+            Image.fromarray(mask).save(folder / "masks" / f"{path.stem}.png")
+        # SSIM sees whole images, as published; L1 alone must not.
+        trainer = train(folder, iterations=5, semantics=False, pipeline__model__ssim_lambda=0.0)
+        results.append(parameters(trainer)["gauss_params.features_dc"])
+    torch.testing.assert_close(results[0], results[1])
