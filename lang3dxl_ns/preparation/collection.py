@@ -19,6 +19,7 @@ from lang3dxl_ns.preparation.physical_scale import (
 )
 from lang3dxl_ns.preparation.prepare import PreparationConfig, PreparedTargets, prepare
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.presets import load_preset
 
 
 def prepare_collection(
@@ -59,6 +60,9 @@ def prepare_collection(
 def _scale_range(
     config: PreparationConfig, reconstruction: Reconstruction, sizes: dict[str, float]
 ) -> ScaleRange:
+    if config.scale_preset is not None:
+        smallest, largest = load_preset(config.scale_preset)["scale_range"]
+        return ScaleRange(smallest, largest, f"crops of {smallest}–{largest} world units ({config.scale_preset})")
     if config.scale_range is None:
         return propose_scale_range(reconstruction, sizes)
     smallest, largest = config.scale_range

@@ -1,0 +1,271 @@
+"""Attenuated downsampler: from a decoded feature map to the grid of the CLIP targets.
+
+A CLIP target is a mean over crops of several sizes, so a cell of it knows about a wide neighbourhood. The
+downsampler gives the decoded map the same blur before the two are compared: a fixed kernel with the
+footprint of the crops, times learned per-pixel weights that choose what inside the window counts. It exists
+in training only; queries read the map itself.
+
+Every kernel here is a sum of boxes, hence separable: sum_j A_j X B_jᵀ, where the small matrices A_j and B_j
+carry window, resize and centring along each axis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+KernelName = Literal["pyramid", "footprint", "box"]
+
+# exp(-2 * 30) is far above the smallest float32, so one maximum over the whole map serves every window.
+_LARGEST_BOUND_FOR_ONE_MAXIMUM = 30.0
+_LOG_OF_ZERO = -1e30  # finite, so that a softmax over an empty window has no NaN in its gradient
+_ROUND_OFF = 1e-9  # of a window; less coverage than this is an error of rounding, not a pixel
+
+
+@dataclass
+class DownsamplerConfig:
+    """How a decoded map is brought to the target grid."""
+
+    kernel: KernelName = "pyramid"
+    """Fixed part of the weights. pyramid: nested squares from the smallest crop to the largest, growing by
+    √2, favouring small ones (the published system's kernel). footprint: the exact crops of every scale and
+    the resize of their grids, all with the same weight. box: the cell alone, as the paper's formula reads;
+    much too narrow for targets that are a mean over scales."""
+    hidden: int = 16
+    """Width of the network that predicts the weights; 0 keeps the fixed kernel and builds no network. The
+    published system has 512, which makes the downsampler about thirty times as slow on a CPU as 16."""
+    logit_bound: float | None = 10.0
+    """Logits w become b·tanh(w/b), so that no pixel outweighs another by more than exp(2b). None leaves them
+    free and takes a slower path that is stable for any logits."""
+
+
+class SeparableKernel(NamedTuple):
+    """K[i, k, p, q] = sum_j rows[j, i, p] · columns[j, k, q]; sums to 1 over a window that is all inside."""
+
+    rows: Float[Tensor, "j hd h"]
+    columns: Float[Tensor, "j wd w"]
+
+
+class AttenuatedDownsampler(nn.Module):
+    """Kernel- and attention-weighted mean of a feature map around every cell of a target grid (Lang3D-XL §3).
+
+    out(o) = Σ_i K(o, i) m_i exp(w_i) f_i / Σ_i K(o, i) m_i exp(w_i), with the kernel K centred on the cell,
+    the mask m, and logits w from three 3×3 convolutions over f. What hangs over the edge of the map is left
+    out of both sums. The last convolution starts at zero: training starts from the plain kernel mean.
+    """
+
+    def __init__(
+        self, config: DownsamplerConfig, channels: int, *, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.network = _weight_network(channels, config.hidden, generator) if config.hidden else None
+
+    def forward(
+        self,
+        features: Float[Tensor, "h w c"],
+        grid: tuple[int, int],
+        crop_sides: Sequence[float],
+        mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
+    ) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
+        """Downsampled features, and the share of each window's kernel that lies inside and on the mask.
+
+        grid: (rows, columns) of the target. crop_sides: sides of the crops that the target averages, smallest
+        first, as fractions of the photo's width; the map has the photo's aspect. Where the share is 0 the
+        features are 0 and pass no gradient; elsewhere it serves as the weight of the loss. Features off the
+        mask have no influence at all. Raises ValueError for crop sides that are not positive and ascending.
+        """
+        h, w, _ = features.shape
+        sides = tuple(float(side) for side in crop_sides)
+        kernel = separable_kernel(self.config.kernel, (h, w), grid, sides, features.dtype, features.device)
+        inside = features.new_ones(h, w) if mask is None else mask.to(features.dtype)
+        masked = features if mask is None else features * inside[..., None]
+        share = apply_kernel(kernel, inside[..., None]).squeeze(-1)
+        if self.network is None:
+            return _divide(apply_kernel(kernel, masked), share), share
+        logits = self.logits(masked)
+        bound = self.config.logit_bound
+        one_maximum = bound is not None and bound <= _LARGEST_BOUND_FOR_ONE_MAXIMUM
+        mean = mean_with_one_maximum if one_maximum else mean_with_window_maxima
+        return mean(kernel, features, logits, inside), share
+
+    def logits(self, features: Float[Tensor, "h w c"]) -> Float[Tensor, "h w"]:
+        """Log of the learned weight of every pixel, bounded as configured; zero without a network."""
+        if self.network is None:
+            return features.new_zeros(features.shape[:2])
+        logits = self.network(features.permute(2, 0, 1)[None])[0, 0]
+        bound = self.config.logit_bound
+        return logits if bound is None else bound * torch.tanh(logits / bound)
+
+
+def mean_with_one_maximum(
+    kernel: SeparableKernel,
+    features: Float[Tensor, "h w c"],
+    logits: Float[Tensor, "h w"],
+    mask: Float[Tensor, "h w"],
+) -> Float[Tensor, "hd wd c"]:
+    """Weighted mean of every window, with one shift of the logits for the whole map: for bounded logits."""
+    weights = torch.exp(logits - logits.detach().max()) * mask
+    mass = apply_kernel(kernel, weights[..., None]).squeeze(-1)
+    return _divide(apply_kernel(kernel, features * weights[..., None]), mass)
+
+
+def mean_with_window_maxima(
+    kernel: SeparableKernel,
+    features: Float[Tensor, "h w c"],
+    logits: Float[Tensor, "h w"],
+    mask: Float[Tensor, "h w"],
+) -> Float[Tensor, "hd wd c"]:
+    """Weighted mean of every window, stable for any logits.
+
+    A log-sum-exp composes axis by axis: along y each window keeps a mean and the log of its mass, and those
+    masses are the logits along x and over the kernel's boxes.
+    """
+    (boxes, hd, h), (_, wd, w) = kernel.rows.shape, kernel.columns.shape
+    along_y = _log(kernel.rows).reshape(boxes * hd, h) + (logits + _log(mask)).T[:, None]  # [w, j·hd, h]
+    means = torch.softmax(along_y, dim=-1) @ features.transpose(0, 1)  # [w, j·hd, c]
+    means = means.view(w, boxes, hd, -1).permute(2, 1, 0, 3).reshape(hd, boxes * w, -1)
+    masses = torch.logsumexp(along_y, dim=-1).view(w, boxes, hd).permute(2, 1, 0).reshape(hd, 1, boxes * w)
+    along_x = masses + _log(kernel.columns).transpose(0, 1).reshape(wd, boxes * w)  # [hd, wd, j·w]
+    empty = torch.logsumexp(along_x, dim=-1, keepdim=True) < _LOG_OF_ZERO / 2
+    return torch.where(empty, 0.0, torch.softmax(along_x, dim=-1) @ means)
+
+
+def apply_kernel(kernel: SeparableKernel, values: Float[Tensor, "h w c"]) -> Float[Tensor, "hd wd c"]:
+    """sum_j A_j X B_jᵀ for every channel, by two matrix products in the cheaper order."""
+    (boxes, hd, h), (_, wd, w) = kernel.rows.shape, kernel.columns.shape
+    c = values.shape[-1]
+    if hd * w * (h + wd) <= wd * h * (w + hd):
+        rows = kernel.rows.transpose(0, 1).reshape(hd * boxes, h)
+        partial = (rows @ values.reshape(h, w * c)).view(hd, boxes * w, c)
+        return kernel.columns.transpose(0, 1).reshape(wd, boxes * w) @ partial
+    partial = kernel.columns.reshape(boxes * wd, w) @ values
+    rows = kernel.rows.permute(1, 2, 0).reshape(hd, h * boxes)
+    return (rows @ partial.view(h * boxes, wd * c)).view(hd, wd, c)
+
+
+@lru_cache(maxsize=128)
+@torch.inference_mode(False)  # else a matrix cached by an evaluation could not be used in training
+def separable_kernel(
+    name: KernelName,
+    size: tuple[int, int],
+    grid: tuple[int, int],
+    sides: tuple[float, ...],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> SeparableKernel:
+    """The kernel's matrices for a map of this size, a target grid and crop sides (fractions of the width)."""
+    if not sides or sides[0] <= 0 or list(sides) != sorted(sides):
+        raise ValueError(f"crop_sides must be positive and ascending, smallest first; got {sides}")
+    if name == "footprint":
+        rows, columns = _footprint_rows(size, grid, sides, axis=0), _footprint_rows(size, grid, sides, axis=1)
+        masses = torch.full((len(sides),), 1 / len(sides), dtype=torch.float64)
+    elif name == "pyramid":
+        # The published weights are (2√2)^-j per unit of area; times the area of square j that is √2^-j.
+        count = 1 + math.floor(2 * math.log2(sides[-1] / sides[0]) + 1e-6)
+        squares = [sides[0] * size[1] * math.sqrt(2) ** j for j in range(count)]
+        rows, columns = _nested_rows(size[0], grid[0], squares), _nested_rows(size[1], grid[1], squares)
+        masses = math.sqrt(0.5) ** torch.arange(count, dtype=torch.float64)
+    else:
+        rows, columns = (_nested_rows(a, n, [a / n]) for a, n in zip(size, grid, strict=True))
+        masses = torch.ones(1, dtype=torch.float64)
+    rows = rows * (masses / masses.sum())[:, None, None]
+    return SeparableKernel(rows.to(device, dtype), columns.to(device, dtype))
+
+
+def resize_features_down(features: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
+    """The paper's ablation "w/o AD (LR)": features resized bilinearly to the target grid."""
+    return F.interpolate(features.permute(2, 0, 1)[None], grid, mode="bilinear")[0].permute(1, 2, 0)
+
+
+def upsample_target(target: Float[Tensor, "hd wd c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:
+    """The paper's ablation "w/o AD (HR)": the target resized bilinearly to the features' size."""
+    return F.interpolate(target.permute(2, 0, 1)[None], size, mode="bilinear")[0].permute(1, 2, 0)
+
+
+def _nested_rows(size: int, cells: int, sides: Sequence[float]) -> Float[Tensor, "j n a"]:
+    """Windows of the given sides (pixels) around the centre of every cell of an axis."""
+    centres = (torch.arange(cells, dtype=torch.float64) + 0.5) * (size / cells)
+    return torch.stack([_window_means(size, centres, side) for side in sides])
+
+
+def _footprint_rows(
+    size: tuple[int, int], grid: tuple[int, int], sides: Sequence[float], axis: int
+) -> Float[Tensor, "j n a"]:
+    """Crops of every scale along an axis, their grid resized bilinearly to the target's.
+
+    Crops of one scale overlap by half and are centred in the image as a whole, so their centres differ a
+    little from those of the cells that the resize takes them for. The target has that error, so this has.
+    """
+    length, cells = size[axis], grid[axis]
+    # A map's height is the photo's, scaled and rounded down, so the photo is up to a pixel higher.
+    photo_length = length if axis == 1 else length + 0.5
+    rows = []
+    for index, side in enumerate(side * size[1] for side in sides):
+        shift = side / 2
+        count = cells if index == 0 else max(1, math.floor(photo_length / shift + 1e-6))
+        centres = length / 2 + (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * shift
+        rows.append(_bilinear_rows(count, cells) @ _window_means(length, centres, side))
+    return torch.stack(rows)
+
+
+def _bilinear_rows(source: int, target: int) -> Float[Tensor, "target source"]:
+    """Bilinear resize of an axis, cell centres at (i + 0.5) / n (align_corners=False)."""
+    position = (torch.arange(target, dtype=torch.float64) + 0.5) * (source / target) - 0.5
+    distance = position.clamp(0, source - 1)[:, None] - torch.arange(source, dtype=torch.float64)
+    return (1 - distance.abs()).clamp(min=0)
+
+
+def _window_means(size: int, centres: Float[Tensor, " n"], side: float) -> Float[Tensor, "n a"]:
+    """Weights of an axis' pixels in windows of the given side, as shares of the whole window.
+
+    A pixel counts by the part of it that the window covers, and that part is read at its own middle, between
+    the neighbouring pixels. So whole pixels are plainly averaged, a window narrower than a pixel
+    interpolates, and a ramp keeps its position exactly wherever the window is inside the map.
+    """
+    pixel = torch.arange(size, dtype=torch.float64)
+    start = torch.maximum(centres[:, None] - side / 2, pixel)
+    end = torch.minimum(centres[:, None] + side / 2, pixel + 1)
+    covered = (end - start).clamp(min=0) / side
+    offset = (start + end) / 2 - (pixel + 0.5)
+    weights = covered * (1 - offset.abs())
+    to_next, to_previous = covered * offset.clamp(min=0), covered * (-offset).clamp(min=0)
+    weights[:, 1:] += to_next[:, :-1]
+    weights[:, -1] += to_next[:, -1]
+    weights[:, :-1] += to_previous[:, 1:]
+    weights[:, 0] += to_previous[:, 0]
+    return torch.where(weights > _ROUND_OFF, weights, 0.0)
+
+
+def _weight_network(channels: int, hidden: int, generator: torch.Generator | None) -> nn.Sequential:
+    """Three 3×3 convolutions to one logit; only the given generator is drawn from."""
+    widths = (channels, hidden, hidden, 1)
+    first, second, last = (
+        nn.utils.skip_init(nn.Conv2d, a, b, kernel_size=3, padding=1) for a, b in pairwise(widths)
+    )
+    for layer in (first, second):
+        nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
+    nn.init.zeros_(last.weight)
+    for layer in (first, second, last):
+        nn.init.zeros_(layer.bias)
+    network = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
+    # The map arrives channels last; weights in the same layout halve the time of the convolutions on a CPU.
+    return network.to(memory_format=torch.channels_last)
+
+
+def _divide(total: Float[Tensor, "hd wd c"], mass: Float[Tensor, "hd wd"]) -> Float[Tensor, "hd wd c"]:
+    """total / mass, and 0 without gradient where there is no mass (and so no total)."""
+    return total / torch.where(mass > 0, mass, 1.0)[..., None]
+
+
+def _log(weights: Tensor) -> Tensor:
+    return torch.where(weights > 0, weights.clamp(min=torch.finfo(weights.dtype).tiny).log(), _LOG_OF_ZERO)

@@ -1,0 +1,207 @@
+"""Multi-resolution hash grid in plain torch, for spaces of two to four dimensions.
+
+Every level lays a regular lattice over the unit cube and keeps one feature vector per lattice vertex, in a
+table of bounded size: levels that fit are stored densely, finer ones share entries through a hash. A point
+reads the 2^d vertices of its cell on every level, interpolates linearly, and concatenates the levels (Müller
+et al., Instant Neural Graphics Primitives, 2022).
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+HASH_PRIMES = (1, 2654435761, 805459861, 3674653429)
+INITIAL_RANGE = 1e-4
+COORDINATE_LIMIT = 1024.0
+"""Coordinates are clamped to ± this; there, float32 still resolves a quarter of a cell 1/2048 wide."""
+
+
+class HashGrid(nn.Module):
+    """Trainable features over [0, 1]^d, differentiable in the table and in the coordinates (first order).
+
+    A level of resolution r has r vertices per axis, and [0, 1] spans r - 2 cells, from half a cell inside the
+    lattice on either side: neither 0 nor 1 reads past the table or sits on a vertex. Outside [0, 1] the
+    lattice goes on, onto entries that are already in use (dense levels repeat, hashed levels hash), so any
+    coordinate gives finite features, and has a gradient up to ± 1024, where it is clamped. A NaN coordinate
+    makes its own output row NaN and no other.
+
+    Keep `max_resolution` as low as the task allows: Adam with a vanishing epsilon moves every touched entry
+    equally far, so fine levels, which few samples constrain, grow as loud as coarse ones.
+
+    Args:
+        input_dim: d, 2 to 4.
+        levels: number of resolutions, in geometric progression from `min_resolution` to `max_resolution`.
+        features_per_level: length of an entry.
+        log2_table_size: a level keeps at most 2 to this power entries.
+        generator: source of the uniform ± 1e-4 initial values.
+    """
+
+    def __init__(
+        self,
+        input_dim: int,
+        levels: int,
+        features_per_level: int,
+        log2_table_size: int,
+        min_resolution: int,
+        max_resolution: int,
+        *,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        if not 2 <= input_dim <= len(HASH_PRIMES):
+            raise ValueError(f"input_dim must be 2 to {len(HASH_PRIMES)}, got {input_dim}")
+        if levels < 1 or not 3 <= log2_table_size <= 30 or not 3 <= min_resolution <= max_resolution:
+            raise ValueError(
+                "needs levels ≥ 1, 3 ≤ log2_table_size ≤ 30, 3 ≤ min_resolution ≤ max_resolution; got "
+                f"{levels}, {log2_table_size}, {min_resolution}, {max_resolution}"
+            )
+        self.input_dim, self.levels, self.features_per_level = input_dim, levels, features_per_level
+        self.output_dim = levels * features_per_level
+
+        resolutions = _resolutions(levels, min_resolution, max_resolution)
+        capacity = 2**log2_table_size
+        sizes = [min(_round_up(r**input_dim, 8), capacity) for r in resolutions]
+        self.entries = sum(sizes)
+        self.dense_levels = sum(r**input_dim <= capacity for r in resolutions)
+        self.hash_mask = capacity - 1
+
+        table = torch.empty(self.entries, features_per_level)
+        self.table = nn.Parameter(table.uniform_(-INITIAL_RANGE, INITIAL_RANGE, generator=generator))
+        self.cells: Tensor
+        self.offsets: Tensor
+        self.dense_resolutions: Tensor
+        offsets = [sum(sizes[:level]) for level in range(levels)]
+        self.register_buffer("cells", torch.tensor([r - 2.0 for r in resolutions]), persistent=False)
+        self.register_buffer("offsets", torch.tensor(offsets), persistent=False)
+        dense = torch.tensor(resolutions[: self.dense_levels], dtype=torch.int64)
+        self.register_buffer("dense_resolutions", dense, persistent=False)
+
+    def forward(
+        self, x: Float[Tensor, "n d"], level_weights: Float[Tensor, " levels"] | None = None
+    ) -> Float[Tensor, "n out"]:
+        """Interpolated features of every point; `level_weights` scales each level (see `coarse_to_fine`)."""
+        x = x.to(self.table.dtype).clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT)
+        position = x.detach().T[:, None] * self.cells[:, None] + 0.5
+        lower = position.floor()
+        index = self._vertex_entries(lower.long())
+        return _Interpolate.apply(x, self.table, index, position - lower, self.cells, level_weights)
+
+    def coarse_to_fine(self, fraction: float) -> Float[Tensor, " levels"]:
+        """Level weights that open the coarsest level at fraction 0 and all at 1; the newest one fades in."""
+        opened = 1 + min(max(fraction, 0.0), 1.0) * (self.levels - 1)
+        amount = (opened - torch.arange(self.levels, dtype=torch.float64)).clamp(0, 1)
+        return (0.5 - 0.5 * torch.cos(math.pi * amount)).to(self.table)
+
+    def _vertex_entries(self, lower: Int[Tensor, "d levels n"]) -> Int[Tensor, "corners levels n"]:
+        """Rows of the table that hold the corners of each point's cell; the last axis varies fastest.
+
+        Any integer is a valid vertex, also whatever NaN was converted to.
+        """
+        vertices = torch.stack((lower, lower + 1), 1)
+        dense, hashed = vertices[:, :, : self.dense_levels], vertices[:, :, self.dense_levels :]
+        dense = dense % self.dense_resolutions[:, None]
+        # The mask keeps the low bits, which a product in 64 bits shares with the customary one in 32.
+        keys = [axis * prime & self.hash_mask for axis, prime in zip(hashed, HASH_PRIMES, strict=False)]
+        dense_entry, hashed_entry = dense[0], keys[0]
+        for axis in range(1, self.input_dim):
+            stride = self.dense_resolutions[:, None] ** axis
+            dense_entry = (dense_entry[:, None] + dense[axis] * stride).flatten(0, 1)
+            hashed_entry = (hashed_entry[:, None] ^ keys[axis]).flatten(0, 1)
+        # 32 bits suffice for a row number, and halve the time to sort them in the backward pass.
+        return (torch.cat((dense_entry, hashed_entry), 1) + self.offsets[:, None]).int()
+
+
+def _resolutions(levels: int, lowest: int, highest: int) -> list[int]:
+    growth = (highest / lowest) ** (1 / max(levels - 1, 1))
+    # Rounding first: the finest level must not become highest + 1 by a last bit.
+    return [math.ceil(round(lowest * growth**level, 6)) for level in range(levels)]
+
+
+def _round_up(value: int, multiple: int) -> int:
+    return -(-value // multiple) * multiple
+
+
+class _Interpolate(torch.autograd.Function):
+    """Multilinear interpolation of table rows, all levels at once.
+
+    Written by hand because autograd through `embedding_bag` takes two to three times as long on a CPU. Here
+    the derivative along an axis is the same interpolation with that axis' weights (1 - t, t) replaced by
+    (-s, s), s being the cells to the unit.
+    """
+
+    @staticmethod
+    def forward(ctx, x, table, index, fraction, cells, level_weights):
+        # Points vary fastest in `index` and `fraction`, which suits elementwise work; in bags corners do.
+        rows = _as_bags(index)
+        axis_weights = torch.stack((1 - fraction, fraction), 1)
+        weights = _as_bags(_corner_weights(list(axis_weights), level_weights))
+        ctx.save_for_backward(table, rows, weights, axis_weights, cells, level_weights)
+        features = F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+        return features.view(len(x), len(cells) * table.shape[1])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):
+        table, rows, weights, axis_weights, cells, level_weights = ctx.saved_tensors
+        grad_bags = grad.reshape(-1, table.shape[1])
+        grad_x = grad_table = None
+        if ctx.needs_input_grad[1]:
+            # A GPU adds atomically; one of its threads alone would sum a bag of thousands of samples of one
+            # coarse entry. On a CPU sorting into bags is up to three times faster than adding in place.
+            gather = _table_gradient_added if grad.is_cuda else _table_gradient_sorted
+            grad_table = gather(len(table), rows, weights, grad_bags)
+        if ctx.needs_input_grad[0]:
+            slope = cells[:, None].expand_as(axis_weights[0, 0])
+            derivatives = []
+            for axis in range(len(axis_weights)):
+                factors = list(axis_weights)
+                factors[axis] = torch.stack((-slope, slope))
+                slopes = _as_bags(_corner_weights(factors, level_weights))
+                derivative = F.embedding_bag(rows, table, per_sample_weights=slopes, mode="sum")
+                derivatives.append((derivative * grad_bags).view(grad.shape).sum(1))
+            grad_x = torch.stack(derivatives, 1)
+        return grad_x, grad_table, None, None, None, None
+
+
+def _corner_weights(
+    factors: list[Float[Tensor, "2 levels n"]], level_weights: Float[Tensor, " levels"] | None
+) -> Float[Tensor, "corners levels n"]:
+    """Products of the axes' weights over all corners of a cell, in the order of `_vertex_entries`."""
+    weights = factors[0] if level_weights is None else factors[0] * level_weights[:, None]
+    for factor in factors[1:]:
+        weights = (weights[:, None] * factor).flatten(0, 1)
+    return weights
+
+
+def _as_bags(per_corner: Tensor) -> Tensor:
+    """[corners, levels, n] to contiguous [n · levels, corners]."""
+    return per_corner.permute(2, 1, 0).reshape(-1, per_corner.shape[0])
+
+
+def _table_gradient_sorted(
+    entries: int, rows: Int[Tensor, "b c"], weights: Float[Tensor, "b c"], grad: Float[Tensor, "b f"]
+) -> Float[Tensor, "entries f"]:
+    """Sort the samples by table row; each row's gradient is then one weighted bag of output gradients."""
+    order = rows.flatten().argsort()
+    counts = torch.bincount(rows.flatten(), minlength=entries)
+    return F.embedding_bag(
+        order // rows.shape[1],
+        grad,
+        counts.cumsum(0) - counts,
+        per_sample_weights=weights.flatten().index_select(0, order),
+        mode="sum",
+    )
+
+
+def _table_gradient_added(
+    entries: int, rows: Int[Tensor, "b c"], weights: Float[Tensor, "b c"], grad: Float[Tensor, "b f"]
+) -> Float[Tensor, "entries f"]:
+    """Add each corner's weighted output gradients to the table rows, in an order that is the device's."""
+    total = grad.new_zeros(entries, grad.shape[1])
+    for corner_rows, corner_weights in zip(rows.T, weights.T, strict=True):
+        total.index_add_(0, corner_rows, grad * corner_weights[:, None])
+    return total

@@ -1,0 +1,130 @@
+"""Losses of a training step: pure functions that take their mask and return a scalar.
+
+Every mean is over the mask, not over the image, so that a small building weighs as much as a large one. An
+empty mask gives zero with zero gradient.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from pytorch_msssim import ssim
+from torch import Tensor
+
+_SSIM_WINDOW = 11
+
+
+def rgb_loss(
+    prediction: Float[Tensor, "h w 3"],
+    target: Float[Tensor, "h w 3"],
+    mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
+    ssim_weight: float = 0.5,
+    mask_ssim: bool = False,
+) -> Float[Tensor, ""]:
+    """(1 − w)·L1 + w·(1 − SSIM), colours in [0, 1]; SSIM's window is 11 pixels with σ 1.5.
+
+    L1 is a mean over the mask. SSIM sees the whole images, as in the published system, or with `mask_ssim`
+    both images multiplied by the mask. An image narrower than the window is extended by its border.
+    """
+    colour = _weighted_mean((prediction - target).abs(), mask)
+    if mask is None:
+        return torch.lerp(colour, 1 - _ssim(prediction, target), ssim_weight)
+    if mask_ssim:
+        prediction, target = prediction * mask[..., None], target * mask[..., None]
+    structure = torch.where(mask.any(), 1 - _ssim(prediction, target), 0.0)
+    return torch.lerp(colour, structure, ssim_weight)
+
+
+def clip_loss(
+    prediction: Float[Tensor, "hd wd c"],
+    target: Float[Tensor, "hd wd c"],
+    weight: Bool[Tensor, "hd wd"] | Float[Tensor, "hd wd"] | None = None,
+) -> Float[Tensor, ""]:
+    """Mean absolute difference between downsampled features and the CLIP target, not normalised."""
+    return _weighted_mean((prediction - target).abs(), weight)
+
+
+def dense_loss(
+    prediction: Float[Tensor, "h w d"],
+    target: Float[Tensor, "hd wd d"],
+    weight: Bool[Tensor, "hd wd"] | Float[Tensor, "hd wd"] | None = None,
+    compare_at: Literal["auto", "target"] = "auto",
+) -> Float[Tensor, ""]:
+    """Mean absolute difference between decoded dense features and their target, on one grid.
+
+    compare_at: "target" resizes the prediction to the target's grid, as the published system does. "auto"
+    resizes the target instead, which needs no gradient and so costs a fraction, unless the target has less
+    than half as many cells as the prediction: details that it doesn't show should not be pressed out of the
+    prediction. The resize is bilinear and antialiased: it averages where it shrinks, and keeps positions
+    within a tenth of a cell. The weight belongs to the target and is resized with it.
+    """
+    at_prediction = compare_at == "auto" and prediction.numel() <= 2 * target.numel()
+    rows, columns, _ = (prediction if at_prediction else target).shape
+    grid = (rows, columns)
+    if weight is not None:
+        weight = resize(weight.to(prediction.dtype)[..., None], grid)[..., 0]
+    return _weighted_mean((resize(prediction, grid) - resize(target, grid)).abs(), weight)
+
+
+def region_variance_loss(
+    features: Float[Tensor, "h w c"],
+    labels: Int[Tensor, "h w"],
+    mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """Variance of the features inside each region, summed over channels, averaged over the valid pixels.
+
+    Σ_r Σ_{i∈r} ‖f_i − mean_r‖² / (number of valid pixels). Labels are any integers, negative for no region;
+    a mask counts from 0.5. A region of one pixel adds nothing but its pixel to the mean.
+    """
+    valid = labels >= 0 if mask is None else (labels >= 0) & (mask >= 0.5)
+    features, valid = features.flatten(0, 1), valid.flatten()
+    rough, rest = _region_means(features, torch.where(valid, labels.flatten(), -1))
+    deviations = features - rough - rest
+    squares = deviations.square().sum(dim=-1)
+    return torch.where(valid, squares, 0.0).sum() / valid.sum().clamp(min=1)
+
+
+@torch.no_grad()
+def _region_means(
+    features: Float[Tensor, "n c"], labels: Int[Tensor, " n"]
+) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"]]:
+    """Mean of each pixel's region, as a rounded value and the small rest that the rounding lost.
+
+    Both are needed where features are large beside their spread: subtract one, then the other. They carry no
+    gradient and the loss above loses none: the deviations in a region sum to zero, and so does the gradient
+    that would flow through its mean.
+    """
+    regions, inverse, counts = torch.unique(labels, return_inverse=True, return_counts=True)
+
+    def means(values: Tensor) -> Tensor:
+        sums = values.new_zeros(len(regions), values.shape[1]).index_add_(0, inverse, values)
+        return (sums / counts[:, None])[inverse]
+
+    rough = means(features)
+    return rough, means(features - rough)
+
+
+def _weighted_mean(values: Float[Tensor, "h w c"], weight: Tensor | None) -> Float[Tensor, ""]:
+    if weight is None:
+        return values.mean()
+    weight = weight.to(values.dtype)
+    total = weight.sum() * values.shape[-1]
+    return (values * weight[..., None]).sum() / torch.where(total > 0, total, 1.0)
+
+
+def resize(values: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
+    """Bilinear resize that averages where it shrinks."""
+    if values.shape[:2] == grid:
+        return values
+    planes = values.permute(2, 0, 1)[None]
+    return F.interpolate(planes, grid, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
+
+
+def _ssim(prediction: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    missing = [max(0, _SSIM_WINDOW - side) for side in prediction.shape[:2]]
+    border = (missing[1] // 2, missing[1] - missing[1] // 2, missing[0] // 2, missing[0] - missing[0] // 2)
+    images = [F.pad(image.permute(2, 0, 1)[None], border, mode="replicate") for image in (prediction, target)]
+    return ssim(*images, data_range=1.0, win_size=_SSIM_WINDOW, win_sigma=1.5)

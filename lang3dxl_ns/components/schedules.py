@@ -1,0 +1,49 @@
+"""Learning-rate and loss-weight schedules: pure functions of the step or of x, the run's fraction in [0, 1].
+
+Outside its range a schedule keeps its value at the nearer end. All return Python floats: a NumPy scalar would
+travel into optimiser state and checkpoints, where a safe loader refuses it.
+"""
+
+from __future__ import annotations
+
+import math
+
+
+def log_linear(x: float, start: float, end: float) -> float:
+    """From start to end (both positive), straight on a logarithmic axis."""
+    x = _fraction(x)
+    return math.exp((1 - x) * math.log(start) + x * math.log(end))
+
+
+def exponential_ramp(step: float, start: float, end: float, steps: float) -> float:
+    """From start to end (both positive) over the first `steps` steps, multiplied by one factor per step."""
+    return log_linear(step / steps if steps > 0 else 1.0, start, end)
+
+
+def semantic_ramp(x: float) -> float:
+    """Weight of the semantic losses: 0.1 to 1 over the first half of the run, so that geometry comes first.
+
+    Lang3D-XL's released schedule ramps over 15,000 of 30,000 iterations.
+    """
+    return exponential_ramp(x, 0.1, 1.0, 0.5)
+
+
+def cosine_decay(x: float, peak: float, end: float, power: float = 1.0) -> float:
+    """From peak to end along half a cosine of x^power; a power above 1 stays near the peak for longer."""
+    peak, end = float(peak), float(end)
+    return end + 0.5 * (peak - end) * (1 + math.cos(math.pi * _fraction(x) ** float(power)))
+
+
+def warm_then_cosine(
+    x: float, start: float, peak: float, end: float, warm_fraction: float, power: float = 1.0
+) -> float:
+    """Log-linear from start to peak during the first `warm_fraction` of the run, then a cosine to end."""
+    if x < warm_fraction:
+        return log_linear(x / warm_fraction, start, peak)
+    return cosine_decay(
+        (x - warm_fraction) / (1 - warm_fraction) if warm_fraction < 1 else 0.0, peak, end, power
+    )
+
+
+def _fraction(x: float) -> float:
+    return min(max(float(x), 0.0), 1.0)

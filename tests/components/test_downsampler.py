@@ -1,0 +1,391 @@
+"""Laws of the attenuated downsampler."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from lang3dxl_ns.components.downsampler import (
+    AttenuatedDownsampler,
+    DownsamplerConfig,
+    mean_with_one_maximum,
+    mean_with_window_maxima,
+    resize_features_down,
+    separable_kernel,
+    upsample_target,
+)
+
+KERNELS = ["pyramid", "footprint", "box"]
+CPU = torch.device("cpu")
+# (map, grid, crop sides): plain; map below the grid; one cell; crops wider than the map; same size.
+CASES = [
+    ((11, 9), (6, 5), (0.4, 0.55, 0.8)),
+    ((4, 5), (7, 8), (0.25, 0.5)),
+    ((8, 6), (1, 1), (1.0,)),
+    ((6, 10), (3, 5), (0.4, 1.0, 2.5)),
+    ((7, 7), (7, 7), (2 / 7,)),
+]
+
+
+def seeded(*size, seed=0):
+    return torch.randn(*size, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def downsampler(kernel="pyramid", hidden=0, bound=10.0, channels=4, trained=False):
+    module = AttenuatedDownsampler(
+        DownsamplerConfig(kernel, hidden, bound), channels, generator=torch.Generator().manual_seed(0)
+    ).double()
+    if trained:
+        module.network[-1].weight.data = seeded(*module.network[-1].weight.shape)
+    return module
+
+
+# ------------------------------------------------------------------ reference, by loops over pixels
+
+
+def axis_window(size, centre, side):
+    """Average over [centre ± side/2], pixel piece by pixel piece, each read at its middle."""
+    weights = np.zeros(size)
+    for pixel in range(size):
+        start, end = max(centre - side / 2, pixel), min(centre + side / 2, pixel + 1)
+        if end > start:
+            for p in range(size):
+                hat = np.interp((start + end) / 2, np.arange(size) + 0.5, np.eye(size)[p])
+                weights[p] += (end - start) / side * hat
+    return weights
+
+
+def axis_footprint(size, cells, cell, side, finest):
+    """One cell of a crop grid's axis after the resize of that grid to the finest one."""
+    shift = side / 2
+    count = cells if finest else max(1, math.floor(size / shift + 1e-6))
+    weights = np.zeros(size)
+    for crop in range(count):
+        share = np.interp((cell + 0.5) / cells, (np.arange(count) + 0.5) / count, np.eye(count)[crop])
+        weights += share * axis_window(size, size / 2 + (crop - (count - 1) / 2) * shift, side)
+    return weights
+
+
+def dense_kernel(name, size, grid, sides):
+    """[hd, wd, h, w]"""
+    (h, w), (hd, wd) = size, grid
+    if name == "pyramid":
+        squares = [
+            sides[0] * w * 2 ** (j / 2) for j in range(40) if 2 ** (j / 2) <= sides[-1] / sides[0] + 1e-6
+        ]
+        boxes = [(side, side, (2 * math.sqrt(2)) ** -j * side**2) for j, side in enumerate(squares)]
+    elif name == "footprint":
+        boxes = [(side * w, side * w, 1.0) for side in sides]
+    else:
+        boxes = [(h / hd, w / wd, 1.0)]
+    kernel = np.zeros((hd, wd, h, w))
+    for i, k, (j, (high, wide, mass)) in itertools.product(range(hd), range(wd), enumerate(boxes)):
+        if name == "footprint":
+            y, x = axis_footprint(h, hd, i, high, j == 0), axis_footprint(w, wd, k, wide, j == 0)
+        else:
+            y, x = axis_window(h, (i + 0.5) * h / hd, high), axis_window(w, (k + 0.5) * w / wd, wide)
+        kernel[i, k] += mass * np.outer(y, x)
+    return torch.from_numpy(kernel / sum(mass for _, _, mass in boxes))
+
+
+def reference_mean(kernel, features, logits, mask):
+    weights = torch.where(kernel * mask > 1e-12, (kernel * mask).clamp(min=1e-300).log() + logits, -math.inf)
+    weights = torch.softmax(weights.flatten(2), dim=-1).nan_to_num()
+    return weights @ features.flatten(0, 1)
+
+
+@pytest.mark.parametrize("mean", [mean_with_one_maximum, mean_with_window_maxima])
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize(("size", "grid", "sides"), CASES)
+def test_the_mean_equals_a_loop_over_every_pixel_of_every_window(name, size, grid, sides, mean):
+    features, logits = seeded(*size, 3), 3 * seeded(*size, seed=1)
+    mask = (seeded(*size, seed=2) > 0).double()
+    kernel = separable_kernel(name, size, grid, sides, torch.float64, CPU)
+    expected = reference_mean(dense_kernel(name, size, grid, sides), features, logits, mask)
+    torch.testing.assert_close(mean(kernel, features, logits, mask), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize(("size", "grid", "sides"), CASES)
+def test_the_share_is_the_kernel_weight_on_the_mask(name, size, grid, sides):
+    mask = seeded(*size, seed=2) > 0
+    share = downsampler(name)(seeded(*size, 4), grid, sides, mask)[1]
+    expected = (dense_kernel(name, size, grid, sides) * mask).sum((2, 3))
+    torch.testing.assert_close(share, expected, rtol=0, atol=1e-8)
+    assert float(downsampler(name)(seeded(*size, 4), grid, sides)[1].max()) <= 1 + 1e-12
+
+
+@pytest.mark.parametrize("hidden", [0, 3])
+@pytest.mark.parametrize("bound", [10.0, None])
+@pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.parametrize(("size", "grid", "sides"), CASES)
+def test_a_constant_map_stays_constant_up_to_its_borders_and_under_any_mask(
+    name, size, grid, sides, hidden, bound
+):
+    module = downsampler(name, hidden, bound, trained=hidden > 0)
+    constant = torch.tensor([1.0, -2.0, 30.0, 0.0], dtype=torch.float64)
+    for mask in (None, seeded(*size, seed=2) > 0, seeded(*size, seed=3).sigmoid()):
+        result, share = module(constant.expand(*size, 4), grid, sides, mask)
+        expected = constant.expand(*grid, 4) * (share > 0)[..., None]
+        torch.testing.assert_close(result, expected, rtol=0, atol=1e-10)
+
+
+def ramp_and_error(name, size, grid, sides):
+    """How far each cell's mean of the pixels' positions is from the cell's centre, in parts of the image."""
+    positions = [
+        torch.cartesian_prod(*((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in shape)).view(
+            *shape, 2
+        )
+        for shape in (size, grid)
+    ]
+    result, share = downsampler(name, channels=2)(positions[0], grid, sides)
+    return (result - positions[1]).norm(dim=-1), share > 1 - 1e-9
+
+
+@pytest.mark.parametrize("name", ["pyramid", "box"])
+@pytest.mark.parametrize("rho", [1, 5, 15])
+def test_a_ramp_keeps_its_position_where_the_window_is_inside(name, rho):
+    """Exactly, for any ratio of map to grid. A window that hangs over the edge lacks that part, so its mean
+    lies at the middle of what is left: the crops of the target have nothing but black out there either."""
+    error, inside = ramp_and_error(name, (80, 100), (48, 61), [2 / 61, 2 / 61 * rho])
+    assert inside.sum() > 500
+    assert float(error[inside].max()) < 1e-12
+
+
+@pytest.mark.parametrize("rho", [1, 5, 15])
+def test_footprints_keep_a_ramp_where_crops_tile_the_image(rho):
+    error, inside = ramp_and_error("footprint", (80, 100), (60, 75), [2 / 75, 2 / 75 * rho])
+    assert inside.sum() > 400
+    assert float(error[inside].max()) < 1e-12
+
+
+def test_footprints_repeat_the_displacement_of_crops_that_do_not_tile_the_image():
+    """7 crops, 14 pixels apart, in 100 pixels: the second is centred at 22, its cell at 21.4."""
+    result = downsampler("footprint", channels=2)(seeded(100, 100, 2), (7, 7), [0.28])[0]
+    photo = seeded(100, 100, 2)
+    torch.testing.assert_close(result[3, 1], photo[36:64, 8:36].mean((0, 1)))
+
+
+def test_at_the_border_the_mean_lies_at_the_middle_of_what_the_window_still_covers():
+    x = (torch.arange(100, dtype=torch.float64) + 0.5) / 100
+    ramp = x.expand(80, 100)[..., None]
+    result, _ = downsampler("pyramid", channels=1)(ramp, (48, 60), [0.2])
+    ends = (torch.arange(60, dtype=torch.float64) + 0.5) / 60 + 0.1
+    start, end = (ends - 0.2).clamp(min=0), ends.clamp(max=1)
+    torch.testing.assert_close(result[24, :, 0], (start + end) / 2)
+
+
+def test_the_footprint_kernel_is_the_mean_over_scales_of_resized_grids_of_crop_means():
+    height, width = 96, 120
+    crops = [12, 20, 36]
+    photo = seeded(height, width, 3)
+    sums = torch.zeros(3, 16, 20, dtype=torch.float64)
+    valid = torch.zeros(1, 16, 20, dtype=torch.float64)
+    for crop in crops:
+        shift = crop // 2
+        starts = [
+            [shift - (shift - a % shift) // 2 + i * shift - shift for i in range(a // shift)]
+            for a in (height, width)
+        ]
+        grid = torch.zeros(4, len(starts[0]), len(starts[1]), dtype=torch.float64)
+        for (i, y), (k, x) in itertools.product(enumerate(starts[0]), enumerate(starts[1])):
+            part = photo[max(y, 0) : y + crop, max(x, 0) : x + crop].reshape(-1, 3)
+            grid[:3, i, k], grid[3, i, k] = part.sum(0) / crop**2, len(part) / crop**2
+        grid = F.interpolate(grid[None], (16, 20), mode="bilinear", align_corners=False)[0]
+        sums, valid = sums + grid[:3] / len(crops), valid + grid[3:] / len(crops)
+    result, share = downsampler("footprint", channels=3)(photo, (16, 20), [c / width for c in crops])
+    torch.testing.assert_close(share, valid[0])
+    torch.testing.assert_close(result, (sums / valid).permute(1, 2, 0))
+
+
+def test_the_pyramid_weighs_its_nested_squares_by_the_published_factor():
+    kernel = separable_kernel("pyramid", (99, 99), (1, 1), (16 / 99, 64 / 99), torch.float64, CPU)
+    weight = torch.einsum("jap,jaq->pq", kernel.rows, kernel.columns)
+    centre = 49
+    # Distances on the axis that lie between the half sides 8, 11.3, 16, 22.6, 32 of the five squares.
+    ring = [float(weight[centre, centre + d]) for d in (0, 9, 13, 19, 27)]
+    steps = [a - b for a, b in zip(ring, [*ring[1:], 0.0], strict=True)]
+    np.testing.assert_allclose(np.array(steps) / steps[0], [(2 * math.sqrt(2)) ** -j for j in range(5)])
+
+
+# ------------------------------------------------------------------ logits
+
+
+@pytest.mark.parametrize("scale", ["200", "1e4", "one dominant pixel"])
+@pytest.mark.parametrize("name", KERNELS)
+def test_unbounded_logits_of_any_size_give_the_float64_mean_and_gradient(name, scale):
+    size, grid, sides = CASES[0]
+    logits = {
+        "200": (seeded(*size, seed=1) * 100).round().clamp(-200, 200),
+        "1e4": (seeded(*size, seed=1) * 1e4).clamp(-1e4, 1e4).round(),
+        "one dominant pixel": torch.zeros(size, dtype=torch.float64).index_put(
+            (torch.tensor(5), torch.tensor(4)), torch.tensor(1e4, dtype=torch.float64)
+        ),
+    }[scale]
+    mask = (seeded(*size, seed=2) > -0.5).double()
+    direction = seeded(*grid, 3, seed=4)
+
+    def run(mean, kernel, dtype):
+        inputs = [v.to(dtype).requires_grad_() for v in (seeded(*size, 3), logits)]
+        result = mean(kernel, *inputs, mask.to(dtype))
+        gradients = torch.autograd.grad((result * direction.to(dtype)).sum(), inputs)
+        return [v.double() for v in (result, *gradients)]
+
+    single = separable_kernel(name, size, grid, sides, torch.float32, CPU)
+    actual = run(mean_with_window_maxima, single, torch.float32)
+    expected = run(reference_mean, dense_kernel(name, size, grid, sides), torch.float64)
+    tolerance = 1e-3 if scale == "1e4" else 1e-4  # 1e-3 is the distance of float32 numbers at 1e4
+    for a, b in zip(actual, expected, strict=True):
+        assert a.isfinite().all()
+        torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("mean", [mean_with_one_maximum, mean_with_window_maxima])
+def test_a_shift_of_all_logits_changes_nothing(mean):
+    size, grid, sides = CASES[0]
+    kernel = separable_kernel("pyramid", size, grid, sides, torch.float64, CPU)
+    inputs = seeded(*size, 3), seeded(*size, seed=1), torch.ones(size, dtype=torch.float64)
+    shifted = mean(kernel, inputs[0], inputs[1] + 500, inputs[2])
+    torch.testing.assert_close(mean(kernel, *inputs), shifted, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("bound", [10.0, 60.0, None])
+def test_every_choice_of_bound_gives_the_mean_of_its_own_logits(bound):
+    size, grid, sides = CASES[0]
+    module = downsampler("pyramid", 3, bound, trained=True)
+    features = 20 * seeded(*size, 4)
+    logits = module.logits(features)
+    largest = logits.detach().abs().max()
+    assert largest > 60 if bound is None else largest <= bound
+    ones = torch.ones(size, dtype=torch.float64)
+    expected = reference_mean(dense_kernel("pyramid", size, grid, sides), features, logits, ones)
+    torch.testing.assert_close(module(features, grid, sides)[0], expected, rtol=0, atol=1e-9)
+    single = module.float()(features.float(), grid, sides)[0]
+    torch.testing.assert_close(single.double(), expected, rtol=1e-3, atol=1e-2)
+
+
+@pytest.mark.parametrize("bound", [60.0, None])
+def test_no_window_underflows_in_float32_however_far_its_logits_lie_below_the_others(bound):
+    module = downsampler("pyramid", 3, bound).float()
+    module.network = torch.nn.Conv2d(4, 1, 1, bias=False)
+    module.network.weight.data = torch.tensor([0.0, 1, 0, 0]).view(1, 4, 1, 1)  # channel 1 is the logit
+    features = torch.ones(20, 30, 4)
+    features[:, :15, 1], features[:, 15:, 1] = -200, 200
+    result, _ = module(features, (10, 15), (0.1, 0.2))
+    torch.testing.assert_close(result[..., 0], torch.ones(10, 15))
+
+
+@pytest.mark.parametrize("mean", [mean_with_one_maximum, mean_with_window_maxima])
+@pytest.mark.parametrize("name", KERNELS)
+def test_gradients_agree_with_finite_differences(name, mean):
+    size, grid, sides = (5, 6), (3, 4), (0.5, 0.9)
+    kernel = separable_kernel(name, size, grid, sides, torch.float64, CPU)
+    mask = torch.ones(size, dtype=torch.float64)
+    mask[:, :3] = 0
+    inputs = seeded(*size, 2).requires_grad_(), seeded(*size, seed=1).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f, w: mean(kernel, f, w, mask), inputs)
+
+
+def test_gradients_through_the_network_agree_with_finite_differences():
+    module = downsampler("pyramid", 2, channels=2, trained=True)
+    features = seeded(5, 6, 2).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f: module(f, (3, 4), (0.5, 0.9))[0], (features,))
+
+
+# ------------------------------------------------------------------ masks
+
+
+@pytest.mark.parametrize(("hidden", "bound"), [(0, 10.0), (3, 10.0), (3, None)])
+@pytest.mark.parametrize("name", KERNELS)
+def test_a_window_without_mask_is_zero_with_zero_share_and_zero_gradient(name, hidden, bound):
+    module = downsampler(name, hidden, bound, trained=hidden > 0)
+    features = seeded(12, 20, 4).requires_grad_()
+    mask = torch.zeros(12, 20, dtype=torch.bool)
+    mask[:, 14:] = True
+    result, share = module(features, (6, 10), (0.2, 0.3), mask)
+    assert (share[:, :4] == 0).all()
+    assert (share[:, 8:] > 0).all()
+    assert (result[:, :4] == 0).all()
+    inputs = [features, *module.parameters()]
+    for gradient in torch.autograd.grad(result[:, :4].square().sum() + result[:, :4].sum(), inputs):
+        assert (gradient == 0).all()
+    empty, share = module(features, (6, 10), (0.2, 0.3), torch.zeros_like(mask))
+    assert (empty == 0).all()
+    assert (share == 0).all()
+
+
+@pytest.mark.parametrize(("hidden", "bound"), [(0, 10.0), (3, 10.0), (3, None)])
+def test_features_off_the_mask_have_no_influence(hidden, bound):
+    module = downsampler("pyramid", hidden, bound, trained=hidden > 0)
+    features, mask = seeded(12, 20, 4), seeded(12, 20, seed=1) > 0
+    other = torch.where(mask[..., None], features, 100 * seeded(12, 20, 4, seed=2))
+    results = [module(f, (6, 10), (0.2, 0.4), mask)[0] for f in (features, other)]
+    torch.testing.assert_close(*results)
+
+
+def test_a_soft_mask_weighs_pixels_once():
+    size, grid, sides = CASES[0]
+    soft = seeded(*size, seed=2).sigmoid()
+    plain = downsampler("pyramid", 0)(seeded(*size, 4), grid, sides, soft)
+    for bound in (10.0, None):
+        started = downsampler("pyramid", 3, bound)(seeded(*size, 4), grid, sides, soft)
+        torch.testing.assert_close(started, plain)
+
+
+# ------------------------------------------------------------------ the module
+
+
+def test_without_hidden_width_there_is_nothing_to_train():
+    assert list(downsampler(hidden=0).parameters()) == []
+    assert (downsampler(hidden=0).logits(seeded(3, 3, 4)) == 0).all()
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_training_starts_from_the_plain_kernel_mean_and_can_leave_it(name):
+    features = seeded(12, 20, 4)
+    module = downsampler(name, 3)
+    started, plain = (m(features, (6, 10), (0.2, 0.4))[0] for m in (module, downsampler(name, 0)))
+    torch.testing.assert_close(started, plain)
+    started.square().sum().backward()
+    assert module.network[-1].weight.grad.abs().max() > 0
+
+
+def test_the_generator_alone_decides_the_weights():
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    first, second = downsampler(hidden=3), downsampler(hidden=3)
+    assert torch.equal(torch.get_rng_state(), state)
+    for a, b in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_a_kernel_cached_in_inference_mode_serves_training():
+    features, sides = seeded(13, 17, 4), (0.21,)
+    with torch.inference_mode():
+        downsampler()(features, (6, 10), sides)
+    downsampler()(features.requires_grad_(), (6, 10), sides)[0].sum().backward()
+    assert features.grad.abs().max() > 0
+
+
+def test_the_result_has_the_type_of_the_features():
+    for dtype in (torch.float32, torch.float64):
+        module = downsampler(hidden=3).to(dtype)
+        assert {t.dtype for t in module(seeded(12, 20, 4).to(dtype), (6, 10), (0.2,))} == {dtype}
+
+
+@pytest.mark.parametrize("sides", [(), (0.0, 0.1), (0.4, 0.2)])
+def test_crop_sides_that_are_not_positive_and_ascending_are_refused(sides):
+    with pytest.raises(ValueError, match="smallest first"):
+        downsampler()(seeded(5, 5, 4), (2, 2), sides)
+
+
+def test_the_ablations_resize_to_the_other_grid_and_keep_a_ramp():
+    ramp = ((torch.arange(40, dtype=torch.float64) + 0.5) / 40).expand(30, 40)[..., None]
+    low = resize_features_down(ramp, (15, 16))
+    torch.testing.assert_close(low[3, :, 0], (torch.arange(16, dtype=torch.float64) + 0.5) / 16)
+    high = upsample_target(low, (30, 40))
+    assert high.shape == ramp.shape
+    torch.testing.assert_close(high[:, 2:-2], ramp[:, 2:-2])

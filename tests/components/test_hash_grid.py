@@ -1,0 +1,214 @@
+"""Laws of the hash grid, against a slow reference that visits one vertex at a time."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from lang3dxl_ns.components import hash_grid
+from lang3dxl_ns.components.hash_grid import HashGrid
+
+PRIMES = (1, 2654435761, 805459861, 3674653429)
+
+
+def make_grid(input_dim=3, levels=4, features=2, log2_table_size=7, lowest=4, highest=24, seed=0):
+    """A float64 grid with entries of order one; in any dimension level 0 is dense, the last hashed."""
+    generator = torch.Generator().manual_seed(seed)
+    if input_dim == 4:
+        log2_table_size = 9
+    grid = HashGrid(
+        input_dim, levels, features, log2_table_size, lowest, highest, generator=generator
+    ).double()
+    with torch.no_grad():
+        grid.table.copy_(torch.randn(grid.table.shape, generator=generator, dtype=torch.float64))
+    return grid
+
+
+def make_points(count, dim, low=0.0, high=1.0, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(count, dim, generator=generator, dtype=torch.float64)
+
+
+def reference(grid, x, capacity, resolutions):
+    """Row of features of one point, and its derivative in the coordinates, with loops and Python integers."""
+    dim = len(x)
+    values, slopes, offset = [], [], 0
+    for resolution in resolutions:
+        dense = resolution**dim <= capacity
+        position = [v * (resolution - 2) + 0.5 for v in x]
+        cell = [math.floor(p) for p in position]
+        value, slope = 0.0, [0.0] * dim
+        for corner in itertools.product((0, 1), repeat=dim):
+            vertex = [c + k for c, k in zip(cell, corner, strict=True)]
+            if dense:
+                entry = sum((v % resolution) * resolution**axis for axis, v in enumerate(vertex))
+            else:
+                entry = 0
+                for v, prime in zip(vertex, PRIMES, strict=False):
+                    entry ^= (v * prime) % 2**32
+                entry %= capacity
+            row = grid.table[offset + entry]
+            parts = [p - c if k else 1 - (p - c) for p, c, k in zip(position, cell, corner, strict=True)]
+            value = value + math.prod(parts) * row
+            for axis in range(dim):
+                others = math.prod(parts[:axis] + parts[axis + 1 :])
+                slope[axis] = slope[axis] + (1 if corner[axis] else -1) * (resolution - 2) * others * row
+        values.append(value)
+        slopes.append(torch.stack(slope))
+        offset += min(-(-(resolution**dim) // 8) * 8, capacity)
+    return torch.cat(values), torch.cat(slopes, 1)
+
+
+@pytest.mark.parametrize("dim", [2, 3, 4])
+@pytest.mark.parametrize("spread", [(0.0, 1.0), (-3.0, 3.0)])
+def test_values_and_coordinate_gradients_equal_the_reference(dim, spread):
+    grid = make_grid(dim)
+    resolutions = [4, 8, 14, 24]
+    assert 0 < grid.dense_levels < grid.levels
+    x = make_points(12, dim, *spread).requires_grad_()
+    features = grid(x)
+    expected = [reference(grid, point, grid.hash_mask + 1, resolutions) for point in x.detach().tolist()]
+    torch.testing.assert_close(features, torch.stack([value for value, _ in expected]))
+    for channel in range(grid.output_dim):
+        (gradient,) = torch.autograd.grad(features[:, channel].sum(), x, retain_graph=True)
+        torch.testing.assert_close(gradient, torch.stack([slope[:, channel] for _, slope in expected]))
+
+
+@pytest.mark.parametrize("dim", [2, 3, 4])
+def test_table_gradient_equals_the_reference(dim):
+    grid = make_grid(dim)
+    x, weight = make_points(20, dim), make_points(20, grid.output_dim, seed=2)
+    (grid(x) * weight).sum().backward()
+    actual, grid.table.grad = grid.table.grad, None
+    rows = [reference(grid, point, grid.hash_mask + 1, [4, 8, 14, 24])[0] for point in x.tolist()]
+    (torch.stack(rows) * weight).sum().backward()
+    torch.testing.assert_close(actual, grid.table.grad)
+
+
+@pytest.mark.parametrize("dim", [2, 3, 4])
+def test_gradients_equal_finite_differences(dim):
+    grid = make_grid(dim, levels=3, highest=14)
+    x = make_points(5, dim).requires_grad_()
+    level_weights = torch.tensor([1.0, 0.3, 0.6], dtype=torch.float64)
+
+    def features(x, table):
+        return torch.func.functional_call(grid, {"table": table}, (x, level_weights))
+
+    assert torch.autograd.gradcheck(features, (x, grid.table), eps=1e-7, fast_mode=True)
+
+
+def test_both_ways_to_gather_the_table_gradient_agree():
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randint(50, (300, 8), generator=generator, dtype=torch.int32)
+    weights = torch.rand(300, 8, generator=generator, dtype=torch.float64)
+    grad = torch.rand(300, 4, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(
+        hash_grid._table_gradient_sorted(60, rows, weights, grad),
+        hash_grid._table_gradient_added(60, rows, weights, grad),
+    )
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 0.5, 0.25])
+def test_coordinates_have_a_gradient_at_the_ends_of_the_range_and_on_vertices(value):
+    grid = make_grid(levels=1, lowest=4, highest=4)  # two cells to the unit: 0.25 and 0.75 lie on vertices
+    x = torch.full((1, 3), value, dtype=torch.float64, requires_grad=True)
+    grid(x).sum().backward()
+    assert (x.grad.abs() > 1e-3).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3, 4])
+def test_dense_levels_keep_every_vertex_apart(dim):
+    """Each vertex that [0, 1] touches, both ends included, has an entry of its own; none is left over."""
+    resolution = 5
+    grid = HashGrid(dim, 1, 1, 10, resolution, resolution)
+    corners = torch.tensor(list(itertools.product(range(resolution), repeat=dim)))
+    entries = grid._vertex_entries(corners.T[:, None])[0, 0]
+    assert sorted(entries.tolist()) == list(range(resolution**dim))
+    ends = (torch.tensor([0.0, 1.0]) * grid.cells + 0.5).floor()
+    assert ends[0] >= 0
+    assert ends[1] + 1 <= resolution - 1
+
+
+def test_features_are_continuous_across_cell_borders():
+    grid = make_grid()
+    borders = torch.cat([(torch.arange(12) - 4 + 0.5) / float(cells) for cells in grid.cells]).double()
+    here = make_points(len(borders), 3)
+    here[:, 1] = borders
+    step = torch.tensor([0.0, 1e-9, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(grid(here - step), grid(here + step), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("value", [-5.0, 37.5, 1e30, -1e30, math.inf, -math.inf])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_far_coordinates_give_finite_features_and_gradients(value, dtype):
+    grid = make_grid().to(dtype)
+    x = torch.full((2, 3), value, dtype=dtype)
+    x[1] = 0.3
+    x.requires_grad_()
+    features = grid(x)
+    features.sum().backward()
+    assert features.dtype == dtype
+    assert features.isfinite().all()
+    assert x.grad.isfinite().all()
+    assert grid.table.grad.isfinite().all()
+
+
+def test_nan_stays_in_its_own_row():
+    grid = make_grid()
+    x = make_points(6, 3)
+    clean = grid(x)
+    x[2, 1] = math.nan
+    features = grid(x)
+    keep = torch.arange(6) != 2
+    assert features[2].isnan().all()
+    assert torch.equal(features[keep], clean[keep])
+
+
+def test_no_points_give_no_features_and_no_gradient():
+    grid = make_grid()
+    x = torch.zeros(0, 3, dtype=torch.float64, requires_grad=True)
+    features = grid(x)
+    features.sum().backward()
+    assert features.shape == (0, grid.output_dim)
+    assert not grid.table.grad.any()
+
+
+def test_levels_open_from_coarse_to_fine():
+    grid = make_grid(levels=4)
+    weights = torch.stack([grid.coarse_to_fine(step / 60) for step in range(-5, 70)])
+    assert weights[0].tolist() == [1, 0, 0, 0]
+    assert weights[-1].tolist() == [1, 1, 1, 1]
+    assert (weights[1:] >= weights[:-1]).all()
+    assert (weights[:, 1:] <= weights[:, :-1]).all()
+    assert (weights[1:] - weights[:-1]).max() < 0.1
+
+
+def test_a_closed_level_gives_zeros_and_gets_no_gradient():
+    grid = make_grid(levels=4, features=2)
+    x = make_points(30, 3)
+    features = grid(x, grid.coarse_to_fine(0.5))  # two levels open, the third half way, the fourth closed
+    features.sum().backward()
+    first_of_level = grid.offsets.tolist()
+    full = grid(x)
+    torch.testing.assert_close(features[:, :4], full[:, :4])
+    torch.testing.assert_close(features[:, 4:6], 0.5 * full[:, 4:6])
+    assert not features[:, 6:].any()
+    assert grid.table.grad[first_of_level[2] : first_of_level[3]].any()
+    assert not grid.table.grad[first_of_level[3] :].any()
+
+
+def test_initial_entries_are_small_and_follow_the_generator():
+    first, again = (
+        HashGrid(3, 2, 4, 12, 8, 16, generator=torch.Generator().manual_seed(3)) for _ in range(2)
+    )
+    other = HashGrid(3, 2, 4, 12, 8, 16, generator=torch.Generator().manual_seed(4))
+    assert torch.equal(first.table, again.table)
+    assert not torch.equal(first.table, other.table)
+    assert 0.9e-4 < first.table.abs().max() <= 1e-4
+
+
+@pytest.mark.parametrize("dim", [1, 5])
+def test_other_dimensions_are_refused(dim):
+    with pytest.raises(ValueError, match="input_dim"):
+        HashGrid(dim, 4, 2, 8, 4, 24)

@@ -1,0 +1,236 @@
+"""Laws of the losses."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+from pytorch_msssim import SSIM
+
+from lang3dxl_ns.components.losses import clip_loss, dense_loss, region_variance_loss, rgb_loss
+
+
+def seeded(*size, seed=0, dtype=torch.float64):
+    return torch.rand(*size, dtype=dtype, generator=torch.Generator().manual_seed(seed))
+
+
+def labels_of(*size, count, seed=0):
+    return torch.randint(-1, count, size, generator=torch.Generator().manual_seed(seed))
+
+
+def ssim_by_definition(a, b):
+    """Wang et al. 2004 over all whole windows, in float64."""
+    distance = torch.arange(11, dtype=torch.float64) - 5
+    gauss = torch.exp(-(distance**2) / (2 * 1.5**2))
+    window = torch.outer(gauss, gauss)[None, None] / gauss.sum() ** 2
+
+    def mean(x):
+        return F.conv2d(x.permute(2, 0, 1)[:, None], window)
+
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b, cov = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2, mean(a * b) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    quality = (2 * mean_a * mean_b + c1) * (2 * cov + c2)
+    return (quality / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean()
+
+
+# ------------------------------------------------------------------ colours
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 0.5])
+def test_rgb_loss_is_the_usual_mix_of_l1_and_ssim(weight):
+    a, b = seeded(20, 30, 3), seeded(20, 30, 3, seed=1)
+    l1 = (a - b).abs().mean()
+    by_definition = (1 - weight) * l1 + weight * (1 - ssim_by_definition(a, b))
+    torch.testing.assert_close(rgb_loss(a, b, ssim_weight=weight), by_definition)
+    planes = a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None]
+    usual = (1 - weight) * l1 + weight * (1 - SSIM(data_range=1.0, size_average=True, channel=3)(*planes))
+    torch.testing.assert_close(rgb_loss(a, b, ssim_weight=weight), usual, rtol=1e-5, atol=1e-6)
+
+
+def test_equal_images_have_no_rgb_loss():
+    a = seeded(20, 30, 3)
+    assert rgb_loss(a, a).item() == pytest.approx(0, abs=1e-7)
+
+
+def test_a_full_mask_changes_no_loss():
+    a, b, mask = seeded(20, 30, 3), seeded(20, 30, 3, seed=1), torch.ones(20, 30, dtype=torch.bool)
+    for mask_ssim in (False, True):
+        torch.testing.assert_close(rgb_loss(a, b, mask, mask_ssim=mask_ssim), rgb_loss(a, b))
+
+
+def test_masked_l1_is_the_mean_over_the_mask_however_small_it_is():
+    prediction, target, mask = torch.zeros(20, 30, 3), torch.zeros(20, 30, 3), torch.zeros(20, 30)
+    mask[:4, :5] = 1
+    target[:4, :5], target[4:] = 0.25, 0.9
+    assert rgb_loss(prediction, target, mask, ssim_weight=0).item() == pytest.approx(0.25)
+    torch.testing.assert_close(
+        rgb_loss(prediction, target, mask * 0.5), rgb_loss(prediction, target, mask), rtol=1e-6, atol=0
+    )
+
+
+def test_ssim_sees_the_whole_image_unless_it_is_masked_too():
+    prediction, mask = seeded(40, 40, 3), torch.zeros(40, 40, dtype=torch.bool)
+    mask[:20] = True
+    target = prediction.clone()
+    target[30:] = seeded(10, 40, 3, seed=1)
+    assert rgb_loss(prediction, target, mask).item() > 0.01
+    assert rgb_loss(prediction, target, mask, mask_ssim=True).item() == pytest.approx(0, abs=1e-7)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 30), (10, 4), (11, 10), (3, 200)])
+def test_images_below_the_ssim_window_have_a_finite_loss_and_gradient(size):
+    a, b = seeded(*size, 3).requires_grad_(), seeded(*size, 3, seed=1)
+    loss = rgb_loss(a, b)
+    loss.backward()
+    assert 0 < loss.item() < 2
+    assert a.grad.isfinite().all()
+    assert rgb_loss(b, b).item() == pytest.approx(0, abs=1e-7)
+
+
+# ------------------------------------------------------------------ empty masks
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        lambda x: rgb_loss(x, torch.ones_like(x), torch.zeros(12, 14)),
+        lambda x: rgb_loss(x, torch.ones_like(x), torch.zeros(12, 14), mask_ssim=True),
+        lambda x: clip_loss(x, torch.ones_like(x), torch.zeros(12, 14)),
+        lambda x: dense_loss(x, torch.ones(6, 7, 3), torch.zeros(6, 7)),
+        lambda x: dense_loss(x, torch.ones(20, 20, 3), torch.zeros(20, 20)),
+        lambda x: region_variance_loss(x, torch.zeros(12, 14, dtype=torch.long), torch.zeros(12, 14)),
+        lambda x: region_variance_loss(x, torch.full((12, 14), -1)),
+    ],
+)
+def test_an_empty_mask_gives_zero_with_zero_gradient(loss):
+    x = seeded(12, 14, 3, dtype=torch.float32).requires_grad_()
+    value = loss(x)
+    value.backward()
+    assert value.item() == 0
+    assert value.shape == ()
+    assert (x.grad == 0).all()
+
+
+# ------------------------------------------------------------------ features
+
+
+def test_clip_loss_is_a_weighted_mean_over_cells_and_channels():
+    a, b, weight = seeded(4, 5, 6), seeded(4, 5, 6, seed=1), seeded(4, 5, seed=2)
+    torch.testing.assert_close(clip_loss(a, b), F.l1_loss(a, b))
+    by_cell = (a - b).abs().mean(-1)
+    torch.testing.assert_close(clip_loss(a, b, weight), (by_cell * weight).sum() / weight.sum())
+    torch.testing.assert_close(clip_loss(a, b, 7 * weight), clip_loss(a, b, weight))
+    mask = weight > 0.5
+    torch.testing.assert_close(clip_loss(a, b, mask), by_cell[mask].mean())
+
+
+@pytest.mark.parametrize("compare_at", ["auto", "target"])
+@pytest.mark.parametrize(("size", "grid"), [((12, 16), (24, 24)), ((20, 30), (9, 9)), ((7, 9), (7, 9))])
+def test_dense_loss_keeps_a_ramp_within_a_tenth_of_a_cell_on_any_two_grids(size, grid, compare_at):
+    """Away from the border, where a resize has no neighbour to lean on."""
+
+    def ramp(n, m):
+        return ((torch.arange(m, dtype=torch.float64) + 0.5) / m).expand(n, m)[..., None]
+
+    weight = torch.zeros(grid, dtype=torch.float64)
+    weight[:, grid[1] // 3 : -(grid[1] // 3)] = 1
+    assert dense_loss(ramp(*size), ramp(*grid), weight, compare_at).item() < 0.1 / max(size + grid)
+    shifted = dense_loss(ramp(*size) + 0.25, ramp(*grid), None, compare_at)
+    assert shifted.item() == pytest.approx(0.25, abs=1e-6)
+
+
+def test_dense_loss_at_the_target_is_the_published_resize_for_a_finer_target():
+    prediction, target = seeded(9, 12, 4), seeded(16, 16, 4, seed=1)
+    resized = F.interpolate(prediction.permute(2, 0, 1)[None], (16, 16), mode="bilinear", align_corners=False)
+    expected = F.l1_loss(resized[0].permute(1, 2, 0), target)
+    torch.testing.assert_close(dense_loss(prediction, target, compare_at="target"), expected)
+
+
+def test_dense_loss_resizes_the_target_unless_that_would_blur_the_prediction():
+    prediction = seeded(16, 16, 2).requires_grad_()
+    same_as_target = dense_loss(prediction, seeded(4, 4, 2), compare_at="target")
+    torch.testing.assert_close(dense_loss(prediction, seeded(4, 4, 2)), same_as_target)
+    dense_loss(
+        prediction, seeded(13, 13, 2, seed=1)
+    ).backward()  # every pixel is compared with its own target
+    torch.testing.assert_close(prediction.grad.abs(), torch.full_like(prediction, 1 / prediction.numel()))
+
+
+def test_dense_weights_choose_cells_of_the_target():
+    prediction, target = torch.zeros(6, 6, 2), torch.zeros(12, 12, 2)
+    target[:, 6:] = 1
+    weight = torch.zeros(12, 12, dtype=torch.bool)
+    weight[:, 9:] = True
+    assert dense_loss(prediction, target, weight).item() == pytest.approx(1)
+    assert dense_loss(prediction, target, ~weight).item() < 0.5
+    assert dense_loss(prediction, target, weight, "target").item() == pytest.approx(1)
+
+
+# ------------------------------------------------------------------ regions
+
+
+def region_variance_by_loops(features, labels, mask=None):
+    valid = labels >= 0 if mask is None else (labels >= 0) & mask
+    total = features.new_zeros(())
+    for label in set(labels[valid].tolist()):
+        pixels = features[valid & (labels == label)]
+        total = total + ((pixels - pixels.mean(0)) ** 2).sum()
+    return total / valid.sum()
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_region_variance_equals_a_loop_over_regions_in_value_and_gradient(masked):
+    labels = labels_of(15, 17, count=6)
+    mask = seeded(15, 17, seed=3) > 0.4 if masked else None
+    results = []
+    for loss in (region_variance_loss, region_variance_by_loops):
+        features = seeded(15, 17, 5).requires_grad_()
+        value = loss(features, labels, mask)
+        results.append((value.detach(), *torch.autograd.grad(value, features)))
+    torch.testing.assert_close(*results)
+
+
+def test_region_variance_of_maps_that_are_constant_in_each_region_is_zero():
+    labels = labels_of(15, 17, count=6)
+    features = seeded(7, 5)[labels]
+    assert region_variance_loss(features, labels).item() < 1e-25
+
+
+def test_region_variance_ignores_pixels_without_region():
+    features, labels = seeded(15, 17, 5), labels_of(15, 17, count=6)
+    other = torch.where((labels < 0)[..., None], 100 * seeded(15, 17, 5, seed=1), features)
+    torch.testing.assert_close(region_variance_loss(features, labels), region_variance_loss(other, labels))
+
+
+def test_region_variance_of_single_pixels_is_zero():
+    assert region_variance_loss(seeded(4, 5, 3), torch.arange(20).view(4, 5)).item() == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
+def test_region_variance_does_not_depend_on_the_labels_names(dtype):
+    features, labels = seeded(15, 17, 5), labels_of(15, 17, count=6)
+    names = torch.tensor([3, 2_000_000_000, 0, 77, 1, 123_456_789, -7], dtype=dtype)  # the last one is for −1
+    torch.testing.assert_close(
+        region_variance_loss(features, names[labels]), region_variance_loss(features, labels)
+    )
+
+
+def test_region_variance_survives_cancellation_in_float32():
+    labels = labels_of(60, 70, count=5)
+    features = (1e4 + 1e-3 * (2 * (seeded(60, 70, 8) > 0.5) - 1)).float()
+    expected = region_variance_by_loops(features.double(), labels)
+    torch.testing.assert_close(region_variance_loss(features, labels).double(), expected, rtol=1e-3, atol=0)
+
+
+def test_region_variance_gradients_agree_with_finite_differences():
+    labels = labels_of(4, 5, count=3)
+    features = seeded(4, 5, 2).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f: region_variance_loss(f, labels), (features,))
+
+
+def test_losses_keep_the_type_of_the_prediction():
+    for dtype in (torch.float32, torch.float64):
+        a, b = seeded(12, 14, 3, dtype=dtype), seeded(12, 14, 3, seed=1, dtype=dtype)
+        mask = torch.ones(12, 14, dtype=torch.bool)
+        losses = [rgb_loss(a, b, mask), clip_loss(a, b, mask), dense_loss(a, b, mask)]
+        losses.append(region_variance_loss(a, mask.long(), mask))
+        assert {loss.dtype for loss in losses} == {dtype}

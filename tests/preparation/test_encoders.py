@@ -1,0 +1,231 @@
+"""The real loading code, on saved folders of tiny random models; transformers itself is the reference."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+import torch
+from tiny_models import make_tiny_clip, make_tiny_dinov2
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation import encoders
+from lang3dxl_ns.preparation.encoders import find_model, load_dense_encoder, load_image_text_encoder
+
+TEXTS = ["a rose window", "minaret", "the dome of a mosque, seen from far away in the evening light"]
+
+
+@pytest.fixture(scope="module")
+def clip_folder(tmp_path_factory):
+    return make_tiny_clip(tmp_path_factory.mktemp("models") / "clip")
+
+
+@pytest.fixture(scope="module")
+def dino_folder(tmp_path_factory):
+    return make_tiny_dinov2(tmp_path_factory.mktemp("models") / "dino")
+
+
+@pytest.fixture(scope="module")
+def clip(clip_folder):
+    return load_image_text_encoder(str(clip_folder), "cpu")
+
+
+def test_image_embeddings_are_those_of_transformers_own_pipeline(clip, clip_folder):
+    from transformers import CLIPImageProcessor, CLIPModel
+
+    levels = torch.randint(0, 256, (5, 3, 32, 32), generator=torch.manual_seed(0), dtype=torch.uint8)
+    pixels = CLIPImageProcessor.from_pretrained(clip_folder)(list(levels), return_tensors="pt")[
+        "pixel_values"
+    ]
+    with torch.no_grad():
+        expected = (
+            CLIPModel.from_pretrained(clip_folder).get_image_features(pixel_values=pixels).pooler_output
+        )
+    embeddings = clip.encode_images(levels / 255)
+    assert embeddings.shape == (5, clip.dim) == (5, 64)
+    torch.testing.assert_close(embeddings, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_text_embeddings_are_those_of_transformers_own_pipeline_one_by_one(clip, clip_folder):
+    from transformers import CLIPModel, CLIPTokenizer
+
+    model = CLIPModel.from_pretrained(clip_folder)
+    tokenizer = CLIPTokenizer.from_pretrained(clip_folder)
+    embeddings = clip.encode_texts(TEXTS)
+    for text, embedding in zip(TEXTS, embeddings, strict=True):
+        tokens = tokenizer([text], return_tensors="pt", truncation=True, max_length=32)
+        with torch.no_grad():
+            expected = model.get_text_features(**tokens).pooler_output[0]
+        torch.testing.assert_close(embedding, expected, rtol=1e-4, atol=1e-5)
+    assert (embeddings[0] - embeddings[1]).abs().max() > 1e-3
+
+
+def test_embeddings_are_not_normalised_and_can_meet_autograd(clip):
+    crops = torch.rand(3, 3, 32, 32, generator=torch.manual_seed(1))
+    embeddings = clip.encode_images(crops)
+    assert (embeddings.norm(dim=-1) - 1).abs().min() > 0.05
+    weight = torch.ones(64, requires_grad=True)
+    (embeddings * weight).square().sum().backward()
+    assert weight.grad is not None
+
+
+def test_crops_of_another_size_are_resized_not_refused(clip):
+    constant = torch.full((1, 3, 50, 50), 0.4)
+    expected = clip.encode_images(torch.full((1, 3, 32, 32), 0.4))
+    torch.testing.assert_close(clip.encode_images(constant), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_folders_own_statistics_are_used(clip, clip_folder, tmp_path):
+    folder = shutil.copytree(clip_folder, tmp_path / "clip")
+    settings = json.loads((folder / "preprocessor_config.json").read_text())
+    settings["image_mean"] = [0.0, 0.0, 0.0]
+    (folder / "preprocessor_config.json").write_text(json.dumps(settings))
+    other = load_image_text_encoder(folder, "cpu")
+    crops = torch.rand(1, 3, 32, 32, generator=torch.manual_seed(1))
+    assert (other.encode_images(crops) - clip.encode_images(crops)).abs().max() > 1e-3
+    assert other.identity != clip.identity
+
+
+def test_identity_follows_the_content_and_not_the_place(clip, clip_folder, tmp_path):
+    moved = shutil.copytree(clip_folder, tmp_path / "elsewhere")
+    assert find_model(moved, "--clip").identity == clip.identity
+    fine_tuned = make_tiny_clip(tmp_path / "fine-tuned", seed=1)
+    assert find_model(fine_tuned, "--clip").identity != clip.identity
+
+
+def test_checkpoints_without_safetensors_load_too(clip, clip_folder, tmp_path):
+    from transformers import CLIPModel
+
+    folder = shutil.copytree(clip_folder, tmp_path / "clip")
+    (folder / "model.safetensors").unlink()
+    torch.save(CLIPModel.from_pretrained(clip_folder).state_dict(), folder / "pytorch_model.bin")
+    crops = torch.rand(1, 3, 32, 32)
+    torch.testing.assert_close(
+        load_image_text_encoder(folder, "cpu").encode_images(crops), clip.encode_images(crops)
+    )
+
+
+def test_dense_features_are_the_patch_tokens_in_reading_order(dino_folder):
+    from transformers import Dinov2Model
+
+    encoder = load_dense_encoder(dino_folder, "cpu", tokens=6)
+    photo = torch.rand(84, 84, 3, generator=torch.manual_seed(0))  # already 6 × 14 px: no resize
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    with torch.no_grad():
+        output = Dinov2Model.from_pretrained(dino_folder)(((photo - mean) / std).permute(2, 0, 1)[None])
+    features = encoder.encode(photo)
+    assert features.shape == (6, 6, encoder.dim) == (6, 6, 32)
+    torch.testing.assert_close(features.flatten(0, 1), output.last_hidden_state[0, 1:], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(50, 130), (300, 40)])
+def test_dense_grid_is_square_whatever_the_photos_shape(dino_folder, size):
+    encoder = load_dense_encoder(dino_folder, "cpu", tokens=5)
+    assert encoder.encode(torch.rand(*size, 3)).shape == (5, 5, 32)
+
+
+def test_dense_grid_keeps_top_left_at_the_top_left(dino_folder):
+    encoder = load_dense_encoder(dino_folder, "cpu", tokens=4)
+    plain = torch.full((100, 200, 3), 0.5)
+    marked = plain.clone()
+    marked[:25, :50] = torch.rand(25, 50, 3, generator=torch.manual_seed(0))
+    change = (encoder.encode(marked) - encoder.encode(plain)).norm(dim=-1)
+    assert change.argmax() == 0
+
+
+def test_a_plain_vit_is_read_at_other_grids_than_its_own(tmp_path):
+    from transformers import ViTConfig, ViTModel
+
+    config = ViTConfig(
+        hidden_size=16,
+        num_hidden_layers=1,
+        num_attention_heads=2,
+        intermediate_size=32,
+        image_size=32,
+        patch_size=8,
+    )
+    ViTModel(config, add_pooling_layer=False).save_pretrained(tmp_path / "vit")
+    assert load_dense_encoder(tmp_path / "vit", "cpu", tokens=7).encode(torch.rand(30, 40, 3)).shape == (
+        7,
+        7,
+        16,
+    )
+
+
+def test_the_builtin_model_is_announced_for_later_and_used_once_it_is_there(
+    clip, clip_folder, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(encoders, "_BUILTIN_CLIP", tmp_path / "demo" / "clip")
+    with pytest.raises(UserError, match="later version"):
+        load_image_text_encoder("builtin", "cpu")
+    shutil.copytree(clip_folder, tmp_path / "demo" / "clip")
+    assert load_image_text_encoder("builtin", "cpu").identity == clip.identity
+
+
+def test_an_absent_model_is_an_error_that_names_it_and_the_remedy(tmp_path, monkeypatch):
+    import huggingface_hub.constants
+
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(
+        UserError, match=r"some-org/some-clip.*hf download .*--pipeline\.datamanager\.clip DIR"
+    ):
+        load_image_text_encoder("some-org/some-clip", "cpu")
+    with pytest.raises(UserError, match=r"--pipeline\.datamanager\.dense DIR"):
+        load_dense_encoder("some-org/some-dino", "cpu")
+    with pytest.raises(UserError, match="no/such/folder"):
+        load_image_text_encoder("/no/such/folder", "cpu")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "config.json").unlink(), "config.json"),
+        (lambda folder: (folder / "model.safetensors").unlink(), "safetensors"),
+        (lambda folder: (folder / "model.safetensors").write_bytes(b"\0" * 100), "can't be loaded"),
+        (lambda folder: (folder / "config.json").write_text("{"), "config.json"),
+        (lambda folder: (folder / "tokenizer.json").unlink(), "tokenizer"),
+    ],
+)
+def test_an_incomplete_clip_folder_is_an_error_that_names_what_is_missing(
+    clip_folder, tmp_path, damage, message
+):
+    folder = shutil.copytree(clip_folder, tmp_path / "clip")
+    damage(folder)
+    with pytest.raises(UserError, match=message):
+        load_image_text_encoder(folder, "cpu")
+
+
+def test_weights_that_lack_tensors_are_refused_and_not_filled_at_random(clip_folder, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    folder = shutil.copytree(clip_folder, tmp_path / "clip")
+    weights = load_file(folder / "model.safetensors")
+    del weights["visual_projection.weight"]
+    save_file(weights, folder / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(UserError, match=r"lack 1 tensors.*visual_projection"):
+        load_image_text_encoder(folder, "cpu")
+
+
+def test_the_wrong_kind_of_model_is_refused(clip_folder, dino_folder):
+    with pytest.raises(UserError, match="dinov2 model"):
+        load_image_text_encoder(dino_folder, "cpu")
+    with pytest.raises(UserError, match="without patch tokens"):
+        load_dense_encoder(clip_folder, "cpu")
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_half_precision_on_the_gpu_stays_close_to_the_cpu(clip_folder, dino_folder):
+    crops = torch.rand(8, 3, 32, 32)
+    photo = torch.rand(60, 90, 3)
+    for load, run in [
+        (load_image_text_encoder, lambda encoder: encoder.encode_images(crops)),
+        (load_image_text_encoder, lambda encoder: encoder.encode_texts(TEXTS)),
+        (lambda _, device: load_dense_encoder(dino_folder, device, 8), lambda encoder: encoder.encode(photo)),
+    ]:
+        expected, found = run(load(clip_folder, "cpu")), run(load(clip_folder, "cuda"))
+        assert found.dtype == torch.float32
+        assert found.device.type == "cuda"
+        assert (found.cpu() - expected).norm() < 0.01 * expected.norm()

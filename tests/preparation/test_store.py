@@ -1,0 +1,220 @@
+"""The store's laws: whole entries or none, one file per name, only what is touched is read."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.store import FeatureStore
+
+SETTINGS = {"encoder": "abc", "crop_sides": [32, 64]}
+
+
+@pytest.fixture
+def store(tmp_path):
+    return FeatureStore(tmp_path / "store")
+
+
+def entry(seed=0):
+    generator = torch.manual_seed(seed)
+    return {
+        "features": torch.randn(4, 5, 8, generator=generator),
+        "valid": torch.rand(4, 5, generator=generator),
+    }
+
+
+def files(store):
+    return sorted(path.name for path in store.root.rglob("*") if path.is_file())
+
+
+def test_what_is_written_is_read_in_half_precision(store):
+    written = entry()
+    store.write("clip", "a.jpg", written, SETTINGS)
+    found = store.read("clip", "a.jpg")
+    assert found.keys() == written.keys()
+    for key, tensor in found.items():
+        assert torch.equal(tensor, written[key].half())
+    assert store.settings("clip", "a.jpg") == SETTINGS
+    assert store.shapes("clip", "a.jpg") == {"features": (4, 5, 8), "valid": (4, 5)}
+    assert store.size() == store.path("clip", "a.jpg").stat().st_size
+
+
+def test_whole_numbers_and_views_survive(store):
+    labels = torch.arange(12, dtype=torch.int32).reshape(3, 4).T
+    store.write("regions", "a.jpg", {"labels": labels}, {})
+    assert torch.equal(store.read("regions", "a.jpg")["labels"], labels)
+
+
+def test_numbers_beyond_half_precision_stay_float32_and_non_numbers_are_refused(store):
+    store.write("clip", "big.jpg", {"features": torch.tensor([1e5, 1.0])}, {})
+    assert torch.equal(store.read("clip", "big.jpg")["features"], torch.tensor([1e5, 1.0]))
+    with pytest.raises(UserError, match=r"bad\.jpg.*NaN"):
+        store.write("clip", "bad.jpg", {"features": torch.tensor([float("nan")])}, {})
+    assert not store.path("clip", "bad.jpg").exists()
+
+
+def test_odd_names_never_share_a_file(store):
+    names = [
+        "a/b.jpg",
+        "a_b.jpg",
+        "a b.jpg",
+        "A/b.jpg",
+        "x.jpg",
+        "x.png",
+        "x",
+        "../x.jpg",
+        "/x.jpg",
+        "x:y|z?.jpg",
+    ]
+    names += ["é.jpg", "e\u0301.jpg", "n" * 300, "n" * 301, "\udcff.jpg", "a\\b.jpg", ".hidden", ""]
+    for index, name in enumerate(names):
+        store.write("clip", name, {"index": torch.tensor(index)}, {"name": index})
+    assert [int(store.read("clip", name)["index"]) for name in names] == list(range(len(names)))
+    lower = {file.lower() for file in files(store)}  # not even where upper and lower case are the same
+    assert len(lower) == len(names)
+    assert all(path.parent == store.root / "clip" for path in store.root.rglob("*.safetensors"))
+
+
+def test_only_the_settings_that_made_an_entry_are_current(store):
+    assert not store.is_current("clip", "a.jpg", SETTINGS)
+    store.write("clip", "a.jpg", entry(), SETTINGS)
+    assert store.is_current("clip", "a.jpg", dict(reversed(SETTINGS.items())))
+    assert not store.is_current("clip", "a.jpg", {**SETTINGS, "encoder": "other"})
+    assert not store.is_current("clip", "a.jpg", {"encoder": "abc"})
+    assert not store.is_current("dense", "a.jpg", SETTINGS)
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_a_failed_write_leaves_the_old_entry_and_nothing_else(store, monkeypatch, step):
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(KeyboardInterrupt):
+        store.write("clip", "a.jpg", entry(), SETTINGS)
+    assert files(store) == []
+    monkeypatch.undo()
+    store.write("clip", "a.jpg", entry(), SETTINGS)
+    before = files(store)
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(KeyboardInterrupt):
+        store.write("clip", "a.jpg", entry(1), {"encoder": "new"})
+    assert files(store) == before
+    assert store.is_current("clip", "a.jpg", SETTINGS)
+    assert torch.equal(store.read("clip", "a.jpg")["features"], entry()["features"].half())
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_process_killed_while_writing_leaves_no_entry_and_its_leftover_is_removed(store):
+    child = os.fork()
+    if child == 0:
+        os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)
+        store.write("clip", "a.jpg", entry(), {})
+        os._exit(0)
+    assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
+    assert not store.is_current("clip", "a.jpg", {})
+    (leftover,) = store.root.rglob("*.tmp")
+    store.remove_leftovers()
+    assert leftover.exists()  # young: another process may be writing it
+    os.utime(leftover, (time.time() - 7200,) * 2)
+    store.remove_leftovers()
+    assert files(store) == []
+
+
+def test_a_full_disk_is_a_users_error_and_leaves_nothing_half_written(store, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(UserError, match=r"no space left in .*a\.jpg"):
+        store.write("clip", "a.jpg", entry(), SETTINGS)
+    assert files(store) == []
+
+
+@pytest.mark.parametrize("keep", [0, 4, 60, -1])
+def test_a_truncated_entry_counts_as_absent_and_is_logged(store, caplog, keep):
+    store.write("clip", "a.jpg", entry(), SETTINGS)
+    path = store.path("clip", "a.jpg")
+    path.write_bytes(path.read_bytes()[:keep])
+    assert not store.is_current("clip", "a.jpg", SETTINGS)
+    assert "a.jpg" in caplog.text
+    with pytest.raises(UserError, match=r"a\.jpg.*damaged"):
+        store.read("clip", "a.jpg")
+
+
+def test_a_foreign_file_counts_as_absent(store):
+    from safetensors.torch import save_file
+
+    path = store.path("clip", "a.jpg")
+    path.parent.mkdir(parents=True)
+    save_file(entry(), path)
+    assert not store.is_current("clip", "a.jpg", SETTINGS)
+
+
+def test_an_absent_entry_is_a_users_error_that_says_what_to_run(store):
+    with pytest.raises(UserError, match=r"clip of b\.jpg is not prepared.*lang3dxl prepare"):
+        store.read("clip", "b.jpg")
+
+
+def test_writers_of_one_entry_never_mix_and_readers_never_see_a_part(store):
+    """Eight writers, each with its own constant, while this thread reads."""
+    store.write("clip", "a.jpg", {"features": torch.zeros(20_000)}, {"writer": 0})
+    problems = []
+
+    def write(number):
+        try:
+            for _ in range(5):
+                tensors = {"features": torch.full((20_000,), float(number))}
+                store.write("clip", "a.jpg", tensors, {"writer": number})
+        except Exception as error:
+            problems.append(error)
+
+    writers = [threading.Thread(target=write, args=(number,)) for number in range(8)]
+    for writer in writers:
+        writer.start()
+    while any(writer.is_alive() for writer in writers):
+        assert len(store.read("clip", "a.jpg")["features"].unique()) == 1
+    assert problems == []
+    final = store.read("clip", "a.jpg")["features"].unique()
+    assert final.tolist() == [store.settings("clip", "a.jpg")["writer"]]
+    assert len(files(store)) == 1
+
+
+def test_a_reader_keeps_its_entry_while_it_is_replaced(store):
+    store.write("clip", "a.jpg", entry(), SETTINGS)
+    held = store.read("clip", "a.jpg")["features"]
+    store.write("clip", "a.jpg", entry(1), SETTINGS)
+    assert torch.equal(held, entry()["features"].half())
+    assert torch.equal(store.read("clip", "a.jpg")["features"], entry(1)["features"].half())
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_reading_a_slice_does_not_load_the_entry(store):
+    store.write("dense", "a.jpg", {"features": torch.zeros(8192, 4096, dtype=torch.half)}, {})  # 64 MiB
+
+    def resident():
+        """Bytes of the entry's file that are in this process's memory."""
+        path, total, inside = str(store.path("dense", "a.jpg")), 0, False
+        for line in Path("/proc/self/smaps").read_text().splitlines():
+            if re.match(r"[0-9a-f]+-[0-9a-f]+ ", line):
+                inside = line.endswith(path)
+            elif inside and line.startswith("Rss:"):
+                total += int(line.split()[1]) * 1024
+        return total
+
+    features = store.read("dense", "a.jpg")["features"]
+    assert resident() < 8 * 2**20
+    assert features[4096].sum() == 0
+    assert resident() < 8 * 2**20
+    assert features.sum() == 0
+    assert resident() > 60 * 2**20  # the measurement sees what is touched
