@@ -41,7 +41,7 @@ class Prepare(PreparationConfig):
         )
         datamanager = config.setup(device=DEVICE, test_mode="test")
         if datamanager.targets is not None:
-            print(f"Targets of {len(datamanager.targets)} photos are in {datamanager.cache_dir}")
+            print(f"Targets of {len(datamanager.targets.names)} photos are in {datamanager.cache_dir}")
 
 
 @dataclass

@@ -11,11 +11,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
     FullImageDatamanagerConfig,
@@ -25,6 +27,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.preparation.collection import prepare_collection
 from lang3dxl_ns.preparation.photo import Photo, scaled_size
@@ -38,6 +41,8 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     """Photos and their targets. `--pipeline.datamanager.clip none` trains colours only."""
 
     _target: type = field(default_factory=lambda: Lang3DXLDataManager)
+    dataparser: AnnotatedDataParserUnion = field(default_factory=PhotoCollectionDataParserConfig)
+    """Where photos and cameras come from."""
     cache_dir: Path | None = None
     """Where prepared targets are kept (default: lang3dxl_cache inside the data folder)."""
     photo_cache_gb: float = 4.0
@@ -134,7 +139,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def setup_train(self) -> None:
         """Before training, prepare what is missing and tell the model what there is to learn."""
         if self.test_mode == "val" and self.targets is not None:
-            names = [photo.name for photo in self.train_dataset.photos]
+            prepared = set(self.targets.names)  # without damaged photos
+            names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
             self.train_dataset.metadata["feature_statistics"] = self.targets.feature_statistics(names)
 
     @cached_property
@@ -205,7 +211,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return self._batch(self.eval_dataset, index, self.eval_dataset.read(index))
 
     @property
-    def fixed_indices_eval_dataloader(self) -> EvalPhotos:
+    def fixed_indices_eval_dataloader(self) -> EvalPhotos:  # type: ignore[override]
         """All held-out photos, read one at a time."""
         return EvalPhotos(self)
 
@@ -220,7 +226,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D].
         """
         photo = dataset.photos[index]
-        batch = {key: value.to(self.device) for key, value in data.items()}
+        batch: dict[str, Any] = {key: value.to(self.device) for key, value in data.items()}
         batch |= {"image_idx": index, "name": photo.name}
         if self.targets is not None:
             clip, dense = self.targets.clip(photo.name), self.targets.dense(photo.name)

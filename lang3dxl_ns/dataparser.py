@@ -107,7 +107,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
     def _read_collection(self) -> None:
         """The model's photos that can be used; says which are left out, and why."""
         reconstruction = read_reconstruction(self.config.data / self.config.colmap_path)
-        left_out = {}
+        left_out: dict[str, UserError] = {}
         for name, geometry in reconstruction.photos.items():
             path = self._image_path(name)
             try:
@@ -116,6 +116,11 @@ class PhotoCollectionDataParser(ColmapDataParser):
                 self.photos[path] = Photo.from_geometry(geometry, path, self._mask_path(name))
             except UserError as reason:
                 left_out[name] = reason
+        if len(self.photos) == 1:
+            raise UserError(
+                f"{self.config.data} has one photo that can be used: a scene needs at least two, one to learn from "
+                f"and one to hold out"
+            )
         if not self.photos:
             raise UserError(
                 f"none of the model's {len(left_out)} photos can be used; "
@@ -124,8 +129,8 @@ class PhotoCollectionDataParser(ColmapDataParser):
             )
         if left_out:
             CONSOLE.log(f"[yellow]{len(left_out)} photos of the model are left out:[/yellow]")
-            for name, reason in left_out.items():
-                CONSOLE.log(f"  {name}: {reason}")
+            for name, why in left_out.items():
+                CONSOLE.log(f"  {name}: {why}")
         kept = {name: g for name, g in reconstruction.photos.items() if name not in left_out}
         self.reconstruction = replace(reconstruction, photos=kept)
 

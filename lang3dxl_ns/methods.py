@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Literal
+
 import torch
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from lang3dxl_ns.datamanager import Lang3DXLDataManagerConfig
-from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
-from lang3dxl_ns.model import Lang3DXLModelConfig
 from lang3dxl_ns.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.trainer import Lang3DXLTrainerConfig, RunAdamConfig, RunScheduleConfig
 
-DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+DEVICE: Literal["cuda", "cpu"] = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def _optimizers() -> dict[str, dict]:
     """Groups and schedules of the paper, in fractions of the run; rates for short runs beside them."""
-    field_schedule = {"start": 0.1, "warm": 0.05, "end": 0.01, "power": 2.0}
+    learned = partial(RunScheduleConfig, start=0.1, warm=0.05, end=0.01, power=2.0)
     return {
         "means": {
             "optimizer": RunAdamConfig(lr=1.6e-4),
@@ -41,15 +41,15 @@ def _optimizers() -> dict[str, dict]:
         },
         "field_encoding": {
             "optimizer": RunAdamConfig(lr=5e-4, short_lr=1e-2),
-            "scheduler": RunScheduleConfig(**field_schedule),
+            "scheduler": learned(),
         },
         "field_decoder": {
             "optimizer": RunAdamConfig(lr=5e-4, short_lr=1e-2, weight_decay=1e-5),
-            "scheduler": RunScheduleConfig(**field_schedule),
+            "scheduler": learned(),
         },
         "downsampler": {
             "optimizer": RunAdamConfig(lr=5e-4, short_lr=5e-3, weight_decay=1e-5),
-            "scheduler": RunScheduleConfig(**field_schedule),
+            "scheduler": learned(),
         },
         "camera_opt": {
             "optimizer": AdamOptimizerConfig(lr=1e-4, eps=1e-15),
@@ -68,10 +68,7 @@ lang3dxl = MethodSpecification(
         steps_per_eval_batch=0,
         steps_per_eval_image=500,
         steps_per_eval_all_images=0,
-        pipeline=Lang3DXLPipelineConfig(
-            datamanager=Lang3DXLDataManagerConfig(dataparser=PhotoCollectionDataParserConfig()),
-            model=Lang3DXLModelConfig(),
-        ),
+        pipeline=Lang3DXLPipelineConfig(),
         optimizers=_optimizers(),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -16,7 +17,6 @@ from nerfstudio.models.splatfacto import (
     SplatfactoModel,
     SplatfactoModelConfig,
     num_sh_bases,
-    random_quat_tensor,
 )
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -63,6 +63,9 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     """Let the semantic losses move Gaussians and opacities too, as the authors' code does."""
     divide_codes_by_alpha: bool = False
     """Decode code ÷ coverage instead of the code, so that half-covered pixels keep their code."""
+    sky_gaussians: int = 2_000
+    """Gaussians on a sphere around the scene, which take up the sky and the far distance, where a COLMAP
+    model has no points; 0 for none."""
     total_steps: int = 30_000
     """Iterations of the run, to which the fractions below refer; set by the trainer."""
     densify_from: float = 1 / 15
@@ -81,8 +84,9 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     """Gaussians below this opacity are pruned."""
     use_absgrad: bool = False
     """Densify by the norm of the mean gradient, as in the paper."""
-    densify_grad_thresh: float = 2e-4
-    """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated."""
+    densify_grad_thresh: float | None = None  # type: ignore[assignment]
+    """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-4 (the
+    paper's) in long runs; 2e-3 in short ones, which begin to densify while gradients are still large."""
 
     def fit_to_run(self, iterations: int) -> None:
         """Settle what depends on the length of the run."""
@@ -90,6 +94,8 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
         self.total_steps = iterations
         if self.semantic_field.preset == "auto":
             self.semantic_field.preset = "short" if short else "default"
+        if self.densify_grad_thresh is None:
+            self.densify_grad_thresh = 2e-3 if short else 2e-4
         if self.dense_weight is None:
             self.dense_weight = 2.0 if short else 0.5
         if self.decode_size is None:
@@ -118,6 +124,7 @@ class Lang3DXLModel(SplatfactoModel):
         if statistics is not None:
             clip, dense = statistics.clip, statistics.dense
             self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean)
+            assert self.semantic_field is not None
             self.semantic_field.set_output_statistics(
                 torch.cat([self.clip_mean, self.dense_mean]),
                 clip.std if dense is None else torch.cat([clip.std, dense.std]),
@@ -139,6 +146,10 @@ class Lang3DXLModel(SplatfactoModel):
         else:
             means = (torch.rand(self.config.num_random, 3) - 0.5) * self.config.random_scale
             colours = torch.rand(self.config.num_random, 3)
+        if self.config.sky_gaussians:
+            sky = sphere_around(means, self.config.sky_gaussians)
+            means = torch.cat([means, sky])
+            colours = torch.cat([colours, torch.full_like(sky, 0.5)])
         n = len(means)
         if n < 4:
             raise UserError(
@@ -151,7 +162,10 @@ class Lang3DXLModel(SplatfactoModel):
         return {
             "means": Parameter(means),
             "scales": Parameter(spacing.log().repeat(1, 3)),
-            "quats": Parameter(random_quat_tensor(n)),
+            # Uniform over rotations; from a generator of its own, so that preparation has no say in it.
+            "quats": Parameter(
+                F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)
+            ),
             "features_dc": Parameter(RGB2SH(colours)),
             "features_rest": Parameter(torch.zeros(n, num_sh_bases(self.config.sh_degree) - 1, 3)),
             "opacities": Parameter(torch.logit(0.1 * torch.ones(n, 1))),
@@ -228,7 +242,7 @@ class Lang3DXLModel(SplatfactoModel):
         """Semantic code of every Gaussian."""
         return self.gauss_params["codes"]
 
-    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
         """Render a camera: `rgb`, `accumulation`, `background`; in training `bottleneck` (codes [H, W, 3]);
         otherwise also `depth` and `semantics`, the codes as a picture in [0, 1]."""
         keep = None
@@ -236,7 +250,7 @@ class Lang3DXLModel(SplatfactoModel):
             keep = self.crop_box.within(self.means).squeeze(-1)
             if not keep.any():
                 size = int(camera.width.item()), int(camera.height.item())
-                return self.get_empty_outputs(*size, self.background_color.to(self.device))
+                return self.get_empty_outputs(*size, self.background_color.to(self.device))  # type: ignore[return-value]
         with part("render"):
             rendering, background = self._render(camera, keep)
         self.info = rendering.info
@@ -322,6 +336,7 @@ class Lang3DXLModel(SplatfactoModel):
         self, codes: Float[Tensor, "h w 3"], batch: dict, mask: Tensor | None
     ) -> dict[str, Tensor]:
         c = self.config
+        assert c.dense_weight is not None
         ramp = schedules.semantic_ramp(self.step / c.total_steps)
         clip, dense, small_mask = self._decode_small(codes, mask, self._random_size())
         with part("downsample"):
@@ -422,12 +437,14 @@ class Lang3DXLModel(SplatfactoModel):
         if self.semantic_field is None:
             self._add_semantics(*saved.values())
             self.to(self.device)
-        for kind, mean, prepared in zip(saved, saved.values(), (self.clip_mean, self.dense_mean), strict=True):
+        for kind, mean, prepared in zip(
+            saved, saved.values(), (self.clip_mean, self.dense_mean), strict=True
+        ):
             if len(mean) != len(prepared):
                 raise UserError(
-                    f"the checkpoint decodes to {kind} features of width {len(mean)}, but the prepared targets "
-                    f"have {len(prepared)}: pass the --pipeline.datamanager.{kind.lower()} that the checkpoint "
-                    f"was trained with, or train anew"
+                    f"the checkpoint decodes to {kind} features of width {len(mean)}, but the prepared "
+                    f"targets have {len(prepared)}: pass the --pipeline.datamanager.{kind.lower()} that the "
+                    f"checkpoint was trained with, or train anew"
                 )
 
 
@@ -450,6 +467,16 @@ class _Lpips:
         if self._metric is None:
             return None
         return float(self._metric.to(target.device)(target, predicted.clamp(0, 1)))
+
+
+def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "count 3"]:
+    """Evenly spread points (a Fibonacci lattice) on a sphere of ten times the scene's radius."""
+    centre = points.median(dim=0).values
+    radius = 10 * (points - centre).norm(dim=1).quantile(0.9)
+    i = torch.arange(count) + 0.5
+    z, longitude = 1 - 2 * i / count, i * math.pi * (3 - math.sqrt(5))
+    around = (1 - z * z).sqrt()
+    return centre + radius * torch.stack([around * longitude.cos(), around * longitude.sin(), z], dim=1)
 
 
 def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:

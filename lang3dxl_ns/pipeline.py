@@ -11,7 +11,9 @@ from typing import Any
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from lang3dxl_ns.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.model import Lang3DXLModelConfig
 
 
 @dataclass
@@ -19,6 +21,8 @@ class Lang3DXLPipelineConfig(VanillaPipelineConfig):
     """Configuration of the pipeline."""
 
     _target: type = field(default_factory=lambda: Lang3DXLPipeline)
+    datamanager: Lang3DXLDataManagerConfig = field(default_factory=Lang3DXLDataManagerConfig)
+    model: Lang3DXLModelConfig = field(default_factory=Lang3DXLModelConfig)
 
 
 class Lang3DXLPipeline(VanillaPipeline):
@@ -28,7 +32,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         print_user_errors_plainly()
         super().__init__(*args, **kwargs)
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
         """Load a checkpoint; whatever does not fit is an error (nerfstudio would silently leave it out)."""
         state = {key.removeprefix("_model."): v for key, v in state_dict.items() if key.startswith("_model.")}
         try:

@@ -19,6 +19,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.pipeline import Lang3DXLPipelineConfig
 
 SHORT_RUN = 1_000
 """Iterations of a run that takes the short-run rates."""
@@ -100,6 +101,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
     """Training configuration; `--max-num-iterations` alone rescales every schedule."""
 
     _target: type = field(default_factory=lambda: Lang3DXLTrainer)
+    pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
 
     def set_timestamp(self) -> None:
         """Called once before the configuration is printed and saved: settle what depends on the run."""
@@ -128,6 +130,11 @@ class Lang3DXLTrainer(Trainer):
     """nerfstudio's trainer with atomic checkpoints, and a resumed run that ends at the asked iteration."""
 
     config: Lang3DXLTrainerConfig
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Set up, then seed: what had to be prepared has no say in the run's randomness."""
+        super().setup(test_mode)
+        torch.manual_seed(self.config.machine.seed)
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in all (nerfstudio would add that many to a resumed run)."""

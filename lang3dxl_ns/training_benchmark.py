@@ -40,9 +40,10 @@ def _train_and_evaluate(
 
     from lang3dxl_ns import timing
     from lang3dxl_ns.methods import lang3dxl
-    from lang3dxl_ns.trainer import Lang3DXLTrainer
+    from lang3dxl_ns.trainer import Lang3DXLTrainer, Lang3DXLTrainerConfig
 
     config = deepcopy(lang3dxl.config)
+    assert isinstance(config, Lang3DXLTrainerConfig)
     config.data = config.pipeline.datamanager.data = data
     config.output_dir = out / "runs"
     config.experiment_name = "joint" if clip != "none" else "rgb"

@@ -8,7 +8,10 @@ from lang3dxl_ns.presets import FOLDER, load_preset
 
 
 def test_every_scene_has_a_range_that_makes_the_published_number_of_scales():
-    counts = {p.stem: len(physical_scales(*load_preset(f"holyscenes/{p.stem}")["scale_range"])) for p in FOLDER.glob("holyscenes/*.yaml")}
+    counts = {
+        p.stem: len(physical_scales(*load_preset(f"holyscenes/{p.stem}")["scale_range"]))
+        for p in FOLDER.glob("holyscenes/*.yaml")
+    }
     published = {"notre_dame": 5, "st_paul": 5, "milano": 4, "blue_mosque": 5, "badshahi": 8, "hurba": 8}
     assert counts == published
 

@@ -40,13 +40,13 @@ def prepare_collection(
             log(
                 "the scene has no 3D points: crops are fractions of the photo's width, not sizes in the world"
             )
-        scales = relative_scales(**_named_range(config.scale_range))
+        scales = relative_scales() if config.scale_range is None else relative_scales(7, *config.scale_range)
         log(f"crops of {_listed(scales)} of the photo's width")
         return prepare(photos, None, config, scales, FeatureStore(cache_dir), device)
     sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
     if untracked:
         log(
-            f"{len(untracked)} photos have no tracked points; their scale is that of the points in their view, "
+            f"{len(untracked)} photos have no tracked points: their scale is that of the points in view, "
             f"or the scene's median: {_some(untracked)}"
         )
     chosen = _scale_range(config, reconstruction, sizes)
@@ -62,7 +62,9 @@ def _scale_range(
 ) -> ScaleRange:
     if config.scale_preset is not None:
         smallest, largest = load_preset(config.scale_preset)["scale_range"]
-        return ScaleRange(smallest, largest, f"crops of {smallest}–{largest} world units ({config.scale_preset})")
+        return ScaleRange(
+            smallest, largest, f"crops of {smallest}–{largest} world units ({config.scale_preset})"
+        )
     if config.scale_range is None:
         return propose_scale_range(reconstruction, sizes)
     smallest, largest = config.scale_range
@@ -71,10 +73,6 @@ def _scale_range(
             f"the scale range {smallest} {largest} is not a range: give the smallest crop first, both above 0"
         )
     return ScaleRange(smallest, largest, f"crops of {smallest:.3g}–{largest:.3g} world units, as asked")
-
-
-def _named_range(scale_range: tuple[float, float] | None) -> dict[str, float]:
-    return {} if scale_range is None else {"smallest": scale_range[0], "largest": scale_range[1]}
 
 
 def _listed(values: Sequence[float]) -> str:

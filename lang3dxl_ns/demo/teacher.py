@@ -1,0 +1,154 @@
+"""Zero-shot score of a CLIP on landmarks that it has never seen: crop pyramid, relevancy, average precision.
+
+This is the quality of the targets that the 3D field learns from, before any field: its upper bound in 2D.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import tyro
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.demo.captions import CANONICAL
+from lang3dxl_ns.demo.labels import CATEGORIES, category_masks
+from lang3dxl_ns.demo.views import (
+    COLOUR,
+    ELEMENT,
+    HEIGHT,
+    PART,
+    SPLITS,
+    WIDTH,
+    ViewFolder,
+    background_rendering,
+)
+from lang3dxl_ns.preparation.encoders import ImageTextEncoder, load_image_text_encoder
+from lang3dxl_ns.preparation.pyramid import build_clip_target
+
+CROP_SIDES = (32, 48, 68)
+"""Pixels of a 480×360 view; chosen on validation landmarks."""
+_FEWEST_PIXELS = 100  # of the half-size map; a category with fewer is not a positive photo
+
+
+def relevancy(
+    features: Float[Tensor, "h w c"], queries: Float[Tensor, "q c"], canonical: Float[Tensor, "p c"]
+) -> Float[Tensor, "q h w"]:
+    """sigmoid of a query's cosine similarity minus the nearest canonical phrase's (LERF, temperature 1)."""
+    features = F.normalize(features, dim=-1)
+    similarity = torch.einsum("hwc,qc->qhw", features, F.normalize(queries, dim=-1))
+    neutral = torch.einsum("hwc,pc->phw", features, F.normalize(canonical, dim=-1)).amax(0)
+    return torch.sigmoid(similarity - neutral)
+
+
+def average_precision(score: Float[Array, " n"], truth: Bool[Array, " n"]) -> float:
+    """Area under the precision-recall curve: mean of the precision at each positive, by descending score."""
+    ranked = truth[np.argsort(-score, kind="stable")]
+    precision = np.cumsum(ranked) / np.arange(1, len(ranked) + 1)
+    return float(precision[ranked].mean())
+
+
+def teacher_precision(
+    encoder: ImageTextEncoder, view: UInt8[Array, "6 h w"], sides: Sequence[int] = CROP_SIDES
+) -> dict[str, float]:
+    """Average precision on one view of each category that it shows, from the bare words of the categories.
+
+    The pyramid is that of the preparation; its features are read at half the photo's size, as in Lang3D-XL.
+    The truth of towers includes their windows.
+    """
+    photo = torch.from_numpy(view[COLOUR].transpose(1, 2, 0).astype(np.float32) / 255)
+    target = build_clip_target(
+        photo, sides, [float(s) for s in sides], encoder.encode_images, encoder.crop_size, 256
+    )
+    half = (view.shape[1] // 2, view.shape[2] // 2)
+    features = F.interpolate(target.features.permute(2, 0, 1)[None], half, mode="bilinear")[0].permute(
+        1, 2, 0
+    )
+    queries, canonical = encoder.encode_texts(list(CATEGORIES)), encoder.encode_texts(list(CANONICAL))
+    maps = relevancy(features, queries, canonical).numpy()
+    masks = category_masks(view[PART, 1::2, 1::2], view[ELEMENT, 1::2, 1::2])
+    return {
+        name: average_precision(score.ravel(), masks[name].ravel())
+        for name, score in zip(CATEGORIES, maps, strict=True)
+        if masks[name].sum() >= _FEWEST_PIXELS
+    }
+
+
+@dataclass
+class TeacherScore:
+    """Average precision per category over the views that show it, and the mean over the categories."""
+
+    precision: dict[str, float]
+    deviation: dict[str, float]
+    """Standard error of each category's precision."""
+    views: dict[str, int]
+    """Number of views that show each category."""
+
+    @property
+    def mean(self) -> float:
+        return float(np.mean(list(self.precision.values())))
+
+    def __str__(self) -> str:
+        columns = (f"{name} {value:.3f}" for name, value in self.precision.items())
+        return f"mAP {self.mean:.3f} ({', '.join(columns)})"
+
+
+def score_teacher(
+    encoder: ImageTextEncoder, views: Sequence[UInt8[Array, "6 h w"]], sides: Sequence[int] = CROP_SIDES
+) -> TeacherScore:
+    """Score of the encoder on views; a category that none of them shows is left out."""
+    found: dict[str, list[float]] = {name: [] for name in CATEGORIES}
+    for view in views:
+        for name, precision in teacher_precision(encoder, view, sides).items():
+            found[name].append(precision)
+    found = {name: values for name, values in found.items() if values}
+    return TeacherScore(
+        precision={name: float(np.mean(values)) for name, values in found.items()},
+        deviation={name: float(np.std(values) / len(values) ** 0.5) for name, values in found.items()},
+        views={name: len(values) for name, values in found.items()},
+    )
+
+
+@dataclass
+class ScoreTeacher:
+    """Print the zero-shot score of a CLIP on landmarks of a split, as a table in Markdown."""
+
+    cache: Path
+    """Folder of rendered views; what is missing is rendered into it."""
+    clip: str = "builtin"
+    """CLIP: "builtin", a Hugging Face name or a directory."""
+    split: str = "test"
+    """test or validation."""
+    landmarks: int = 200
+    """Number of landmarks, with one view each."""
+    sides: tuple[str, ...] = (",".join(map(str, CROP_SIDES)),)
+    """Crop sides in pixels of a 480×360 view, with commas; several such sets to compare them."""
+    threads: int = 1
+    """CPU threads; as many processes render."""
+
+    def main(self) -> None:
+        torch.set_num_threads(self.threads)
+        folder = self.cache / self.split
+        with background_rendering(folder, SPLITS[self.split][: self.landmarks], 1, self.threads) as tasks:
+            for task in tasks:
+                task.result()
+        seeds = set(SPLITS[self.split][: self.landmarks])
+        views = [landmark.views[0] for landmark in ViewFolder(folder).landmarks if landmark.seed in seeds]
+        encoder = load_image_text_encoder(self.clip, "cpu")
+        print(f"{len(views)} {self.split} landmarks, one wild view each, {WIDTH}×{HEIGHT}\n")
+        print(f"| crop sides | {' | '.join(CATEGORIES)} | mean |\n|{'---|' * (len(CATEGORIES) + 2)}")
+        for sides in self.sides:
+            score = score_teacher(encoder, views, [int(side) for side in sides.split(",")])
+            cells = (f"{score.precision[c]:.3f} ± {score.deviation[c]:.3f}" for c in CATEGORIES)
+            print(f"| {sides} | {' | '.join(cells)} | **{score.mean:.3f}** |", flush=True)
+        print(f"| views | {' | '.join(str(score.views[c]) for c in CATEGORIES)} | |")
+
+
+if __name__ == "__main__":
+    tyro.cli(ScoreTeacher).main()

@@ -1,0 +1,196 @@
+"""What every benchmark shares: who measured, how long, how much memory, and a report never half written."""
+
+import dataclasses
+import gc
+import json
+import math
+import os
+import platform
+import shlex
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from datetime import date
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+MEBIBYTE = 2**20
+
+
+# --- who measured ---------------------------------------------------------------------------------------
+
+
+def describe_machine(device: torch.device | str = "cpu") -> str:
+    """One line that says where and when figures were made: processor, cores, threads, versions, date."""
+    parts = [
+        _processor_name(),
+        f"{os.cpu_count()} cores, {torch.get_num_threads()} thread(s) used",
+        f"torch {torch.__version__}, Python {platform.python_version()}, {platform.system()}",
+        date.today().isoformat(),
+    ]
+    device = torch.device(device)
+    if device.type == "cuda":
+        parts.insert(0, torch.cuda.get_device_name(device))
+    return " · ".join(parts)
+
+
+def _processor_name() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, "") or platform.processor() or platform.machine()
+
+
+def command_line(command: str, settings: Any) -> str:
+    """The command that repeats a run: `command` with a flag for each field that isn't at its default.
+
+    Args:
+        settings: a dataclass instance whose fields tyro turned into flags.
+    """
+    words = [command]
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        default = field.default_factory() if callable(field.default_factory) else field.default
+        if value != default:
+            words += _flag(field.name.replace("_", "-"), value)
+    return " ".join(words)
+
+
+def _flag(name: str, value: Any) -> list[str]:
+    if isinstance(value, bool):
+        return [f"--{name}" if value else f"--no-{name}"]
+    return [f"--{name}", *(shlex.quote(str(item)) for item in _flatten(value))]
+
+
+def _flatten(value: Any) -> Iterable[Any]:
+    if isinstance(value, tuple | list):
+        for item in value:
+            yield from _flatten(item)
+    else:
+        yield value
+
+
+# --- how long, how much -------------------------------------------------------------------------------
+
+
+def interleaved_times(
+    candidates: Mapping[str, Callable[[], object]],
+    repeats: int = 5,
+    budget_seconds: float = math.inf,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, list[float]]:
+    """Seconds per run of each candidate, all measured in turn so that a busy machine slows all alike.
+
+    Every candidate has one warm-up run, left out of the result (page faults can make it three times as
+    long), then at least one more; once its `budget_seconds` are used up it has no others. Compare medians.
+
+    Args:
+        clock: seconds. `time.process_time` for work on one thread of a shared machine, where other
+            processes would otherwise be counted too.
+    """
+    for work in candidates.values():
+        work()
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    for _ in range(repeats):
+        for name, work in candidates.items():
+            if sum(times[name]) < budget_seconds:
+                times[name].append(_seconds(work, clock))
+    return times
+
+
+def _seconds(work: Callable[[], object], clock: Callable[[], float]) -> float:
+    _synchronize()
+    start = clock()
+    work()
+    _synchronize()
+    return clock() - start
+
+
+def _synchronize() -> None:
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def peak_memory(setup: Callable[..., Callable[[], object]], *args: Any) -> int:
+    """Extra bytes that `setup(*args)()` holds at its peak over what was held just before the last call.
+
+    Measured in a fresh process, so nothing that ran before can lend it memory. Host memory, or the GPU's
+    where `setup` starts one. `setup` and `args` must be picklable. Good to a few MiB; Linux and macOS.
+    """
+    context = get_context("forkserver")
+    # Imported once, not for every measurement; torch would import sympy at the first gradient.
+    context.set_forkserver_preload(["torch", "sympy", setup.__module__])
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_measure_peak, setup, args).result()
+
+
+def _measure_peak(setup: Callable[..., Callable[[], object]], args: Sequence[Any]) -> int:
+    work = setup(*args)
+    gc.collect()
+    if torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        work()
+        return torch.cuda.max_memory_allocated() - before
+    before = _host_peak(reset=True)
+    work()
+    return _host_peak() - before
+
+
+def _host_peak(reset: bool = False) -> int:
+    """Most memory (bytes) this process has held; `reset` first forgets any peak above what it holds now."""
+    if sys.platform == "linux":
+        # getrusage would count the parent's peak too: Linux carries it over into a new process.
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        status = Path("/proc/self/status").read_text()
+        kibibytes = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
+        return int(kibibytes) * 1024
+    import resource  # absent on Windows
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
+
+
+# --- the report -----------------------------------------------------------------------------------------
+
+
+def progress_bar() -> Progress:
+    """A rich progress bar with the time left; add one task per benchmark."""
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    return Progress(*columns, speed_estimate_period=600)  # steps differ much: a short memory would jump about
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A markdown table; None becomes a dash."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join("–" if c is None else str(c) for c in line) + " |" for line in lines)
+
+
+def write_report(folder: Path, name: str, markdown: str, data: Mapping[str, Any]) -> None:
+    """Write `name`.json and `name`.md into `folder` (made if missing), each whole or not at all.
+
+    Raises:
+        ValueError: a figure is NaN or infinite, which JSON cannot hold and a report should not.
+    """
+    write_atomically(folder / f"{name}.json", json.dumps(data, indent=2, allow_nan=False) + "\n")
+    write_atomically(folder / f"{name}.md", markdown.rstrip() + "\n")
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file under a temporary name beside it and rename, so that no reader sees half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+        os.chmod(temporary, 0o644)  # mkstemp's files are private; a report is to be read
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise

@@ -1,0 +1,135 @@
+"""Gaussians to screen ellipses: the local affine (EWA) projection with its gradients."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lang3dxl_ns.rendering.gaussians import Camera, Gaussians
+
+# The affine approximation is bad far outside the image, so the place at which it is taken is held
+# within the image plus this part of its half size on every side (the rule of gsplat 1.4).
+FRUSTUM_MARGIN = 0.3
+# Larger ellipses overflow float32 in the determinant; only Gaussians that enclose the camera get there.
+MAX_SIGMA_PIXELS = 1e8
+
+
+@dataclass
+class Splats:
+    """Screen ellipses, one for every Gaussian; those that are out of sight have radius and opacity 0."""
+
+    means2d: Float[Tensor, "1 n 2"]
+    """Centres, pixels from the top-left corner. One tensor with gsplat's leading camera axis, because
+    densification reads the gradient from it."""
+    conics: Float[Tensor, "n 3"]
+    """Inverse covariances (xx, xy, yy), pixels⁻²."""
+    variances: Float[Tensor, "n 2"]
+    """Diagonal of the covariances (xx, yy), pixels², without gradient."""
+    depths: Float[Tensor, " n"]
+    """Distance along the camera's z axis, world units."""
+    opacities: Float[Tensor, " n"]
+    radii: Int[Tensor, "1 n"]
+    """Three standard deviations along the long axis, whole pixels; 0 where out of sight."""
+
+
+def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool) -> Splats:
+    """Project Gaussians to the screen (EWA splatting, Zwicker et al. 2001, with gsplat's conventions).
+
+    `near`: world units. `eps2d`: variance added to both screen axes, pixels². `antialiased`: scale the
+    opacity by the square root of the ratio of the determinants without and with `eps2d`
+    (Mip-Splatting, Yu et al. 2024).
+    """
+    view = camera.view_matrix.to(gaussians.means)
+    intrinsics = camera.intrinsics.to(gaussians.means)
+    points = gaussians.means @ view[:3, :3].T + view[:3, 3]
+    drawable = _drawable(points, gaussians.scales, intrinsics, near)
+    points = torch.where(drawable[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
+    scales = torch.where(drawable[:, None], gaussians.scales, 0.0)
+    x, y, z = points.unbind(1)
+    fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
+    slope_x, slope_y = x / z, y / z
+    means2d = torch.stack([fx * slope_x + cx, fy * slope_y + cy], dim=1)[None]
+
+    jacobian = torch.stack(
+        [
+            _jacobian_row(view[0, :3], view[2, :3], slope_x, z, fx, cx, camera.width),
+            _jacobian_row(view[1, :3], view[2, :3], slope_y, z, fy, cy, camera.height),
+        ],
+        dim=1,
+    )
+    axes_x, axes_y = torch.bmm(jacobian, _rotations(gaussians.quats) * scales[:, None]).unbind(1)
+    # The determinant as the squared area of the parallelogram of the two rows (Cauchy-Binet), and that
+    # of the blurred covariance as a sum of positive terms: nothing cancels, so float32 is enough for
+    # needles, where xx·yy − xy² loses every digit.
+    area = torch.linalg.vector_norm(torch.linalg.cross(axes_x, axes_y), dim=1)
+    xx, yy, xy = axes_x.square().sum(1), axes_y.square().sum(1), (axes_x * axes_y).sum(1)
+    determinant = (area.square() + eps2d * (xx + yy) + eps2d**2).clamp_min(1e-10)
+    xx, yy = xx + eps2d, yy + eps2d
+    conics = torch.stack([yy, -xy, xx], dim=1) / determinant[:, None]
+
+    opacities = torch.where(drawable, gaussians.opacities, 0.0)
+    if antialiased:
+        opacities = opacities * area / determinant.sqrt()
+    with torch.no_grad():
+        radii = _radii(means2d[0], xx, yy, xy, camera) * drawable
+    variances = torch.stack([xx, yy], dim=1).detach()
+    return Splats(means2d, conics, variances, z, opacities, radii[None])
+
+
+@torch.no_grad()
+def _drawable(
+    points: Float[Tensor, "n 3"],
+    scales: Float[Tensor, "n 3"],
+    intrinsics: Float[Tensor, "3 3"],
+    near: float,
+) -> Bool[Tensor, " n"]:
+    """In front of the near plane, and not so large on the screen that numbers overflow."""
+    z = points[:, 2]
+    sigma = scales.amax(1) * torch.maximum(intrinsics[0, 0], intrinsics[1, 1])
+    return (z > near) & (sigma < MAX_SIGMA_PIXELS * z)
+
+
+def _jacobian_row(
+    axis: Float[Tensor, " 3"],
+    forward: Float[Tensor, " 3"],
+    slope: Float[Tensor, " n"],
+    z: Float[Tensor, " n"],
+    focal: Tensor,
+    centre: Tensor,
+    size: int,
+) -> Float[Tensor, "n 3"]:
+    """Derivative of one pixel coordinate by the world position; `axis`, `forward`: camera axes in it."""
+    margin = FRUSTUM_MARGIN * 0.5 * size / focal
+    slope = slope.clamp(-centre / focal - margin, (size - centre) / focal + margin)
+    return (focal / z)[:, None] * (axis - slope[:, None] * forward)
+
+
+def _rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+    """Rotation matrices of quaternions (w, x, y, z) of any length; the identity for length zero."""
+    w, x, y, z = F.normalize(quats, dim=1).unbind(1)
+    xx, yy, zz = x * x, y * y, z * z
+    entries = [
+        1 - 2 * (yy + zz), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (xx + zz), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (xx + yy),
+    ]  # fmt: skip
+    return torch.stack(entries, dim=1).view(-1, 3, 3)
+
+
+def _radii(
+    means2d: Float[Tensor, "n 2"],
+    xx: Float[Tensor, " n"],
+    yy: Float[Tensor, " n"],
+    xy: Float[Tensor, " n"],
+    camera: Camera,
+) -> Int[Tensor, " n"]:
+    """gsplat's radius: three standard deviations along the long axis, 0 where that misses the image."""
+    spread = (0.25 * (xx - yy).square() + xy.square()).clamp_min(0.01).sqrt()
+    radii = (3 * (0.5 * (xx + yy) + spread).sqrt()).ceil()
+    x, y = means2d.unbind(1)
+    inside = (x + radii > 0) & (x - radii < camera.width) & (y + radii > 0) & (y - radii < camera.height)
+    return (radii * inside).int()

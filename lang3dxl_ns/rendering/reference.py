@@ -1,0 +1,135 @@
+"""A second rasteriser, written for clarity: every Gaussian against every pixel, gradients by autograd.
+
+It shares no arithmetic with the tiled one, and is what that one is tested and measured against. Use float64.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from lang3dxl_ns.rendering.gaussians import Camera, Gaussians, Rendering
+
+PIXELS_AT_A_TIME = 64
+
+
+def rasterize_reference(
+    gaussians: Gaussians,
+    camera: Camera,
+    channels: Float[Tensor, "n c"],
+    background: Float[Tensor, " c"] | None = None,
+    *,
+    features: Float[Tensor, "n d"] | None = None,
+    detach_features: bool = True,
+    render_depth: bool = False,
+    antialiased: bool = False,
+    near: float = 0.01,
+    eps2d: float = 0.3,
+) -> Rendering:
+    """As `rasterize`, in time proportional to Gaussians × pixels; all values finite, `info` stays empty."""
+    means2d, covariances, depths = project_reference(gaussians, camera)
+    blurred = covariances + eps2d * torch.eye(2).to(covariances)
+    opacities = gaussians.opacities
+    if antialiased:
+        opacities = opacities * torch.sqrt(torch.linalg.det(covariances) / torch.linalg.det(blurred))
+    order = torch.argsort(depths)
+    order = order[depths[order] > near]
+    attached = torch.cat([channels, torch.ones_like(depths)[:, None], depths[:, None]], dim=1)
+    detached = channels[:, :0] if features is None else features
+    maps, detached_maps = composite_reference(
+        means2d[order], torch.linalg.inv(blurred)[order], opacities[order], attached[order], detached[order],
+        camera.width, camera.height, detach=detach_features,
+    )  # fmt: skip
+
+    image, alpha, depth = maps.split([channels.shape[1], 1, 1], dim=2)
+    if background is not None:
+        image = image + (1 - alpha) * background
+    expected_depth = torch.where(alpha > 0, depth / alpha.clamp_min(1e-12), 0.0) if render_depth else None
+    return Rendering(image, None if features is None else detached_maps, alpha, expected_depth)
+
+
+def project_reference(
+    gaussians: Gaussians, camera: Camera
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, " n"]]:
+    """Pixel centres, screen covariances (pixels²) and depths by the textbook's matrices."""
+    q = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
+    identity = torch.eye(3).to(q).expand(len(q), 3, 3)
+    cross = torch.linalg.cross(q[:, None, 1:].expand(-1, 3, 3), identity).mT
+    rotations = identity + 2 * q[:, :1, None] * cross + 2 * cross @ cross  # Rodrigues
+    covariances = rotations @ torch.diag_embed(gaussians.scales**2) @ rotations.mT
+
+    view_rotation, translation = camera.view_matrix[:3, :3], camera.view_matrix[:3, 3]
+    points = gaussians.means @ view_rotation.T + translation
+    homogeneous = points @ camera.intrinsics.T
+    means2d = homogeneous[:, :2] / homogeneous[:, 2:]
+
+    focal, centre = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
+    size = torch.tensor([camera.width, camera.height]).to(points)
+    margin = 0.3 * size / (2 * focal)
+    depths = points[:, 2]
+    slopes = points[:, :2] / depths[:, None]
+    slopes = slopes.clamp(-centre / focal - margin, (size - centre) / focal + margin)
+    jacobian = torch.cat([torch.diag(focal).expand(len(q), 2, 2), -(focal * slopes)[:, :, None]], dim=2)
+    to_screen = jacobian / depths[:, None, None] @ view_rotation
+    return means2d, to_screen @ covariances @ to_screen.mT, depths
+
+
+def composite_reference(
+    means2d: Float[Tensor, "n 2"],
+    conics: Float[Tensor, "n 2 2"],
+    opacities: Float[Tensor, " n"],
+    attached: Float[Tensor, "n c"],
+    detached: Float[Tensor, "n d"],
+    width: int,
+    height: int,
+    *,
+    detach: bool,
+) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w d"]]:
+    """Composite Gaussians that are sorted front to back over black.
+
+    With `detach`, the gradient of the second map reaches only `detached`.
+    """
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack([x, y], dim=-1).view(-1, 2).to(means2d)
+
+    def block_maps(block: Tensor, *splats: Tensor) -> tuple[Tensor, Tensor]:
+        weights = pixel_weights(block, *splats[:3])
+        return weights @ splats[3], (weights.detach() if detach else weights) @ splats[4]
+
+    maps = []
+    for block in pixels.split(PIXELS_AT_A_TIME):
+        # Leaving out what is skipped in every pixel of the block changes nothing and saves the memory.
+        with torch.no_grad():
+            used = (pixel_alphas(block, means2d, conics, opacities) > 0).any(0)
+        splats = [value[used] for value in (means2d, conics, opacities, attached, detached)]
+        maps.append(checkpoint(block_maps, block, *splats, use_reentrant=False))
+    first, second = (torch.cat(parts) for parts in zip(*maps, strict=True))
+    return first.view(height, width, -1), second.view(height, width, second.shape[1])
+
+
+def pixel_weights(
+    pixels: Float[Tensor, "p 2"],
+    means2d: Float[Tensor, "n 2"],
+    conics: Float[Tensor, "n 2 2"],
+    opacities: Float[Tensor, " n"],
+) -> Float[Tensor, "p n"]:
+    """Alpha × transmittance; 0 from the Gaussian on that would take the transmittance to 1e-4 or below."""
+    alphas = pixel_alphas(pixels, means2d, conics, opacities)
+    after = torch.cumprod(1 - alphas, dim=1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
+    return torch.where(after > 1e-4, alphas * before, 0.0)
+
+
+def pixel_alphas(
+    pixels: Float[Tensor, "p 2"],
+    means2d: Float[Tensor, "n 2"],
+    conics: Float[Tensor, "n 2 2"],
+    opacities: Float[Tensor, " n"],
+) -> Float[Tensor, "p n"]:
+    """Opacity × Gaussian, at most 0.999, 0 below 1/255."""
+    x, y = pixels[:, :1] - means2d[:, 0], pixels[:, 1:] - means2d[:, 1]
+    xx, xy, yy = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
+    alphas = opacities * torch.exp(-0.5 * (xx * x * x + 2 * xy * x * y + yy * y * y))
+    return torch.where(alphas >= 1 / 255, alphas.clamp_max(0.999), 0.0)

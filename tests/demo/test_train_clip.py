@@ -1,0 +1,182 @@
+"""Training, interrupted or not, gives the same model; the preparation reads it; the shipped one can see."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from lang3dxl_ns.demo import train_dense
+from lang3dxl_ns.demo.captions import ADJECTIVES, CANONICAL, CLASS, GENERIC, Caption
+from lang3dxl_ns.demo.labels import CATEGORIES, ELEMENT, PART, category_masks
+from lang3dxl_ns.demo.materials import MATERIALS
+from lang3dxl_ns.demo.teacher import average_precision, relevancy, score_teacher
+from lang3dxl_ns.demo.train_clip import ClipTraining, caption_fit, contrastive_loss, learning_rate, train
+from lang3dxl_ns.demo.views import render_landmark
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation import encoders
+from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """Coloured noise in place of rendered landmarks: training doesn't mind."""
+    folder = tmp_path_factory.mktemp("cache")
+    rng = np.random.default_rng(0)
+    (folder / "train").mkdir()
+    for seed, family in ((10_000, "mosque"), (10_001, "cathedral")):
+        planes = np.zeros((2, 6, 60, 80), np.uint8)
+        planes[:, :3] = rng.integers(0, 255, (2, 3, 60, 80))
+        planes[:, 3, :, 20:60] = PART["dome"]
+        planes[:, 4, 20:40, 30:50] = ELEMENT["window"]
+        np.save(folder / "train" / f"{family}_{seed}.npy", planes)
+    return folder
+
+
+def settings(cache, out, **changes):
+    config = ClipTraining(
+        out=out, cache=cache, steps=20, batch=8, landmarks=2, render_processes=0, validation_landmarks=0
+    )
+    return dataclasses.replace(config, **changes)
+
+
+@pytest.fixture(scope="module")
+def trained(cache, tmp_path_factory):
+    out = tmp_path_factory.mktemp("models") / "clip"
+    train(settings(cache, out))
+    return out
+
+
+def test_an_interrupted_training_ends_with_the_same_weights(cache, trained, tmp_path):
+    train(settings(cache, tmp_path / "clip", stop_after=7))
+    assert not (tmp_path / "clip").exists()
+    train(settings(cache, tmp_path / "clip", resume=True))
+    weights, expected = (load_file(folder / "model.safetensors") for folder in (tmp_path / "clip", trained))
+    assert weights.keys() == expected.keys()
+    for name, tensor in expected.items():
+        torch.testing.assert_close(weights[name], tensor, rtol=1e-4, atol=1e-5)
+
+
+def test_a_checkpoint_of_another_model_is_refused(cache, tmp_path):
+    (tmp_path / "train").symlink_to(cache / "train")
+    torch.save({"model": {"weight": torch.zeros(1)}}, tmp_path / "checkpoint.pt")
+    with pytest.raises(UserError, match="another model"):
+        train(settings(tmp_path, tmp_path / "clip", resume=True))
+
+
+def test_training_without_time_ends_at_once_with_a_model(cache, tmp_path):
+    train(settings(cache, tmp_path / "clip", minutes=0))
+    assert (tmp_path / "clip" / "model.safetensors").exists()
+
+
+def test_the_saved_folder_is_read_by_the_preparation(trained):
+    encoder = load_image_text_encoder(trained, "cpu")
+    assert encoder.encode_images(torch.rand(2, 3, 48, 48)).shape == (2, encoder.dim)
+    assert encoder.encode_texts(["minarets", "a rose window, seen from far away"]).shape == (2, encoder.dim)
+    assert (trained / "vocab.json").exists()
+    assert (trained / "merges.txt").exists()
+
+
+def test_categories_and_canonical_phrases_are_single_known_tokens(trained):
+    from transformers import CLIPTokenizer
+
+    tokenizer = CLIPTokenizer.from_pretrained(trained)
+    for word in (*CATEGORIES, *CANONICAL):
+        ids = tokenizer(word)["input_ids"]
+        assert len(ids) == 3, word
+        assert tokenizer.unk_token_id not in ids[1:-1], word
+    odd = tokenizer("Zwiebeltürme & fenêtres 7")["input_ids"][1:-1]
+    assert tokenizer.unk_token_id not in odd
+
+
+def test_a_caption_fits_by_class_share_material_and_family():
+    shares = np.zeros((2, GENERIC))
+    shares[0, CLASS["dome"]], shares[1, CLASS["dome"]], shares[1, CLASS["wall"]] = 1.0, 0.4, 0.6
+    materials = np.repeat([[MATERIALS.index("gold")], [MATERIALS.index("slate")]], GENERIC, axis=1)
+    captions = [
+        Caption("dome", CLASS["dome"]),
+        Caption("golden dome", CLASS["dome"], adjective=ADJECTIVES.index("golden")),
+        Caption("dome of a mosque", CLASS["dome"], family=1),
+        Caption("things", GENERIC),
+    ]
+    fit = caption_fit(captions, shares, materials, np.array([1, 0]))
+    np.testing.assert_allclose(fit[:, 0], [1.0, 0.4])
+    np.testing.assert_allclose(fit[:, 1], [1.0, 0.4 * 0.3])
+    np.testing.assert_allclose(fit[:, 2], [1.0, 0.4 * 0.3])
+    assert fit[0, 3] == fit[1, 3] > 0
+
+
+def test_the_loss_is_lowest_where_similarities_follow_the_fit():
+    fit = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    classes = torch.tensor([0, 1])
+    unit = torch.eye(2)
+    right, wrong = (
+        contrastive_loss(unit, texts, fit, classes, torch.tensor(10.0)) for texts in (unit, unit.flip(0))
+    )
+    assert right < 0.01
+    assert wrong > 9
+
+
+def test_a_class_with_many_captions_pulls_a_crop_no_more_than_one_with_a_single_caption():
+    """The image→text half is least where the two classes, not the three captions, share the probability."""
+    fit, classes = torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([0, 0, 1])
+    image, scale = torch.tensor([[1.0, 0.0]]), torch.tensor(1.0)
+
+    def loss(single):  # log probabilities of the captions; the text→image half is constant for a single crop
+        logits = torch.tensor([(1 - single) / 2, (1 - single) / 2, single]).log()
+        return float(contrastive_loss(image, torch.stack([logits, logits * 0], dim=1), fit, classes, scale))
+
+    assert loss(0.5) < loss(1 / 3)
+    assert loss(0.5) < loss(0.7)
+
+
+def test_the_learning_rate_warms_up_and_falls_to_a_fiftieth():
+    peak = learning_rate(60, 0.0)
+    assert learning_rate(0, 0.0) < peak / 50
+    assert learning_rate(500, 0.5) == pytest.approx(0.51 * peak)
+    assert learning_rate(1_000, 1.0) == pytest.approx(0.02 * peak)
+
+
+def test_average_precision_is_one_for_a_perfect_order_and_the_share_of_positives_by_chance():
+    truth = np.array([False, True, False, True])
+    assert average_precision(np.array([0.1, 0.9, 0.2, 0.8]), truth) == 1
+    assert average_precision(np.array([0.9, 0.1, 0.8, 0.2]), truth) == pytest.approx((1 / 3 + 2 / 4) / 2)
+    rng = np.random.default_rng(0)
+    assert average_precision(rng.random(20_000), rng.random(20_000) < 0.2) == pytest.approx(0.2, abs=0.02)
+
+
+def test_relevancy_is_a_half_where_a_query_ties_with_the_nearest_canonical_phrase():
+    features = torch.tensor([[[2.0, 0.0], [0.0, 3.0], [1.0, 1.0]]])
+    scores = relevancy(features, torch.tensor([[5.0, 0.0]]), torch.tensor([[0.0, 1.0], [-1.0, 0.0]]))[0, 0]
+    assert scores[0] > 0.5 > scores[1]
+    assert scores[2] == pytest.approx(0.5)
+
+
+def test_a_dense_encoder_made_from_the_clip_reads_photos_at_any_grid(cache, trained, tmp_path):
+    train_dense.train(train_dense.DenseTraining(clip=trained, out=tmp_path / "dense", cache=cache, steps=2))
+    photo = torch.rand(60, 90, 3)
+    for tokens in (4, 9):
+        features = load_dense_encoder(tmp_path / "dense", "cpu", tokens).encode(photo)
+        assert features.shape[:2] == (tokens, tokens)
+        assert features.flatten(0, 1).std(0).min() > 0
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    folder = encoders._BUILTIN_CLIP
+    if not folder.is_dir():
+        pytest.skip("no small CLIP is shipped")
+    return folder
+
+
+def test_the_shipped_model_is_small(shipped):
+    assert sum(path.stat().st_size for path in shipped.iterdir()) <= 8e6
+
+
+@pytest.mark.slow
+def test_the_shipped_model_finds_what_it_is_asked_for_on_a_landmark_it_has_never_seen(shipped, tmp_path):
+    views = [np.load(render_landmark(tmp_path, seed, 1))[0] for seed in (0, 1)]
+    score = score_teacher(load_image_text_encoder("builtin", "cpu"), views)
+    chance = np.mean([[mask.mean() for mask in category_masks(view[3], view[4]).values()] for view in views])
+    assert score.mean > max(0.3, 2 * chance)

@@ -1,0 +1,203 @@
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from PIL import Image
+
+from lang3dxl_ns.preparation.pyramid import (
+    build_clip_target,
+    crop_centres,
+    cut_crops,
+    iterate_crops,
+    valid_fractions,
+)
+
+
+def mean_colour(crops):
+    return crops.mean(dim=(2, 3))
+
+
+def random_photo(height, width, seed=0):
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize(("side", "count"), [(32, 62), (100, 20), (1000, 2)])
+def test_grid_counts_are_the_published_ones(side, count):
+    assert len(crop_centres(1000, side)) == count
+
+
+@pytest.mark.parametrize("length", [5, 31, 97, 532, 708, 1000])
+@pytest.mark.parametrize("side", [2, 3, 32, 33, 64, 101, 700])
+def test_centres_are_half_a_crop_apart_symmetric_and_inside(length, side):
+    centres = crop_centres(length, side)
+    assert (centres.diff() == side // 2).all()
+    assert 0 <= centres.min() <= centres.max() <= length
+    assert abs(float(centres.float().mean()) - length / 2) <= 0.5
+
+
+def test_an_axis_shorter_than_half_a_crop_has_its_middle():
+    assert crop_centres(21, 100).tolist() == [10]
+
+
+def test_a_side_below_two_pixels_is_refused():
+    with pytest.raises(ValueError, match="at least 2 pixels"):
+        crop_centres(100, 1)
+
+
+@pytest.mark.parametrize("side", [32, 45])
+def test_the_middle_of_a_crop_is_its_centre(side):
+    photo, half = random_photo(83, 120), side // 2
+    crops, valid = cut_crops(photo, side, 2 * half)
+    ys, xs = crop_centres(83, side), crop_centres(120, side)
+    assert valid.shape == (len(ys), len(xs))
+    for crop, y, x in zip(crops, ys.repeat_interleave(len(xs)), xs.repeat(len(ys)), strict=True):
+        assert torch.equal(crop[:, half, half], photo[y, x])
+
+
+@pytest.mark.parametrize(("height", "width", "side"), [(83, 120, 32), (60, 200, 130), (10, 300, 64)])
+def test_crops_are_black_outside_and_the_valid_fraction_is_what_is_not(height, width, side):
+    white = torch.ones(height, width, 3)
+    crops, valid = cut_crops(white, side, 2 * (side // 2))
+    assert set(crops.unique().tolist()) <= {0.0, 1.0}
+    assert torch.allclose(mean_colour(crops)[:, 0].view_as(valid), valid)
+    assert torch.equal(valid_fractions(height, width, side), valid)
+    assert valid.min() < 1
+
+
+@pytest.mark.parametrize("batch_size", [1, 7, 1000])
+def test_batches_are_bounded_and_hold_the_same_crops_in_the_same_order(batch_size):
+    photo = random_photo(83, 120)
+    batches = list(iterate_crops(photo, 40, 24, batch_size))
+    assert max(len(batch) for batch in batches) <= batch_size
+    assert torch.allclose(torch.cat(batches), cut_crops(photo, 40, 24)[0], atol=1e-6)
+
+
+def test_resized_crops_match_pillows_bicubic():
+    photo = (64 + random_photo(128, 128) * 127).round() / 255  # Pillow clips between its axes: no overshoot
+    for side, size in ((96, 32), (32, 64)):
+        crops, valid = cut_crops(photo, side, size)
+        index = int(valid.flatten().argmax())
+        rows, columns = crop_centres(128, side), crop_centres(128, side)
+        y, x, half = int(rows[index // len(columns)]), int(columns[index % len(columns)]), side // 2
+        pixels = F.pad(photo, (0, 0, half, half, half, half))[y : y + side, x : x + side]
+        image = Image.fromarray((pixels * 255).round().byte().numpy()).resize(
+            (size, size), Image.Resampling.BICUBIC
+        )
+        difference = crops[index].permute(1, 2, 0) * 255 - torch.from_numpy(np.array(image)).float()
+        assert difference.abs().max() < 1.6  # Pillow rounds to 8 bits after each axis
+
+
+def test_fine_texture_turns_grey_when_shrunk():
+    rows, columns = torch.meshgrid(torch.arange(256), torch.arange(256), indexing="ij")
+    checkers = ((rows + columns) % 2).float()[..., None].expand(-1, -1, 3)
+    crops, valid = cut_crops(checkers, 128, 32)
+    inside = crops[valid.flatten() == 1]
+    assert len(inside) > 0
+    assert (inside - 0.5).abs().max() < 0.02
+
+
+def test_crops_stay_in_the_photos_range_and_type():
+    photo = (random_photo(90, 90) > 0.5).double()
+    crops, _ = cut_crops(photo, 32, 77)
+    assert crops.dtype == torch.float64
+    assert 0 <= crops.min() <= crops.max() <= 1
+
+
+def slow_target(photo, sides, encode, size):
+    """Crop by crop and cell by cell."""
+    height, width = photo.shape[:2]
+    grids = []
+    for side in sides:
+        half = side // 2
+        ys, xs = crop_centres(height, side).tolist(), crop_centres(width, side).tolist()
+        grid = np.zeros((len(ys), len(xs), 4))
+        for i, y in enumerate(ys):
+            for j, x in enumerate(xs):
+                canvas, inside = torch.zeros(2 * half, 2 * half, 3), torch.zeros(2 * half, 2 * half)
+                y0, y1, x0, x1 = (
+                    max(0, y - half),
+                    min(height, y + half),
+                    max(0, x - half),
+                    min(width, x + half),
+                )
+                window = slice(y0 - y + half, y1 - y + half), slice(x0 - x + half, x1 - x + half)
+                canvas[window], inside[window] = photo[y0:y1, x0:x1], 1
+                crop = F.interpolate(
+                    canvas.permute(2, 0, 1)[None], (size, size), mode="bicubic", antialias=True
+                )
+                grid[i, j] = [*encode(crop.clamp(0, 1))[0].tolist(), inside.mean()]
+        grids.append(grid)
+    rows, columns = grids[int(np.argmin(sides))].shape[:2]
+    target = np.zeros((rows, columns, 4))
+    for i in range(rows):
+        for j in range(columns):
+            for grid in grids:
+                y = np.clip((i + 0.5) / rows * grid.shape[0] - 0.5, 0, grid.shape[0] - 1)
+                x = np.clip((j + 0.5) / columns * grid.shape[1] - 0.5, 0, grid.shape[1] - 1)
+                y0, x0 = int(y), int(x)
+                y1, x1 = min(y0 + 1, grid.shape[0] - 1), min(x0 + 1, grid.shape[1] - 1)
+                top = grid[y0, x0] * (1 - x + x0) + grid[y0, x1] * (x - x0)
+                bottom = grid[y1, x0] * (1 - x + x0) + grid[y1, x1] * (x - x0)
+                target[i, j] += (top * (1 - y + y0) + bottom * (y - y0)) / len(grids)
+    return torch.from_numpy(target).float()
+
+
+@pytest.mark.parametrize("sides", [[32, 60, 110], [110, 33]])
+def test_the_target_equals_the_slow_loop(sides):
+    photo = random_photo(70, 110)
+    target = build_clip_target(photo, sides, [float(side) for side in sides], mean_colour, 24, batch_size=5)
+    expected = slow_target(photo, sides, mean_colour, 24)
+    assert target.features.dtype == torch.float32
+    assert torch.allclose(target.features, expected[..., :3], atol=1e-5)
+    assert torch.allclose(target.valid, expected[..., 3], atol=1e-6)
+
+
+def test_a_constant_photo_differs_only_where_crops_leave_it():
+    photo = torch.full((200, 300, 3), 0.6)
+    target = build_clip_target(photo, [32, 64], [1.0, 2.0], mean_colour, 32, batch_size=16)
+    inside = target.valid > 1 - 1e-6
+    assert 0.3 < inside.float().mean() < 1
+    assert torch.allclose(target.features[inside], torch.tensor(0.6), atol=1e-5)
+    assert torch.allclose(target.features[..., 0], 0.6 * target.valid, atol=1e-2)
+
+
+def test_every_scale_counts_the_same():
+    scale_of_call = iter([1.0, 10.0, 100.0])
+    target = build_clip_target(
+        random_photo(128, 128),
+        [32, 64, 128],
+        [0.5, 1.0, 2.0],
+        lambda crops: torch.full((len(crops), 2), next(scale_of_call)),
+        32,
+        batch_size=10_000,
+    )
+    assert torch.allclose(target.features, torch.tensor(37.0))
+    assert (target.crop_sides, target.scales, target.range_factor) == ([32, 64, 128], [0.5, 1.0, 2.0], 4.0)
+
+
+def test_cells_lie_where_the_grid_says():
+    height, width = 256, 384
+    ramp = ((torch.arange(width) + 0.5) / width).expand(height, width)[..., None].expand(-1, -1, 3)
+    target = build_clip_target(ramp, [32, 64], [1.0, 2.0], mean_colour, 32, batch_size=64)
+    rows, columns = target.features.shape[:2]
+    expected = (torch.arange(columns) + 0.5) / columns
+    middle = target.features[rows // 2, 4:-4, 0]
+    assert torch.allclose(middle, expected[4:-4], atol=2e-3)
+
+
+def test_the_encoder_never_sees_more_than_a_batch_and_needs_no_gradient():
+    seen = []
+
+    def encode(crops):
+        seen.append(len(crops))
+        return mean_colour(crops)
+
+    photo = random_photo(100, 100).requires_grad_()
+    target = build_clip_target(photo, [32, 50], [1.0, 1.5], encode, 16, batch_size=9)
+    assert max(seen) == 9
+    assert not target.features.requires_grad
+
+
+def test_sides_and_scales_must_go_together():
+    with pytest.raises(ValueError, match="2 sides, 1 scales"):
+        build_clip_target(random_photo(64, 64), [32, 40], [1.0], mean_colour, 16, 4)

@@ -1,0 +1,90 @@
+"""The gsplat backend: on a GPU against the torch backend; elsewhere what is passed to gsplat and back."""
+
+import pytest
+import torch
+from splat_clouds import gradients, make_cloud, maps, relative_error
+
+from lang3dxl_ns.rendering import Camera, Gaussians, rasterize
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+
+
+def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **settings):
+    """gsplat.rasterization's signature over the torch backend: one camera, float32, unpacked."""
+    assert settings.pop("packed") is False
+    assert {tensor.dtype for tensor in (means, quats, scales, opacities, colors, viewmats, Ks)} == {
+        torch.float32
+    }
+    depth = settings.pop("render_mode", "RGB") == "RGB+ED"
+    rendering = rasterize(
+        Gaussians(means, quats, scales, opacities), Camera(viewmats[0], Ks[0], width, height), colors,
+        settings.pop("backgrounds")[0], near=settings.pop("near_plane"), eps2d=settings.pop("eps2d"),
+        antialiased=settings.pop("rasterize_mode") == "antialiased", render_depth=depth,
+        absgrad=settings.pop("absgrad", False), backend="torch",
+    )  # fmt: skip
+    assert not settings
+    image = torch.cat([rendering.image, rendering.depth], dim=2) if depth else rendering.image
+    return image[None], rendering.alpha[None], {**rendering.info, "tile_size": 16}
+
+
+@pytest.mark.parametrize("detach", [True, False])
+@pytest.mark.parametrize("depth", [True, False])
+def test_the_maps_and_gradients_come_back_in_their_places(monkeypatch, detach, depth):
+    monkeypatch.setattr("gsplat.rasterization", stand_in)
+    cloud = make_cloud(200, 40, 30)
+    settings = {"detach_features": detach, "render_depth": depth, "antialiased": True, "near": 1.0}
+    torch_leaves, gsplat_leaves = cloud.leaves(torch.float32), cloud.leaves(torch.float32)
+    expected = cloud.render(rasterize, torch_leaves, backend="torch", **settings)
+    found = cloud.render(rasterize, gsplat_leaves, backend="gsplat", **settings)
+    assert maps(found).keys() == maps(expected).keys()
+    for name, value in maps(expected).items():
+        torch.testing.assert_close(getattr(found, name), value, atol=1e-6, rtol=1e-5)
+    expected_gradients = gradients(expected, torch_leaves)
+    for name, value in gradients(found, gsplat_leaves).items():
+        assert relative_error(value, expected_gradients[name]) < 1e-4, name
+    assert found.info.keys() == expected.info.keys()
+
+
+def test_tensors_on_the_cpu_are_rendered_by_torch(monkeypatch):
+    monkeypatch.setattr("gsplat.rasterization", lambda *a, **k: pytest.fail("gsplat was called"))
+    cloud = make_cloud(20, 16, 16)
+    cloud.render(rasterize, cloud.leaves(torch.float32))
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize("detach", [True, False])
+@pytest.mark.parametrize("antialiased", [True, False])
+def test_both_backends_render_the_same_function(detach, antialiased):
+    cloud = make_cloud(3000, 160, 120, size=0.03)
+    cloud.tensors = {name: value.cuda() for name, value in cloud.tensors.items()}
+    cloud.intrinsics = cloud.intrinsics.cuda()
+    settings = {"detach_features": detach, "antialiased": antialiased, "absgrad": True}
+    renderings, found = {}, {}
+    for backend in ("torch", "gsplat"):
+        leaves = cloud.leaves(torch.float32)
+        rendering = renderings[backend] = cloud.render(rasterize, leaves, backend=backend, **settings)
+        rendering.info["means2d"].retain_grad()
+        found[backend] = gradients(rendering, leaves)
+    # gsplat cuts at three standard deviations, rounded out to tiles of 16; the torch backend where alpha
+    # reaches 1/255, so that an opaque Gaussian's rim (alpha below 0.011) may be missing there.
+    for name, value in maps(renderings["torch"]).items():
+        error = (getattr(renderings["gsplat"], name) - value).abs()
+        assert error.mean() < 2e-3, name
+        assert (error > 2e-2).float().mean() < 1e-2, name
+    for name, value in found["torch"].items():
+        assert relative_error(found["gsplat"][name], value) < 5e-2, name
+    radii = [rendering.info["radii"].float() for rendering in renderings.values()]
+    assert ((radii[0] - radii[1]).abs() > 1).float().mean() < 1e-3
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_the_torch_backend_gives_the_same_on_a_gpu_as_on_the_cpu():
+    cloud = make_cloud(500, 60, 40)
+    on_cpu = cloud.render(rasterize, cloud.leaves())
+    cloud.tensors = {name: value.cuda() for name, value in cloud.tensors.items()}
+    cloud.intrinsics = cloud.intrinsics.cuda()
+    on_gpu = cloud.render(rasterize, cloud.leaves(), backend="torch")
+    for name, value in maps(on_cpu).items():
+        torch.testing.assert_close(getattr(on_gpu, name).cpu(), value, atol=1e-9, rtol=0)

@@ -1,0 +1,163 @@
+"""Scenes at the edge of what is allowed."""
+
+import pytest
+import torch
+from splat_clouds import gaussians, gradients, make_cloud, maps, relative_error
+
+from lang3dxl_ns.rendering import Camera, Gaussians, rasterize, tile_plan
+from lang3dxl_ns.rendering.reference import rasterize_reference
+
+
+def assert_all_finite(rendering, leaves):
+    for name, value in maps(rendering).items():
+        assert bool(value.isfinite().all()), name
+    found = gradients(rendering, leaves)
+    for name, value in found.items():
+        assert bool(value.isfinite().all()), name
+    return found
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (3, 50), (8, 8), (41, 4), (17, 31)])
+def test_any_image_size_equals_the_reference(width, height):
+    cloud = make_cloud(60, width, height, size=0.3)
+    ours, theirs = cloud.leaves(), cloud.leaves()
+    expected, found = cloud.render(rasterize_reference, theirs), cloud.render(rasterize, ours)
+    assert found.image.shape == (height, width, 3)
+    torch.testing.assert_close(found.image, expected.image, atol=1e-10, rtol=0)
+    expected_gradients = gradients(expected, theirs)
+    for name, value in gradients(found, ours).items():
+        assert relative_error(value, expected_gradients[name]) < 1e-8, name
+
+
+@pytest.mark.parametrize("case", ["no Gaussians", "all behind", "all transparent"])
+def test_nothing_to_see_is_the_background(case):
+    cloud = make_cloud(0 if case == "no Gaussians" else 50, 20, 10)
+    if case == "all behind":
+        cloud.tensors["means"][:, 2] -= 100
+    if case == "all transparent":
+        cloud.tensors["opacities"][:] = 0
+    leaves = cloud.leaves(torch.float32)
+    rendering = cloud.render(rasterize, leaves)
+    torch.testing.assert_close(rendering.image, leaves["background"].expand_as(rendering.image))
+    assert not rendering.alpha.any()
+    assert not rendering.depth.any()
+    found = assert_all_finite(rendering, leaves)
+    assert not found["means"].any()
+    assert found["background"].any()
+
+
+def test_an_opacity_of_zero_or_one_has_finite_gradients():
+    cloud = make_cloud(100, 30, 20, size=0.1)
+    cloud.tensors["opacities"][::2] = 0
+    cloud.tensors["opacities"][1::4] = 1
+    ours, theirs = cloud.leaves(), cloud.leaves()
+    found = assert_all_finite(cloud.render(rasterize, ours), ours)
+    expected = gradients(cloud.render(rasterize_reference, theirs), theirs)
+    for name, value in found.items():
+        assert relative_error(value, expected[name]) < 1e-9, name
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_degenerate_shapes_have_finite_gradients(dtype, antialiased):
+    cloud = make_cloud(120, 40, 30)
+    cloud.tensors["quats"][:20] = 0
+    cloud.tensors["scales"][20:40] = 0
+    cloud.tensors["scales"][40:60] = torch.tensor([1e-6, 1e-6, 5.0])
+    cloud.tensors["scales"][60:70] = 1e20
+    leaves = cloud.leaves(dtype)
+    assert_all_finite(cloud.render(rasterize, leaves, antialiased=antialiased), leaves)
+
+
+@pytest.mark.parametrize("broken", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities"])
+def test_broken_gaussians_are_left_out_and_get_no_gradient(name, broken):
+    cloud, rest = make_cloud(60, 30, 20), make_cloud(60, 30, 20)
+    rest.tensors["opacities"][:10] = 0
+    expected = rest.render(rasterize, rest.leaves(torch.float32))
+    cloud.tensors[name][:10] = broken
+    leaves = cloud.leaves(torch.float32)
+    rendering = cloud.render(rasterize, leaves)
+    torch.testing.assert_close(rendering.image, expected.image)
+    found = assert_all_finite(rendering, leaves)
+    for parameter in ("means", "quats", "scales", "opacities"):
+        assert not found[parameter][:10].any()
+        assert found[parameter][10:].any()
+
+
+def test_broken_colours_of_unseen_gaussians_do_no_harm():
+    cloud = make_cloud(60, 30, 20)
+    cloud.tensors["means"][:10, 2] = -5
+    cloud.tensors["channels"][:10] = float("nan")
+    leaves = cloud.leaves(torch.float32)
+    assert_all_finite(cloud.render(rasterize, leaves), leaves)
+
+
+def test_a_long_needle_is_as_exact_in_float32_far_from_its_centre():
+    # Centre 2900 px outside the image, standard deviation 3000 px along a slanted axis.
+    camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 16], [0, 100.0, 16], [0, 0, 1]]), 32, 32)
+    direction = torch.nn.functional.normalize(torch.tensor([0.9, 0.43, 0.0]), dim=0)
+    half = torch.atan2(direction[1], direction[0]) / 2
+    needle = Gaussians(
+        (10 * 29 * direction + torch.tensor([0, 0, 10.0]))[None],
+        torch.stack([half.cos(), half * 0, half * 0, half.sin()])[None],
+        torch.tensor([[300.0, 1e-3, 1e-3]]),
+        torch.tensor([0.9]),
+    )
+    exact = Gaussians(*(value.double() for value in vars(needle).values()))
+    exact_camera = Camera(camera.view_matrix.double(), camera.intrinsics.double(), 32, 32)
+    image = rasterize(needle, camera, torch.ones(1, 1)).image
+    expected = rasterize_reference(exact, exact_camera, torch.ones(1, 1).double()).image
+    assert expected.max() > 0.4
+    assert float((image - expected).abs().max()) < 2e-4
+
+
+def test_cutting_the_depth_order_into_segments_changes_nothing(monkeypatch):
+    cloud = make_cloud(500, 60, 40, size=0.15)
+    whole = cloud.leaves()
+    expected = cloud.render(rasterize, whole)
+    expected_gradients = gradients(expected, whole)
+    monkeypatch.setattr(tile_plan.Footprints.segments, "__defaults__", (300,))
+    leaves = cloud.leaves()
+    rendering = cloud.render(rasterize, leaves)
+    torch.testing.assert_close(rendering.image, expected.image, atol=1e-12, rtol=0)
+    for name, value in gradients(rendering, leaves).items():
+        assert relative_error(value, expected_gradients[name]) < 1e-11, name
+
+
+def test_gaussians_close_to_the_camera_do_not_blow_up_the_memory(monkeypatch):
+    expand, expanded = tile_plan._expand, []
+
+    def counting(*arguments):
+        found = expand(*arguments)
+        expanded.append(len(found[0]))
+        return found
+
+    monkeypatch.setattr(tile_plan, "_expand", counting)
+    cloud = make_cloud(3000, 320, 240, size=0.02)
+    cloud.tensors["means"] *= 0.02
+    cloud.tensors["view_matrix"][:3, 3] *= 0.02
+    leaves = cloud.leaves(torch.float32)
+    cloud.render(rasterize, leaves).image.sum().backward()
+    assert len(expanded) > 2
+    assert max(expanded) <= tile_plan.ROWS_PER_SEGMENT
+    assert bool(leaves["means"].grad.isfinite().all())
+
+
+def test_no_pair_of_tile_and_gaussian_that_reaches_the_threshold_is_culled():
+    cloud = make_cloud(300, 70, 50, size=0.06)
+    leaves = cloud.leaves()
+    single = cloud.render(rasterize, leaves, features=torch.eye(300, dtype=torch.float64), render_depth=False)
+    alone = cloud.render(
+        rasterize_reference, leaves, features=torch.eye(300, dtype=torch.float64), render_depth=False
+    )
+    assert bool(((alone.features > 0) == (single.features > 0)).all())
+
+
+def test_sizes_that_do_not_fit_are_reported_with_both_numbers():
+    cloud = make_cloud(5, 8, 8)
+    leaves = cloud.leaves()
+    with pytest.raises(ValueError, match=r"there are 5 means, but \{'features': 4\}"):
+        cloud.render(rasterize, leaves, features=leaves["features"][:4])
+    with pytest.raises(ValueError, match=r"3 channels, but a background of shape \(2,\)"):
+        rasterize(gaussians(leaves), cloud.camera(leaves), leaves["channels"], torch.zeros(2))
