@@ -1,1 +1,28 @@
-"""Language in large 3D scenes: Lang3D-XL as a nerfstudio plugin."""
+"""Language in large 3D scenes: Lang3D-XL as a nerfstudio plugin.
+
+What is useful without nerfstudio can be imported from here; each name loads its module at first use, so that
+importing the package costs nothing.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_PUBLIC = {
+    "Camera": "rendering",
+    "Gaussians": "rendering",
+    "Rendering": "rendering",
+    "rasterize": "rendering",
+    "AttenuatedDownsampler": "components.downsampler",
+    "DownsamplerConfig": "components.downsampler",
+    "HashGrid": "components.hash_grid",
+    "SemanticField": "components.semantic_field",
+    "SemanticFieldConfig": "components.semantic_field",
+    "UserError": "errors",
+}
+__all__ = list(_PUBLIC)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)

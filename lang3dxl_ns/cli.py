@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
@@ -73,6 +74,7 @@ Benchmark = (
 )
 Command = (
     Annotated[Prepare, tyro.conf.subcommand("prepare")]
+    | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]
     | Annotated[
         Benchmark,
         tyro.conf.subcommand("benchmark", description="Measure: time, memory and error, side by side."),

@@ -80,7 +80,7 @@ class PhotoDataset(InputDataset):
 
 
 class PhotoCache:
-    """Keeps decoded photos up to a number of bytes and reads ahead in a thread."""
+    """Keeps decoded photos up to a number of bytes, the few read ahead (in a thread) on top."""
 
     def __init__(self, read: Callable[[int], dict[str, Tensor]], max_bytes: float):
         self._read = read
@@ -121,9 +121,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
     train_dataset: PhotoDataset
     eval_dataset: PhotoDataset
 
-    def __init__(self, *args, **kwargs):
+    def __init__(self, config: Lang3DXLDataManagerConfig, *args, **kwargs):
         self._left_out: set[int] = set()
-        super().__init__(*args, **kwargs)
+        if hasattr(config.dataparser, "load_3D_points"):
+            config.dataparser.load_3D_points = True  # nerfstudio-data leaves them out by default
+        super().__init__(config, *args, **kwargs)
 
     def create_train_dataset(self) -> PhotoDataset:
         return self._dataset(self.train_dataparser_outputs)

@@ -72,7 +72,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         if len(indices) == 0:
             raise UserError(
                 f"the {split} split of {self.config.data} has no photo (of {len(image_filenames)} in all): "
-                f"add photos, or choose another split with `lang3dxl-colmap --eval-mode …` after the other options"
+                f"add photos, or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
             )
         return indices
 
@@ -118,8 +118,8 @@ class PhotoCollectionDataParser(ColmapDataParser):
                 left_out[name] = reason
         if len(self.photos) == 1:
             raise UserError(
-                f"{self.config.data} has one photo that can be used: a scene needs at least two, one to learn from "
-                f"and one to hold out"
+                f"{self.config.data} has one photo that can be used: a scene needs at least two, one to "
+                f"learn from and one to hold out"
             )
         if not self.photos:
             raise UserError(

@@ -74,3 +74,12 @@ from nerfstudio.scripts.train import entrypoint
 entrypoint()
 """
     assert "--pipeline.model.sh-degree" in run(code)
+
+
+def test_public_names_load_at_first_use_and_not_before():
+    code = """
+import sys, lang3dxl_ns
+assert "torch" not in sys.modules
+print(all(getattr(lang3dxl_ns, name) is not None for name in lang3dxl_ns.__all__))
+"""
+    assert run(code).strip() == "True"

@@ -124,8 +124,8 @@ class SemanticFieldConfig:
     """Settings of a semantic field: a preset, and whatever is set here instead of the preset's value."""
 
     preset: Preset | Literal["auto"] = "auto"
-    """`default`: long GPU run; `short`: 300 to 1,000 steps on a CPU; `paper`: as printed; `official`: as released;
-    `auto`: chosen by the length of the run (`default` where none is known)."""
+    """`default`: long GPU run; `short`: 300 to 1,000 steps on a CPU; `paper`: as printed; `official`: as
+    released; `auto`: chosen by the length of the run (`default` where none is known)."""
     code_dim: int | None = None
     """Channels of the rendered code, 2 to 4 (2 or 3 with `indexed`)."""
     code_std: float | None = None
@@ -282,7 +282,7 @@ class SemanticField(nn.Module):
         return list(self.grid.parameters())
 
     def decoder_parameters(self) -> list[nn.Parameter]:
-        """Parameters of the MLP: an optimiser group with weight decay, which makes CLIP and dense outputs share edges."""
+        """Parameters of the MLP: a group with weight decay, so that CLIP and dense outputs share edges."""
         return [*self.hidden.parameters(), *self.output.parameters()]
 
     def _decode_hidden(self, codes: Float[Tensor, "*batch code"]) -> Float[Tensor, "*batch hidden"]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -171,8 +172,8 @@ def train(config: ClipTraining) -> None:
         run.restore()
     validation = _validation_views(config)
     seeds = SPLITS["train"][: config.landmarks]
-    with background_rendering(config.cache / "train", seeds, config.views, config.render_processes):
-        _fit(run, _first_views(config), validation)
+    with background_rendering(config.cache / "train", seeds, config.views, config.render_processes) as tasks:
+        _fit(run, _first_views(config, tasks), validation)
     run.save()
     if run.step == config.stop_after:
         return
@@ -303,12 +304,21 @@ def _draw_captions(
     return captions
 
 
-def _first_views(config: ClipTraining) -> ViewFolder:
+def _first_views(config: ClipTraining, tasks: list[Future[Path]]) -> ViewFolder:
     """The training views, once enough of them are rendered."""
     folder = ViewFolder(config.cache / "train")
-    while len(folder.landmarks) < min(config.first_landmarks, config.landmarks):
-        time.sleep(1)
+    needed = min(config.first_landmarks, config.landmarks)
+    while len(folder.landmarks) < needed:
+        finished = all(task.done() for task in tasks)
         folder.refresh()
+        if finished and len(folder.landmarks) < needed:
+            for task in tasks:
+                task.result()  # raises what went wrong
+            raise UserError(
+                f"{config.cache} holds {len(folder.landmarks)} landmarks, training starts with {needed}: "
+                "let it render them (--render-processes 1)"
+            )
+        time.sleep(0.5)
     return folder
 
 

@@ -36,7 +36,7 @@ def backward_rows(
     rows: Rows,
     chunks: list[Chunk],
     basis: Float[Tensor, "6 pixels"],
-    table: Float[Tensor, "n c"],
+    table: Float[Tensor, "v c"],
     upstream: Float[Tensor, "tiles pixels c"],
     behind: Float[Tensor, "tiles pixels"],
     *,
@@ -76,7 +76,7 @@ def _chunk_slope(
     chunk: Chunk,
     index: Int[Tensor, " m"],
     basis: Float[Tensor, "6 pixels"],
-    table: Float[Tensor, "n c"],
+    table: Float[Tensor, "v c"],
     upstream: Float[Tensor, "tiles pixels c"],
     behind: Float[Tensor, "tiles pixels"],
     channel_gradient: Float[Tensor, "m c"],
@@ -102,7 +102,7 @@ def _chunk_slope(
     channel_gradient.view(*shape[:2], -1).copy_(torch.bmm(here, weights.permute(1, 2, 0)).permute(2, 0, 1))
     values = chunk_values(rows, index, table).view(*shape[:2], -1).transpose(0, 1)
     value = scratch.take("value", shape[1], shape[0], shape[2])
-    torch.bmm(values[..., detached:].contiguous(), here[:, detached:], out=value)
+    torch.bmm(values[..., detached:], here[:, detached:], out=value)
     weighted = torch.mul(value.transpose(0, 1), weights, out=scratch.take("weighted", *shape))
     hidden = _suffix_sums(weighted, chunk.tiles, behind, out=value.view(shape)).div_(after)
     slope = torch.addcmul(weighted, weights, hidden, value=-1, out=weighted)

@@ -69,13 +69,14 @@ class Scratch:
 def composite_rows(
     rows: Rows,
     basis: Float[Tensor, "6 pixels"],
-    table: Float[Tensor, "n c"],
+    table: Float[Tensor, "v c"],
     transmittance: Float[Tensor, "tiles pixels"],
     totals: Float[Tensor, "tiles c pixels"],
 ) -> list[Chunk]:
     """Composite one segment: adds weight × table to `totals` and updates `transmittance`, both in place.
 
-    `table` holds the channels of every Gaussian. Returns the chunks in the order of their computation.
+    `table` holds the channels of the visible Gaussians in depth order. Returns the chunks in the order of
+    their computation.
     """
     scratch = Scratch(table)
     chunks = []
@@ -117,7 +118,7 @@ def _composite_chunk(
     first: int,
     depth: int,
     basis: Float[Tensor, "6 pixels"],
-    table: Float[Tensor, "n c"],
+    table: Float[Tensor, "v c"],
     transmittance: Float[Tensor, "tiles pixels"],
     totals: Float[Tensor, "tiles c pixels"],
     scratch: Scratch,
@@ -133,7 +134,7 @@ def _composite_chunk(
         weights.mul_(torch.sign(after, out=scratch.take("going", *weights.shape)))
     transmittance.index_copy_(0, tiles, passing[-1])
     values = chunk_values(rows, index, table).view(depth, len(tiles), -1).permute(1, 2, 0)
-    totals.index_add_(0, tiles, torch.bmm(values.contiguous(), weights.transpose(0, 1)))
+    totals.index_add_(0, tiles, torch.bmm(values, weights.transpose(0, 1)))
     return Chunk(tiles, first, depth, before, stops)
 
 
@@ -144,9 +145,9 @@ def chunk_rows(rows: Rows, tiles: Int[Tensor, " b"], first: int, depth: int) -> 
     return index.masked_fill_(step >= rows.count.index_select(0, tiles), len(rows)).view(-1)
 
 
-def chunk_values(rows: Rows, index: Int[Tensor, " m"], table: Float[Tensor, "n c"]) -> Float[Tensor, "m c"]:
+def chunk_values(rows: Rows, index: Int[Tensor, " m"], table: Float[Tensor, "v c"]) -> Float[Tensor, "m c"]:
     """The channels of each row's Gaussian."""
-    return table.index_select(0, rows.gaussians.index_select(0, index))
+    return table.index_select(0, rows.ranks.index_select(0, index))
 
 
 def chunk_alpha(

@@ -117,7 +117,8 @@ class Footprints:
 class Rows:
     """The rows of one segment, sorted by tile and front to back within a tile; one padding row at the end."""
 
-    gaussians: Int[Tensor, " r+1"]
+    ranks: Int[Tensor, " r+1"]
+    """Places of the Gaussians in the depth order; the padding row has that of a visible one."""
     coefficients: tuple[Tensor, ...]
     """Six columns: log2 of alpha as a polynomial over the tile's basis."""
     offset_x: Float[Tensor, " r+1"]
@@ -227,10 +228,8 @@ def make_rows(
     group_size = torch.bincount(slots, minlength=segment[1] - segment[0])
     sorted_kept = kept.index_select(0, by_tile)
     x, y, *shape = (_padded(column, sorted_kept) for column in (x, y, *shape))
-    gaussians = _padded(parts["gaussians"], slots.index_select(0, by_tile))
-    gaussians[-1] = parts["gaussians"][0]  # padding must not read an unseen Gaussian: 0 × NaN is NaN
     return Rows(
-        gaussians=gaussians,
+        ranks=_padded(slots, by_tile).add_(segment[0]),
         coefficients=_coefficients(x, y, *shape),
         offset_x=x,
         offset_y=y,

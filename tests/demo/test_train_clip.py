@@ -65,6 +65,11 @@ def test_a_checkpoint_of_another_model_is_refused(cache, tmp_path):
         train(settings(tmp_path, tmp_path / "clip", resume=True))
 
 
+def test_a_cache_with_too_few_landmarks_is_an_error_where_nobody_renders(cache, tmp_path):
+    with pytest.raises(UserError, match="holds 2 landmarks"):
+        train(settings(cache, tmp_path / "clip", landmarks=3))
+
+
 def test_training_without_time_ends_at_once_with_a_model(cache, tmp_path):
     train(settings(cache, tmp_path / "clip", minutes=0))
     assert (tmp_path / "clip" / "model.safetensors").exists()
