@@ -13,6 +13,7 @@ from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
+from lang3dxl_ns.training_benchmark import TrainingBenchmark
 
 
 @dataclass(kw_only=True)
@@ -45,32 +46,9 @@ class Prepare(PreparationConfig):
             print(f"Targets of {len(datamanager.targets.names)} photos are in {datamanager.cache_dir}")
 
 
-@dataclass
-class BenchmarkTraining:
-    """Train with and without semantics, evaluate on held-out photos, and time every part of a step."""
-
-    data: Path
-    """Folder with images/ and sparse/0/."""
-    out: Path
-    """Folder for training.md and training.json."""
-    clip: str = "openai/clip-vit-base-patch32"
-    """CLIP: a Hugging Face name or directory."""
-    dense: str = "facebook/dinov2-small"
-    """Dense encoder: a Hugging Face name or directory, or none."""
-    iterations: int = 1_000
-    """Iterations of each run."""
-    scale: float = 0.25
-    """Size of the training photos against those on disk."""
-
-    def main(self) -> None:
-        from lang3dxl_ns.training_benchmark import benchmark_training
-
-        benchmark_training(self.data, self.out, self.clip, self.dense, self.iterations, self.scale)
-
-
 Benchmark = (
     Annotated[RasterizerBenchmark, tyro.conf.subcommand("rasterizer")]
-    | Annotated[BenchmarkTraining, tyro.conf.subcommand("training")]
+    | Annotated[TrainingBenchmark, tyro.conf.subcommand("training")]
 )
 Command = (
     Annotated[Prepare, tyro.conf.subcommand("prepare")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -29,6 +28,8 @@ from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, Downsample
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics
+from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
+from lang3dxl_ns.geometry import sphere_around, view_matrix
 from lang3dxl_ns.preparation.prepare import FeatureStatistics
 from lang3dxl_ns.rendering import Camera, Gaussians, Rendering, rasterize, spherical_harmonics
 from lang3dxl_ns.timing import part
@@ -131,7 +132,7 @@ class Lang3DXLModel(SplatfactoModel):
             )
         self.step = 0
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
-        self.lpips = _Lpips()
+        self.lpips = Lpips()
         self.crop_box = None
         self.background_color = get_color(
             "black" if self.config.background_color == "random" else self.config.background_color
@@ -446,49 +447,6 @@ class Lang3DXLModel(SplatfactoModel):
                     f"targets have {len(prepared)}: pass the --pipeline.datamanager.{kind.lower()} that the "
                     f"checkpoint was trained with, or train anew"
                 )
-
-
-class _Lpips:
-    """LPIPS made at its first use; left out where its weights cannot be had (offline)."""
-
-    def __init__(self) -> None:
-        self._metric: nn.Module | None = None
-        self._available = True
-
-    def __call__(self, target: Float[Tensor, "1 3 h w"], predicted: Float[Tensor, "1 3 h w"]) -> float | None:
-        if self._metric is None and self._available:
-            from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-            try:
-                self._metric = LearnedPerceptualImagePatchSimilarity(normalize=True)
-            except OSError as error:
-                CONSOLE.log(f"[yellow]LPIPS is left out: its weights cannot be loaded ({error})")
-                self._available = False
-        if self._metric is None:
-            return None
-        return float(self._metric.to(target.device)(target, predicted.clamp(0, 1)))
-
-
-def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "count 3"]:
-    """Evenly spread points (a Fibonacci lattice) on a sphere of ten times the scene's radius."""
-    centre = points.median(dim=0).values
-    radius = 10 * (points - centre).norm(dim=1).quantile(0.9)
-    i = torch.arange(count) + 0.5
-    z, longitude = 1 - 2 * i / count, i * math.pi * (3 - math.sqrt(5))
-    around = (1 - z * z).sqrt()
-    return centre + radius * torch.stack([around * longitude.cos(), around * longitude.sin(), z], dim=1)
-
-
-def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
-    """World → camera (OpenCV axes) from nerfstudio's camera → world (OpenGL axes)."""
-    rotation = (camera_to_world[:, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).T
-    top = torch.cat([rotation, -rotation @ camera_to_world[:, 3:]], dim=1)
-    return torch.cat([top, camera_to_world.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-
-
-def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Peak signal-to-noise ratio in decibels, for a peak of 1."""
-    return -10 * torch.log10(F.mse_loss(predicted, target).clamp_min(1e-10))
 
 
 def _resize(image: Float[Tensor, "H W c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:

@@ -5,35 +5,46 @@ from __future__ import annotations
 import time
 from concurrent.futures import ProcessPoolExecutor
 from copy import deepcopy
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, write_report
+from lang3dxl_ns.evaluation.report import command_line, describe_machine, markdown_table, write_report
 
 PARTS = ("data", "render", "decode", "downsample", "losses", "backward", "optimiser")
 
 
-def benchmark_training(data: Path, out: Path, clip: str, dense: str, iterations: int, scale: float) -> None:
-    """Train twice, with the targets of `clip` and `dense` and with neither, and write out/training.md/.json.
+@dataclass
+class TrainingBenchmark:
+    """Train with and without semantics, evaluate on held-out photos, and time every part of a step."""
 
-    Each run has a process of its own, so that its peak memory is its own. Runs follow one another: quote
-    the split of a step and the ratios rather than absolute seconds.
-    """
-    results = {}
-    for name, encoder in (("joint", clip), ("rgb only", "none")):
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            results[name] = pool.submit(
-                _train_and_evaluate, data, out, encoder, dense, iterations, scale
-            ).result()
-    write_report(out, "training", _markdown(results, data, iterations, scale), results)
-    print(f"Wrote {out / 'training.md'}")
+    data: Path
+    """Folder with images/ and sparse/0/."""
+    out: Path
+    """Folder for training.md, training.json and the two runs."""
+    clip: str = "openai/clip-vit-base-patch32"
+    """CLIP: a Hugging Face name or directory."""
+    dense: str = "facebook/dinov2-small"
+    """Dense encoder: a Hugging Face name or directory, or none."""
+    iterations: int = 1_000
+    """Iterations of each run."""
+    scale: float = 0.25
+    """Size of the training photos against those on disk."""
+
+    def main(self) -> None:
+        """Each run has a process of its own, so that its peak memory is its own. They follow one another on
+        a machine that may be busy: quote the split of a step and ratios rather than absolute seconds."""
+        results = {}
+        for name, settings in (("joint", self), ("rgb only", replace(self, clip="none", dense="none"))):
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                results[name] = pool.submit(_train_and_evaluate, settings).result()
+        write_report(self.out, "training", markdown(self, results), results)
+        print(f"Wrote {self.out / 'training.md'}")
 
 
-def _train_and_evaluate(
-    data: Path, out: Path, clip: str, dense: str, iterations: int, scale: float
-) -> dict[str, Any]:
+def _train_and_evaluate(settings: TrainingBenchmark) -> dict[str, Any]:
     import resource
 
     import torch
@@ -44,14 +55,14 @@ def _train_and_evaluate(
 
     config = deepcopy(lang3dxl.config)
     assert isinstance(config, Lang3DXLTrainerConfig)
-    config.data = config.pipeline.datamanager.data = data
-    config.output_dir = out / "runs"
-    config.experiment_name = "joint" if clip != "none" else "rgb"
+    config.data = config.pipeline.datamanager.data = settings.data
+    config.output_dir = settings.out / "runs"
+    config.experiment_name = "joint" if settings.clip != "none" else "rgb"
     config.vis = "tensorboard"
     config.steps_per_eval_image = 0
-    config.max_num_iterations = iterations
-    config.pipeline.datamanager.clip, config.pipeline.datamanager.dense = clip, dense
-    config.pipeline.datamanager.camera_res_scale_factor = scale
+    config.max_num_iterations = settings.iterations
+    config.pipeline.datamanager.clip, config.pipeline.datamanager.dense = settings.clip, settings.dense
+    config.pipeline.datamanager.camera_res_scale_factor = settings.scale
     config.set_timestamp()
     config.save_config()
     torch.manual_seed(config.machine.seed)
@@ -108,7 +119,8 @@ def _time_parts(trainer: Any) -> None:
     trainer.grad_scaler.scale = lambda loss: _TimedLoss(scaled(loss))
 
 
-def _markdown(results: dict[str, dict], data: Path, iterations: int, scale: float) -> str:
+def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:
+    """The report of the two runs."""
     joint, rgb = results["joint"], results["rgb only"]
     names = [name for name in joint["metrics"] if name not in ("num_rays_per_sec", "fps")]
     quality = markdown_table(
@@ -128,10 +140,11 @@ def _markdown(results: dict[str, dict], data: Path, iterations: int, scale: floa
             ["Gaussians at the end", *(r["gaussians"] for r in (joint, rgb))],
         ],
     )
-    return f"""# Training on `{data.name}`: with and without semantics
+    return f"""# Training on `{settings.data.name}`: with and without semantics
 
-`lang3dxl benchmark training`, {iterations} iterations, photos at {scale} of their size.
-{joint["machine"]}
+    {command_line("lang3dxl benchmark training", settings)}
+
+{settings.iterations} iterations, photos at {settings.scale} of their size. {joint["machine"]}
 
 ## Quality
 

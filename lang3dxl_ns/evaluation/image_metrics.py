@@ -1,0 +1,39 @@
+"""How close a rendered photo is to the real one."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from rich import get_console
+from torch import Tensor, nn
+
+
+def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """Peak signal-to-noise ratio in decibels, for a peak of 1."""
+    return -10 * torch.log10(F.mse_loss(predicted, target).clamp_min(1e-10))
+
+
+class Lpips:
+    """LPIPS (AlexNet), made at its first use; left out where its weights cannot be had, as offline.
+
+    Not a module, so that AlexNet stays out of checkpoints.
+    """
+
+    def __init__(self) -> None:
+        self._metric: nn.Module | None = None
+        self._available = True
+
+    def __call__(self, target: Float[Tensor, "1 3 h w"], predicted: Float[Tensor, "1 3 h w"]) -> float | None:
+        """The distance of two images in [0, 1], or None without weights."""
+        if self._metric is None and self._available:
+            from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+            try:
+                self._metric = LearnedPerceptualImagePatchSimilarity(normalize=True)
+            except OSError as error:
+                get_console().log(f"LPIPS is left out: its weights cannot be loaded ({error})")
+                self._available = False
+        if self._metric is None:
+            return None
+        return float(self._metric.to(target.device)(target, predicted.clamp(0, 1)))
