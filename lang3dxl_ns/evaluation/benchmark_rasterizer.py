@@ -7,18 +7,30 @@ do, so those are the figures to quote.
 import io
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.evaluation.dense_rasterizer import (
+    DENSE_BYTES_PER_PAIR,
+    DENSE_TILE,
+    count_pairs,
+    render_dense,
+)
+from lang3dxl_ns.evaluation.rasterizer_scenes import (
+    CHANNELS,
+    COLOURS,
+    Case,
+    Problem,
+    Recipe,
+    make_problem,
+)
 from lang3dxl_ns.evaluation.report import (
     MEBIBYTE,
     command_line,
@@ -30,237 +42,10 @@ from lang3dxl_ns.evaluation.report import (
     write_atomically,
     write_report,
 )
-from lang3dxl_ns.rendering import Camera, Gaussians, rasterize
+from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.rasterize import Backend
 
-Recipe = Literal["A", "B"]
 OURS, DENSE, GSPLAT = "lang3dxl", "dense tiles", "gsplat"
-CHANNELS, COLOURS = 6, 3
-
-
-# --- scenes ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Case:
-    """One line of the report: how many Gaussians of which kind, on how many pixels."""
-
-    recipe: Recipe
-    gaussians: int
-    width: int
-    height: int
-
-
-@dataclass
-class Problem:
-    """All that one rendering and its backward pass need; gradients are wanted for `leaves`."""
-
-    gaussians: Gaussians
-    camera: Camera
-    channels: Float[Tensor, "n 6"]
-    background: Float[Tensor, " 6"]
-    image_gradient: Float[Tensor, "h w 6"]
-    alpha_gradient: Float[Tensor, "h w 1"]
-
-    @property
-    def leaves(self) -> tuple[Tensor, ...]:
-        g = self.gaussians
-        return g.means, g.quats, g.scales, g.opacities, self.channels
-
-
-def make_problem(
-    case: Case, scene: Path | None, device: str = "cpu", dtype: torch.dtype = torch.float32, seed: int = 0
-) -> Problem:
-    """The same problem for the same case and seed, whatever the device and number type.
-
-    Recipe A: random scales U(1e-4, 0.02), opacities U(0, 1). Recipe B, as in training: scales of the mean
-    distance to the three nearest neighbours times a log-normal factor per axis, opacities sigmoid(N(0, 2)).
-    """
-    generator = torch.Generator().manual_seed(seed)
-    points, camera = synthetic_cloud(case.gaussians, generator) if scene is None else load_cloud(scene)
-    if len(points) < case.gaussians:
-        raise UserError(
-            f"{scene} has {len(points)} points within ±2, fewer than {case.gaussians}: lower --gaussians"
-        )
-    n = case.gaussians
-    means = points[torch.randperm(len(points), generator=generator)[:n]]
-    if case.recipe == "A":
-        scales = torch.rand(n, 3, generator=generator) * (0.02 - 1e-4) + 1e-4
-        opacities = torch.rand(n, generator=generator)
-    else:
-        scales = _neighbour_distance(means)[:, None] * torch.randn(n, 3, generator=generator).mul(0.5).exp()
-        opacities = torch.sigmoid(2 * torch.randn(n, generator=generator))
-    quats = torch.randn(n, 4, generator=generator)
-    channels = torch.rand(n, CHANNELS, generator=generator)
-    background = torch.rand(CHANNELS, generator=generator)
-    image_gradient = torch.randn(case.height, case.width, CHANNELS, generator=generator)
-    alpha_gradient = torch.randn(case.height, case.width, 1, generator=generator)
-
-    def leaf(tensor: Tensor) -> Tensor:
-        return tensor.to(device, dtype).requires_grad_()
-
-    zoom = torch.tensor([case.width / camera.width, case.height / camera.height, 1.0])
-    return Problem(
-        Gaussians(leaf(means), leaf(quats), leaf(scales), leaf(opacities)),
-        Camera(
-            camera.view_matrix.to(device, dtype),
-            (zoom[:, None] * camera.intrinsics).to(device, dtype),
-            case.width,
-            case.height,
-        ),
-        leaf(channels),
-        background.to(device, dtype),
-        image_gradient.to(device, dtype),
-        alpha_gradient.to(device, dtype),
-    )
-
-
-def load_cloud(path: Path) -> tuple[Float[Tensor, "n 3"], Camera]:
-    """Points within ±2 and the first camera of an npz in the layout of gsplat's `test_garden.npz`."""
-    try:
-        with np.load(path) as arrays:
-            points = torch.from_numpy(arrays["means3d"]).float()
-            view, intrinsics = (torch.from_numpy(arrays[name][0]).float() for name in ("viewmats", "Ks"))
-            width, height = int(arrays["width"]), int(arrays["height"])
-    except (OSError, ValueError, KeyError) as error:
-        raise UserError(
-            f"{path} is no scene for this benchmark ({error}): it takes an npz with means3d, viewmats, Ks, "
-            "width and height, as gsplat's test_garden.npz; without --scene a made one is used"
-        ) from error
-    return points[points.abs().amax(1) < 2], Camera(view, intrinsics, width, height)
-
-
-def synthetic_cloud(count: int, generator: torch.Generator) -> tuple[Float[Tensor, "n 3"], Camera]:
-    """Points within ±2 on a ground, a round table, a ball on it and a round wall, seen from 1.6 away.
-
-    Stands in for the garden: the same number of pairs of pixel and Gaussian within about a quarter.
-    """
-
-    def uniform(n: int, *ranges: tuple[float, float]) -> list[Tensor]:
-        return [low + (high - low) * torch.rand(n, generator=generator) for low, high in ranges]
-
-    turn = (0.0, 2 * torch.pi)
-    ground, table, ball = (count * percent // 100 for percent in (30, 40, 10))
-    x, y, z = uniform(ground, (-2, 2), (-2, 2), (-0.72, -0.7))
-    area, angle, level = uniform(table, (0, 0.64), turn, (-0.01, 0.01))
-    bearing, height, distance = uniform(count - ground - table - ball, turn, (-0.7, 1), (1.75, 1.85))
-    sphere = torch.nn.functional.normalize(torch.randn(ball, 3, generator=generator), dim=1)
-    points = [
-        torch.stack([x, y, z], dim=1),
-        torch.stack([area.sqrt() * angle.cos(), area.sqrt() * angle.sin(), level], dim=1),
-        0.25 * sphere + torch.tensor([0, 0, 0.25]),
-        torch.stack([distance * bearing.cos(), distance * bearing.sin(), height], dim=1),
-    ]
-    return torch.cat(points), _camera_towards_origin(torch.tensor([-1.4, -0.3, 0.7]))
-
-
-def _camera_towards_origin(position: Float[Tensor, " 3"]) -> Camera:
-    """A camera of 648×420 pixels (as the garden's) at a world position; the world's z points up."""
-    forward = -position / position.norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0]))
-    right = right / right.norm()
-    rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    view = torch.eye(4)
-    view[:3, :3], view[:3, 3] = rotation, -rotation @ position
-    return Camera(view, torch.tensor([[480.0, 0, 324], [0, 480.0, 210], [0, 0, 1]]), 648, 420)
-
-
-def _neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Mean distance to the three nearest other points."""
-    from scipy.spatial import KDTree
-
-    array = points.numpy()
-    distances, _ = KDTree(array).query(array, k=min(4, len(array)))
-    return torch.from_numpy(distances[:, 1:].mean(1)).float().clamp_min(1e-6)
-
-
-# --- the baseline: dense, tile by tile, differentiated by autograd ------------------------------------------
-
-DENSE_TILE = 16
-"""Pixels per side. Of 16, 32 and 64 the fastest in every case measured, so the fairest to compare with."""
-DENSE_BYTES_PER_PAIR = 55
-"""What autograd keeps for every pixel and Gaussian of a tile, float32, measured."""
-
-
-def render_dense(problem: Problem) -> tuple[Float[Tensor, "h w 6"], Float[Tensor, "h w 1"]]:
-    """What a short rasteriser in plain torch looks like: every Gaussian of a tile at every pixel of it.
-
-    Follows gsplat's rules of rendering, but shares no code with `rasterize`: also its reference in float64.
-    """
-    columns = -(-problem.camera.width // DENSE_TILE)
-    payload = torch.cat([problem.channels, torch.ones_like(problem.channels[:, :1])], dim=1)
-    tiles = _dense_tiles(problem)
-    maps = [(weights @ payload.index_select(0, index)).unflatten(0, size) for index, weights, size in tiles]
-    rows = [torch.cat(maps[first : first + columns], dim=1) for first in range(0, len(maps), columns)]
-    image, alpha = torch.cat(rows).split([CHANNELS, 1], dim=2)
-    return image + (1 - alpha) * problem.background, alpha
-
-
-@torch.no_grad()
-def count_pairs(problem: Problem) -> tuple[int, int]:
-    """Pairs of a pixel and a Gaussian: those that contribute, and those that `render_dense` evaluates."""
-    counts = [(int((weights > 0).sum()), weights.numel()) for _, weights, _ in _dense_tiles(problem)]
-    kept, evaluated = (sum(column) for column in zip(*counts, strict=True))
-    return kept, evaluated
-
-
-def _dense_tiles(
-    problem: Problem,
-) -> Iterator[tuple[Int[Tensor, " m"], Float[Tensor, "p m"], tuple[int, int]]]:
-    """For every tile, row by row: its Gaussians front to back, their weights in each pixel, its size."""
-    camera = problem.camera
-    order, centres, conics, opacities, reach = _splats(problem)
-    with torch.no_grad():
-        low, high = centres - reach, centres + reach
-    for top in range(0, camera.height, DENSE_TILE):
-        for left in range(0, camera.width, DENSE_TILE):
-            right, bottom = min(left + DENSE_TILE, camera.width), min(top + DENSE_TILE, camera.height)
-            inside = (high > high.new_tensor([left, top])) & (low < low.new_tensor([right, bottom]))
-            index = inside.all(1).nonzero().squeeze(1)
-            grid = torch.cartesian_prod(torch.arange(top, bottom), torch.arange(left, right)).to(centres)
-            y, x = grid.unbind(1)
-            u, v = centres.index_select(0, index).unbind(1)
-            a, b, c = conics.index_select(0, index).unbind(1)
-            dx, dy = x[:, None] + 0.5 - u, y[:, None] + 0.5 - v
-            falloff = torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-            alpha = falloff * opacities.index_select(0, index)
-            alpha = torch.where(alpha < 1 / 255, 0.0, alpha.clamp_max(0.999))
-            after = torch.cumprod(1 - alpha, dim=1)
-            before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
-            yield order[index], torch.where(after > 1e-4, alpha * before, 0.0), (bottom - top, right - left)
-
-
-def _splats(problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Of all in front of the camera, front to back: index, centre, conic, opacity, reach along x and y."""
-    gaussians, camera = problem.gaussians, problem.camera
-    rotation, offset = camera.view_matrix[:3, :3], camera.view_matrix[:3, 3]
-    points = gaussians.means @ rotation.T + offset
-    with torch.no_grad():
-        order = ((points[:, 2] > 0.01) & (gaussians.opacities >= 1 / 255)).nonzero().squeeze(1)
-        order = order[points[order, 2].argsort(stable=True)]
-    opacities, (x, y, z) = gaussians.opacities[order], points[order].unbind(1)
-    focal, centre = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
-    size = focal.new_tensor([camera.width, camera.height])
-    slopes = torch.stack([x / z, y / z], dim=1)
-    margin = 0.15 * size  # gsplat's: 0.3 of half the image, beyond which the affine approximation is bad
-    held = slopes.clamp((-centre - margin) / focal, (size - centre + margin) / focal)
-    jacobian = torch.cat([torch.eye(2).to(held).expand(len(held), 2, 2), -held[:, :, None]], dim=2)
-    jacobian = jacobian * (focal[:, None] / z[:, None, None])
-    axes = jacobian @ rotation @ (_rotations(gaussians.quats[order]) * gaussians.scales[order, None])
-    covariances = axes @ axes.mT + 0.3 * torch.eye(2).to(axes)
-    (xx, xy), (_, yy) = (row.unbind(1) for row in covariances.unbind(1))
-    conics = torch.stack([yy, -xy, xx], dim=1) / (xx * yy - xy * xy)[:, None]
-    with torch.no_grad():
-        reach = (2 * torch.log(255 * opacities)[:, None] * torch.stack([xx, yy], dim=1)).sqrt()
-    return order, slopes * focal + centre, conics, opacities, reach
-
-
-def _rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """R = I + 2w[v]ₓ + 2[v]ₓ² for the unit quaternion (w, v)."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    zero = torch.zeros_like(w)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).view(-1, 3, 3)
-    return torch.eye(3).to(quats) + 2 * w[:, None, None] * cross + 2 * cross @ cross
 
 
 # --- measuring --------------------------------------------------------------------------------------------

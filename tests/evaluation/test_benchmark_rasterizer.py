@@ -13,16 +13,13 @@ from lang3dxl_ns.evaluation import benchmark_rasterizer as benchmark
 from lang3dxl_ns.evaluation.benchmark_rasterizer import (
     DENSE,
     OURS,
-    Case,
     RasterizerBenchmark,
-    count_pairs,
     error_against,
     forward_backward,
-    make_problem,
     pass_costs,
-    render_dense,
-    synthetic_cloud,
 )
+from lang3dxl_ns.evaluation.dense_rasterizer import count_pairs, render_dense
+from lang3dxl_ns.evaluation.rasterizer_scenes import Case, make_problem, synthetic_cloud
 
 SMALL = [Case("A", 400, 50, 37), Case("B", 400, 50, 37)]
 
@@ -62,7 +59,7 @@ def test_the_dense_baseline_over_a_background_of_one_colour_keeps_that_colour(fl
 def test_the_baseline_does_not_depend_on_its_tile_size(float64_problem, monkeypatch):
     image, _ = render_dense(float64_problem)
     kept, evaluated = count_pairs(float64_problem)
-    monkeypatch.setattr(benchmark, "DENSE_TILE", 50)
+    monkeypatch.setattr("lang3dxl_ns.evaluation.dense_rasterizer.DENSE_TILE", 50)
     torch.testing.assert_close(render_dense(float64_problem)[0], image)
     assert count_pairs(float64_problem)[0] == kept
     assert kept < evaluated < count_pairs(float64_problem)[1]
