@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
@@ -207,10 +208,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
         """Camera and batch of a held-out photo, in turn."""
-        index = self.eval_unseen_cameras.pop(0)
-        if not self.eval_unseen_cameras:
-            self.eval_unseen_cameras = list(range(len(self.eval_dataset)))
-        return self._batch(self.eval_dataset, index, self.eval_dataset.read(index))
+        return next(self._eval_rounds)
+
+    @cached_property
+    def _eval_rounds(self) -> Iterator[tuple[Cameras, dict]]:
+        return chain.from_iterable(repeat(EvalPhotos(self)))
 
     @property
     def fixed_indices_eval_dataloader(self) -> EvalPhotos:  # type: ignore[override]
@@ -240,7 +242,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
 
 class EvalPhotos:
-    """The held-out photos as (camera, batch) pairs; holds one photo at a time."""
+    """The held-out photos as (camera, batch) pairs, one photo in memory at a time; damaged ones are left
+    out, with a line in the log."""
 
     def __init__(self, datamanager: Lang3DXLDataManager):
         self._datamanager = datamanager
@@ -250,8 +253,17 @@ class EvalPhotos:
 
     def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
         dataset = self._datamanager.eval_dataset
-        for index in range(len(dataset)):
-            yield self._datamanager._batch(dataset, index, dataset.read(index))
+        usable = False
+        for index, photo in enumerate(dataset.photos):
+            try:
+                item = self._datamanager._batch(dataset, index, dataset.read(index))
+            except UserError as reason:
+                CONSOLE.log(f"[yellow]{photo.name} is left out of evaluation: {reason}")
+                continue
+            usable = True
+            yield item
+        if not usable:
+            raise UserError("none of the held-out photos can be used: see the reasons above")
 
 
 def pinhole_cameras(photos: list[Photo], posed: Cameras, scale: float) -> Cameras:

@@ -90,6 +90,23 @@ def test_truncated_photo_does_not_end_the_run(start, folder, capsys, semantics):
     assert trainer.pipeline.datamanager._left_out == {index}
 
 
+def test_truncated_held_out_photo_does_not_end_the_evaluation(start, folder, capsys):
+    photo = sorted((folder / "images").iterdir())[0]
+    photo.write_bytes(photo.read_bytes()[:-400])
+    trainer = start(folder)
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    assert f"{photo.name} is left out of evaluation" in " ".join(capsys.readouterr().out.split())
+    assert metrics["psnr"] > 0
+
+
+def test_no_usable_held_out_photo(start, folder):
+    for photo in sorted((folder / "images").iterdir())[::8]:
+        photo.write_bytes(photo.read_bytes()[:-400])
+    trainer = start(folder, semantics=False)
+    with pytest.raises(UserError, match="none of the held-out photos"):
+        trainer.pipeline.get_average_eval_image_metrics()
+
+
 def test_zero_photos_in_a_split(start, folder):
     for photo in sorted((folder / "images").iterdir())[1:]:
         photo.unlink()
