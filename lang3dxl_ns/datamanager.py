@@ -102,8 +102,7 @@ class PhotoCache:
     @property
     def bytes(self) -> int:
         """Memory of the photos that are decoded."""
-        done = [f.result() for f in self._entries.values() if f.done() and not f.exception()]
-        return sum(t.numel() * t.element_size() for data in done for t in data.values())
+        return sum(_bytes(future) for future in self._entries.values() if future.done())
 
     def _make_room(self, keep: set[int]) -> None:
         excess = self.bytes - self._max_bytes
@@ -112,7 +111,14 @@ class PhotoCache:
                 return
             future = self._entries.pop(i)
             if not future.cancel():
-                excess -= sum(t.numel() * t.element_size() for t in future.result().values())
+                excess -= _bytes(future)
+
+
+def _bytes(future: Future[dict[str, Tensor]]) -> int:
+    """Memory of a photo that has been read; none of one that could not be (its own turn says why)."""
+    if future.exception():
+        return 0
+    return sum(t.numel() * t.element_size() for t in future.result().values())
 
 
 class Lang3DXLDataManager(FullImageDatamanager):
@@ -253,6 +259,7 @@ class EvalPhotos:
 
     def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
         dataset = self._datamanager.eval_dataset
+        _ = self._datamanager.targets  # what goes wrong in preparing them is no single photo's fault
         usable = False
         for index, photo in enumerate(dataset.photos):
             try:

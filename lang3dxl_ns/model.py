@@ -167,7 +167,9 @@ class Lang3DXLModel(SplatfactoModel):
             "quats": Parameter(
                 F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)
             ),
-            "features_dc": Parameter(RGB2SH(colours)),
+            "features_dc": Parameter(
+                RGB2SH(colours) if self.config.sh_degree > 0 else torch.logit(colours, eps=1e-4)
+            ),
             "features_rest": Parameter(torch.zeros(n, num_sh_bases(self.config.sh_degree) - 1, 3)),
             "opacities": Parameter(torch.logit(0.1 * torch.ones(n, 1))),
         }
@@ -307,10 +309,10 @@ class Lang3DXLModel(SplatfactoModel):
         return rendering, background
 
     def _colours(self, g: Mapping[str, Tensor], camera_centre: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-        """Colours seen from a point; the degree of the harmonics rises in four equal parts of a third of
-        the run (every 1,000 iterations at 10,000 and above)."""
+        """Colours seen from a point; the degree of the harmonics rises by one every 1,000 iterations, in
+        runs of under 10,000 every tenth of the run. At degree 0 colours are logits, as in splatfacto."""
         if self.config.sh_degree == 0:
-            return RGB2SH(torch.sigmoid(g["features_dc"])) * 0.28209479177387814 + 0.5
+            return torch.sigmoid(g["features_dc"])
         interval = max(min(self.config.sh_degree_interval, self.config.total_steps // 10), 1)
         degree = min(self.step // interval, self.config.sh_degree)
         directions = g["means"].detach() - camera_centre

@@ -30,6 +30,18 @@ def test_cache_reads_a_photo_once_while_it_fits():
     assert sorted(reads) == [0, 1, 2]
 
 
+def test_a_photo_that_failed_ahead_of_its_turn_fails_no_other():
+    def read(index):
+        if index == 1:
+            raise UserError("photo 1 is torn")
+        return photo(index)
+
+    cache = PhotoCache(read, max_bytes=150)
+    cache.get(0, [1])
+    for index in (2, 3, 4, 5):  # makes room, the torn photo's entry among the first to go
+        assert int(cache.get(index, [])["image"][0, 0]) == index
+
+
 def test_cache_hands_on_what_went_wrong():
     def broken(index):
         raise UserError(f"photo {index} is torn")
