@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from time import perf_counter
 from types import TracebackType
 from typing import Any
 
+import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+from torch import Tensor
 
-from lang3dxl_ns.datamanager import Lang3DXLDataManagerConfig
+from lang3dxl_ns.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.model import Lang3DXLModelConfig
+from lang3dxl_ns.evaluation.average_precision import deviation_over_photos, mean_over_photos
+from lang3dxl_ns.evaluation.holyscenes import GroundTruth, mean_average_precision, scoring_size
+from lang3dxl_ns.evaluation.language import LanguageScorer, Maps, open_scorer
+from lang3dxl_ns.evaluation.report import progress_bar
+from lang3dxl_ns.model import Lang3DXLModel, Lang3DXLModelConfig
 
 
 @dataclass
@@ -23,14 +33,100 @@ class Lang3DXLPipelineConfig(VanillaPipelineConfig):
     _target: type = field(default_factory=lambda: Lang3DXLPipeline)
     datamanager: Lang3DXLDataManagerConfig = field(default_factory=Lang3DXLDataManagerConfig)
     model: Lang3DXLModelConfig = field(default_factory=Lang3DXLModelConfig)
+    ground_truth: Path | None = None
+    """Folder of ground truth in HolyScenes' layout, <category>/NNNN-gt.jpg, object black: `ns-eval` then
+    reports the average precision of each category. Default: ground_truth/ in the data folder, if there."""
+
+
+@dataclass
+class EvaluatedPhoto:
+    """A held-out photo: its figures, and the pictures behind them."""
+
+    name: str
+    metrics: dict[str, float]
+    """PSNR … and, with ground truth, `ap_{category}` and `teacher_ap_{category}`."""
+    images: dict[str, Tensor]
+    """`img` (photo beside rendering, [H, 2W, 3]) and, with semantics, `semantics`."""
+    field_maps: Maps
+    """Relevancy by category at half the photo's size; empty without ground truth."""
+    teacher_maps: Maps
+    """The same of the photo's own CLIP target."""
 
 
 class Lang3DXLPipeline(VanillaPipeline):
-    """nerfstudio's pipeline; loads checkpoints strictly."""
+    """nerfstudio's pipeline; loads checkpoints strictly, evaluates colours, features and words."""
+
+    config: Lang3DXLPipelineConfig
+    datamanager: Lang3DXLDataManager
+    model: Lang3DXLModel
 
     def __init__(self, *args, **kwargs):
         print_user_errors_plainly()
         super().__init__(*args, **kwargs)
+
+    # ── evaluation ──────────────────────────────────────────────────────────────────────────────────
+
+    @cached_property
+    def scorer(self) -> LanguageScorer | None:
+        """Scores words where the scene has ground truth and the run has semantics."""
+        folder = self.config.ground_truth
+        if folder is None:
+            data = Path(self.datamanager.config.dataparser.data)
+            folder = (data if data.is_dir() else data.parent) / "ground_truth"
+            if not folder.is_dir():
+                return None
+        if self.model.semantic_field is None:
+            return None
+        return open_scorer(GroundTruth(folder), self.datamanager.config.clip, self.device)
+
+    @torch.no_grad()
+    def evaluate(self) -> Iterator[EvaluatedPhoto]:
+        """Render every held-out photo and compare, one at a time, with a progress bar."""
+        self.eval()
+        photos = self.datamanager.fixed_indices_eval_dataloader
+        with progress_bar() as bar:
+            for camera, batch in bar.track(photos, total=len(photos), description="evaluating"):
+                yield self._evaluate_photo(camera, batch)
+        self.train()
+
+    def _evaluate_photo(self, camera, batch: dict) -> EvaluatedPhoto:
+        start = perf_counter()
+        outputs = self.model.get_outputs_for_camera(camera)
+        seconds = perf_counter() - start
+        metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
+        metrics["fps"] = 1 / seconds
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, {})
+        if self.scorer is not None:
+            self._score_words(evaluated, batch)
+        return evaluated
+
+    def _score_words(self, evaluated: EvaluatedPhoto, batch: dict) -> None:
+        scorer, field_ = self.scorer, self.model.semantic_field
+        assert scorer is not None and field_ is not None
+        photo = self.datamanager.eval_dataset.photos[batch["image_idx"]]
+        size = scoring_size(photo.height, photo.width)
+        keep = batch["mask"][..., 0] if "mask" in batch else None
+        evaluated.field_maps = scorer.field_maps(field_.decode_clip, self.model.rendered_codes, size, keep)
+        evaluated.teacher_maps = scorer.teacher_maps(batch["clip_target"], size, keep)
+        for prefix, maps in (("", evaluated.field_maps), ("teacher_", evaluated.teacher_maps)):
+            evaluated.metrics |= scorer.scores(photo.name, maps, prefix)
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """Means over the held-out photos, for `ns-eval` and the trainer; see `average`.
+
+        output_path: folder for a picture of every photo, if wanted.
+        """
+        photos = []
+        for evaluated in self.evaluate():
+            photos.append(evaluated.metrics)
+            for name, image in evaluated.images.items() if output_path is not None else ():
+                stem = evaluated.name.replace("/", "_")
+                pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
+                output_path.mkdir(parents=True, exist_ok=True)
+                Image.fromarray(pixels).save(output_path / f"{stem}.{name}.jpg")
+        return average(photos, get_std)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
         """Load a checkpoint; whatever does not fit is an error (nerfstudio would silently leave it out)."""
@@ -42,6 +138,23 @@ class Lang3DXLPipeline(VanillaPipeline):
                 f"the checkpoint does not fit this configuration: {error}. "
                 f"Load it with the config.yml beside it, or with the options that it was trained with"
             ) from error
+
+
+def average(photos: list[dict[str, float]], with_deviation: bool = False) -> dict[str, Any]:
+    """Means over photos of every figure; `map` and `teacher_map`, unweighted means over the categories of
+    `ap_…` and `teacher_ap_…`; `ap_…_photos`, how many photos a category was scored on."""
+    means: dict[str, Any] = mean_over_photos(photos)
+    totals = {f"{who}map": mean_average_precision(means, who) for who in ("", "teacher_")}
+    counts = {
+        f"{name}_photos": sum(name in photo for photo in photos) for name in means if name.startswith("ap_")
+    }
+    if with_deviation:
+        deviations = deviation_over_photos(photos)
+        means = {
+            key: v for name in means for key, v in ((name, means[name]), (f"{name}_std", deviations[name]))
+        }
+    means |= {name: value for name, value in totals.items() if value is not None}
+    return means | counts
 
 
 _previous_hook = sys.excepthook

@@ -9,13 +9,12 @@ import numpy as np
 
 from lang3dxl_ns.demo.labels import ELEMENTS, PARTS
 from lang3dxl_ns.demo.materials import MATERIALS
+from lang3dxl_ns.query.relevancy import CANONICAL
 
 CLASSES = (*PARTS, *ELEMENTS[1:])
 """A pixel's class is its element where it has one, else its part."""
 CLASS = {name: index for index, name in enumerate(CLASSES)}
 
-CANONICAL = ("object", "things", "stuff", "texture")
-"""What relevancy compares a query with. A model that never read them puts them on top of real categories."""
 GENERIC = len(CLASSES)
 """Class of the captions that fit every crop equally."""
 

@@ -13,11 +13,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 import tyro
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import UInt8
 from numpy import ndarray as Array
-from torch import Tensor
 
-from lang3dxl_ns.demo.captions import CANONICAL
 from lang3dxl_ns.demo.labels import CATEGORIES, category_masks
 from lang3dxl_ns.demo.views import (
     COLOUR,
@@ -29,29 +27,14 @@ from lang3dxl_ns.demo.views import (
     ViewFolder,
     background_rendering,
 )
+from lang3dxl_ns.evaluation.average_precision import average_precision
 from lang3dxl_ns.preparation.encoders import ImageTextEncoder, load_image_text_encoder
 from lang3dxl_ns.preparation.pyramid import build_clip_target
+from lang3dxl_ns.query.relevancy import CANONICAL, relevancy
 
 CROP_SIDES = (32, 48, 68)
 """Pixels of a 480×360 view; chosen on validation landmarks."""
 _FEWEST_PIXELS = 100  # of the half-size map; a category with fewer is not a positive photo
-
-
-def relevancy(
-    features: Float[Tensor, "h w c"], queries: Float[Tensor, "q c"], canonical: Float[Tensor, "p c"]
-) -> Float[Tensor, "q h w"]:
-    """sigmoid of a query's cosine similarity minus the nearest canonical phrase's (LERF, temperature 1)."""
-    features = F.normalize(features, dim=-1)
-    similarity = torch.einsum("hwc,qc->qhw", features, F.normalize(queries, dim=-1))
-    neutral = torch.einsum("hwc,pc->phw", features, F.normalize(canonical, dim=-1)).amax(0)
-    return torch.sigmoid(similarity - neutral)
-
-
-def average_precision(score: Float[Array, " n"], truth: Bool[Array, " n"]) -> float:
-    """Area under the precision-recall curve: mean of the precision at each positive, by descending score."""
-    ranked = truth[np.argsort(-score, kind="stable")]
-    precision = np.cumsum(ranked) / np.arange(1, len(ranked) + 1)
-    return float(precision[ranked].mean())
 
 
 def teacher_precision(
@@ -73,11 +56,12 @@ def teacher_precision(
     queries, canonical = encoder.encode_texts(list(CATEGORIES)), encoder.encode_texts(list(CANONICAL))
     maps = relevancy(features, queries, canonical).numpy()
     masks = category_masks(view[PART, 1::2, 1::2], view[ELEMENT, 1::2, 1::2])
-    return {
-        name: average_precision(score.ravel(), masks[name].ravel())
-        for name, score in zip(CATEGORIES, maps, strict=True)
-        if masks[name].sum() >= _FEWEST_PIXELS
-    }
+    scores = {}
+    for name, score in zip(CATEGORIES, maps, strict=True):
+        precision = average_precision(score, masks[name])
+        if precision is not None and masks[name].sum() >= _FEWEST_PIXELS:
+            scores[name] = precision
+    return scores
 
 
 @dataclass

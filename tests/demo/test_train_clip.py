@@ -11,7 +11,7 @@ from lang3dxl_ns.demo import train_dense
 from lang3dxl_ns.demo.captions import ADJECTIVES, CANONICAL, CLASS, GENERIC, Caption
 from lang3dxl_ns.demo.labels import CATEGORIES, ELEMENT, PART, category_masks
 from lang3dxl_ns.demo.materials import MATERIALS
-from lang3dxl_ns.demo.teacher import average_precision, relevancy, score_teacher
+from lang3dxl_ns.demo.teacher import score_teacher
 from lang3dxl_ns.demo.train_clip import ClipTraining, caption_fit, contrastive_loss, learning_rate, train
 from lang3dxl_ns.demo.views import render_landmark
 from lang3dxl_ns.errors import UserError
@@ -141,21 +141,6 @@ def test_the_learning_rate_warms_up_and_falls_to_a_fiftieth():
     assert learning_rate(0, 0.0) < peak / 50
     assert learning_rate(500, 0.5) == pytest.approx(0.51 * peak)
     assert learning_rate(1_000, 1.0) == pytest.approx(0.02 * peak)
-
-
-def test_average_precision_is_one_for_a_perfect_order_and_the_share_of_positives_by_chance():
-    truth = np.array([False, True, False, True])
-    assert average_precision(np.array([0.1, 0.9, 0.2, 0.8]), truth) == 1
-    assert average_precision(np.array([0.9, 0.1, 0.8, 0.2]), truth) == pytest.approx((1 / 3 + 2 / 4) / 2)
-    rng = np.random.default_rng(0)
-    assert average_precision(rng.random(20_000), rng.random(20_000) < 0.2) == pytest.approx(0.2, abs=0.02)
-
-
-def test_relevancy_is_a_half_where_a_query_ties_with_the_nearest_canonical_phrase():
-    features = torch.tensor([[[2.0, 0.0], [0.0, 3.0], [1.0, 1.0]]])
-    scores = relevancy(features, torch.tensor([[5.0, 0.0]]), torch.tensor([[0.0, 1.0], [-1.0, 0.0]]))[0, 0]
-    assert scores[0] > 0.5 > scores[1]
-    assert scores[2] == pytest.approx(0.5)
 
 
 def test_a_dense_encoder_made_from_the_clip_reads_photos_at_any_grid(cache, trained, tmp_path):

@@ -1,0 +1,1 @@
+"""Text queries: relevancy of features to prompts. Importable without nerfstudio."""
