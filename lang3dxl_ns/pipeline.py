@@ -121,11 +121,8 @@ class Lang3DXLPipeline(VanillaPipeline):
         photos = []
         for evaluated in self.evaluate():
             photos.append(evaluated.metrics)
-            for name, image in evaluated.images.items() if output_path is not None else ():
-                stem = evaluated.name.replace("/", "_")
-                pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
-                output_path.mkdir(parents=True, exist_ok=True)
-                Image.fromarray(pixels).save(output_path / f"{stem}.{name}.jpg")
+            if output_path is not None:
+                _write_pictures(evaluated, output_path)
         return average(photos, get_std)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
@@ -138,6 +135,13 @@ class Lang3DXLPipeline(VanillaPipeline):
                 f"the checkpoint does not fit this configuration: {error}. "
                 f"Load it with the config.yml beside it, or with the options that it was trained with"
             ) from error
+
+
+def _write_pictures(evaluated: EvaluatedPhoto, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in evaluated.images.items():
+        pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
+        Image.fromarray(pixels).save(folder / f"{evaluated.name.replace('/', '_')}.{name}.jpg")
 
 
 def average(photos: list[dict[str, float]], with_deviation: bool = False) -> dict[str, Any]:
