@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from lang3dxl_ns.demo.scene_writer import DemoScene
+from lang3dxl_ns.demo_run import Demo
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
@@ -51,7 +52,8 @@ Benchmark = (
     | Annotated[TrainingBenchmark, tyro.conf.subcommand("training")]
 )
 Command = (
-    Annotated[Prepare, tyro.conf.subcommand("prepare")]
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Prepare, tyro.conf.subcommand("prepare")]
     | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]
     | Annotated[
         Benchmark,

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import math
 import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Literal
 
 import torch
@@ -19,7 +24,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.pipeline import Lang3DXLPipelineConfig
+from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 
 SHORT_RUN = 1_000
 """Iterations of a run that takes the short-run rates."""
@@ -130,11 +135,20 @@ class Lang3DXLTrainer(Trainer):
     """nerfstudio's trainer with atomic checkpoints, and a resumed run that ends at the asked iteration."""
 
     config: Lang3DXLTrainerConfig
+    pipeline: Lang3DXLPipeline
+    interrupted = False
+    """Whether the training was asked to stop before its end."""
+    _last_iteration = -1
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up, then seed: what had to be prepared has no say in the run's randomness."""
         super().setup(test_mode)
         torch.manual_seed(self.config.machine.seed)
+
+    @property
+    def first_iteration(self) -> int:
+        """Where the training begins: 0, or after the checkpoint that it goes on from."""
+        return self._start_step
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in all (nerfstudio would add that many to a resumed run)."""
@@ -149,9 +163,48 @@ class Lang3DXLTrainer(Trainer):
             CONSOLE.log(f"Resuming at iteration {self._start_step} of {total}")
         self.config.max_num_iterations = total - self._start_step
         try:
-            super().train()
+            with self._stoppable():
+                super().train()
         finally:
             self.config.max_num_iterations = total
+
+    def train_iteration(self, step: int):
+        result = super().train_iteration(step)
+        self._last_iteration = step
+        return result
+
+    @contextmanager
+    def _stoppable(self) -> Iterator[None]:
+        """Let Ctrl-C or a SIGTERM end the training after the iteration under way, with a checkpoint; a
+        second one ends it at once."""
+
+        def stop(number: int, _frame: FrameType | None) -> None:
+            self.interrupted = self.stop_training = True
+            signal.signal(number, previous[signal.Signals(number)])
+
+        if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+            yield
+            return
+        previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        for number in previous:
+            signal.signal(number, stop)
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def _after_train(self) -> None:
+        """Save; after an interruption also say how to go on, and don't wait in the viewer."""
+        if self.interrupted:
+            self.step = max(self._last_iteration, self._start_step)  # not the one that was about to begin
+            self.config.viewer.quit_on_train_completion = True
+            CONSOLE.print(
+                f"Stopped after {self.step + 1} iterations. To go on: the same command with "
+                f"--load-dir {self.checkpoint_dir}",
+                soft_wrap=True,
+            )
+        super()._after_train()
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:

@@ -24,7 +24,10 @@ from lang3dxl_ns.errors import UserError
 CLIP_OPTION = "--pipeline.datamanager.clip"
 DENSE_OPTION = "--pipeline.datamanager.dense"
 
-_BUILTIN_CLIP = Path(__file__).parents[1] / "demo" / "clip"
+BUILTIN = "builtin"
+"""Name of the small encoders that ship with this package."""
+_DEMO = Path(__file__).parents[1] / "demo"
+_BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
 _WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -43,19 +46,14 @@ class ModelFiles:
 
 def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     """A model's files: a local folder, a Hugging Face name (downloaded once), or "builtin", which is the CLIP
-    that ships with this package.
+    or dense encoder that ships with this package, according to the option.
 
     Raises UserError when there is no such folder, the model can't be downloaded, or files are missing.
     """
     name = str(name_or_dir)
     local = Path(name).expanduser()
-    if name == "builtin":
-        if not _BUILTIN_CLIP.is_dir():
-            raise UserError(
-                f"the built-in CLIP ships with a later version of lang3dxl-ns: give {option} a model name, "
-                "such as openai/clip-vit-base-patch32, or a folder"
-            )
-        folder = _BUILTIN_CLIP
+    if name == BUILTIN:
+        folder = _BUILTIN_FOLDERS[option]
     else:
         folder = local if local.is_dir() else _download(name, option)
     return ModelFiles(name, folder, _fingerprint(folder, option), option)
@@ -143,6 +141,8 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
     from transformers import CLIPImageProcessor, CLIPModel, CLIPTokenizer
 
     files = find_model(name_or_dir, CLIP_OPTION)
+    if files.name == BUILTIN:
+        _say_what_builtin_knows()
     _check_model_type(files)
     model = _load_weights(CLIPModel, files, device)
     if not _has(files.folder, "tokenizer.json") and not _has(files.folder, "vocab.json", "merges.txt"):
@@ -174,6 +174,17 @@ def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, toke
             'vision transformer such as facebook/dinov2-small, or "none"'
         )
     return DenseEncoder(model, tokens, files.identity)
+
+
+@lru_cache(maxsize=1)  # once is enough
+def _say_what_builtin_knows() -> None:
+    from rich import get_console
+
+    get_console().print(
+        "The built-in CLIP knows the demo's landmarks and nothing else; for your photos name a real one: "
+        f"{CLIP_OPTION} openai/clip-vit-base-patch32 {DENSE_OPTION} facebook/dinov2-small",
+        soft_wrap=True,
+    )
 
 
 def _load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
