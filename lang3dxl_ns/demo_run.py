@@ -60,8 +60,7 @@ class Demo:
     """Photos as from the Internet: other sizes, lenses, weather, exposures and passers-by in each.
     --no-wild: one camera, one sun, nobody there."""
     quick: bool = False
-    """Two minutes instead of ten: fewer photos at half the size, and fewer iterations. The words are found
-    less well."""
+    """Two minutes instead of ten: fewer photos and iterations. The words are found less well."""
     clip: str = "builtin"
     """CLIP: "builtin", a Hugging Face name, a folder, or "none" for colours only."""
     dense: str = "builtin"
@@ -142,7 +141,7 @@ class Demo:
         parser = config.pipeline.datamanager.dataparser
         assert isinstance(parser, PhotoCollectionDataParserConfig)
         parser.masks_path = None  # every pixel counts, sky and people too
-        config.pipeline.datamanager.camera_res_scale_factor = 0.5 if self.quick else 1.0
+        config.pipeline.datamanager.camera_res_scale_factor = 0.5  # words are scored at half the size
         config.pipeline.datamanager.dense_tokens = 32 if self.quick else 48
         config.logging.steps_per_log = 50
         if self.ns_train:
