@@ -1,4 +1,4 @@
-"""The demo command: a report that says what it should, work that is not done twice, and stops that keep it."""
+"""The demo: its report says what it should, no work is done twice, and a stop keeps what is there."""
 
 import json
 import signal
@@ -78,9 +78,7 @@ def test_ctrl_c_while_training_keeps_the_run(demo, tmp_path, monkeypatch):
         return original(self, *args)
 
     monkeypatch.setattr(Lang3DXLModel, "get_loss_dict", interrupted)
-    settings = Demo(
-        out=tmp_path, photos=8, steps=6, quick=True, wild=False, clip=demo.clip, dense=demo.dense
-    )
+    settings = Demo(out=tmp_path, photos=8, steps=6, quick=True, wild=False, clip=demo.clip, dense=demo.dense)
     with pytest.raises(SystemExit, match="same command goes on"):
         settings.main()
     checkpoints = tmp_path / "run" / "lang3dxl" / "demo" / "nerfstudio_models"
