@@ -12,12 +12,12 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, read_reconstruction
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 
 @dataclass
@@ -31,7 +31,7 @@ class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
     """Photos, relative to the data folder; dense/images is tried too."""
     masks_path: Path | None = Path("masks")
     """Foreground masks, white = keep, named like the photos (.png or .jpg); a photo without one is used
-    whole."""
+    whole. --pipeline.datamanager.foreground has other sources."""
     downscale_factor: int | None = 1
     """Left at 1: photos are resized as they are read (--pipeline.datamanager.camera-res-scale-factor)."""
 
@@ -138,11 +138,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         """The photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""
         if self.config.masks_path is None:
             return None
-        mask = self.config.data / self.config.masks_path / name
-        candidates = [mask.with_suffix(suffix) for suffix in IMAGE_SUFFIXES] + [
-            mask.with_name(mask.name + ".png")
-        ]
-        return next((path for path in candidates if path.is_file()), None)
+        return find_mask(self.config.data / self.config.masks_path, name)
 
 
 def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Path:

@@ -132,15 +132,12 @@ class Demo:
         import tyro
         from nerfstudio.utils.rich_utils import CONSOLE
 
-        from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
         from lang3dxl_ns.methods import run_config
 
         steps = self.steps or (200 if self.quick else 1_200)
         config = run_config(scene, out, str(RUN.parts[0]), steps, self.clip, self.dense)
         config.timestamp = RUN.name
-        parser = config.pipeline.datamanager.dataparser
-        assert isinstance(parser, PhotoCollectionDataParserConfig)
-        parser.masks_path = None  # every pixel counts, sky and people too
+        config.pipeline.datamanager.foreground = "none"  # every pixel counts, sky and people too
         config.pipeline.datamanager.camera_res_scale_factor = 0.5  # words are scored at half the size
         config.pipeline.datamanager.dense_tokens = 32 if self.quick else 48
         config.logging.steps_per_log = 50

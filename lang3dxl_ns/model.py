@@ -349,7 +349,8 @@ class Lang3DXLModel(SplatfactoModel):
             weight = None if small_mask is None else weight
             loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, batch["clip_target"], weight)}
             if dense is not None and "dense_target" in batch:
-                loss["dense"] = ramp * c.dense_weight * losses.dense_loss(dense, batch["dense_target"])
+                difference = losses.dense_loss(dense, batch["dense_target"], small_mask)
+                loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
                 labels = _resize(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()
                 loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
@@ -415,7 +416,7 @@ class Lang3DXLModel(SplatfactoModel):
         metrics = feature_metrics("clip", predicted, batch["clip_target"], self.clip_mean, weight)
         if dense is not None and "dense_target" in batch:
             target = losses.resize(batch["dense_target"], dense.shape[:2])
-            metrics |= feature_metrics("dense", dense, target, self.dense_mean)
+            metrics |= feature_metrics("dense", dense, target, self.dense_mean, small_mask)
         return metrics
 
     # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────

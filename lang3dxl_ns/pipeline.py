@@ -72,8 +72,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         """Scores words where the scene has ground truth and the run has semantics."""
         folder = self.config.ground_truth
         if folder is None:
-            data = Path(self.datamanager.config.dataparser.data)
-            folder = (data if data.is_dir() else data.parent) / "ground_truth"
+            folder = self.datamanager.data_folder / "ground_truth"
             if not folder.is_dir():
                 return None
         if self.model.semantic_field is None:

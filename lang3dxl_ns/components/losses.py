@@ -50,7 +50,7 @@ def clip_loss(
 def dense_loss(
     prediction: Float[Tensor, "h w d"],
     target: Float[Tensor, "hd wd d"],
-    weight: Bool[Tensor, "hd wd"] | Float[Tensor, "hd wd"] | None = None,
+    weight: Bool[Tensor, "hw ww"] | Float[Tensor, "hw ww"] | None = None,
     compare_at: Literal["auto", "target"] = "auto",
 ) -> Float[Tensor, ""]:
     """Mean absolute difference between decoded dense features and their target, on one grid.
@@ -59,7 +59,7 @@ def dense_loss(
     resizes the target instead, which needs no gradient and so costs a fraction, unless the target has less
     than half as many cells as the prediction: details that it doesn't show should not be pressed out of the
     prediction. The resize is bilinear and antialiased: it averages where it shrinks, and keeps positions
-    within a tenth of a cell. The weight belongs to the target and is resized with it.
+    within a tenth of a cell. The weight, of any size, is resized like the features.
     """
     at_prediction = compare_at == "auto" and prediction.numel() <= 2 * target.numel()
     rows, columns, _ = (prediction if at_prediction else target).shape

@@ -143,8 +143,13 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
     files = find_model(name_or_dir, CLIP_OPTION)
     if files.name == BUILTIN:
         _say_what_builtin_knows()
-    _check_model_type(files)
-    model = _load_weights(CLIPModel, files, device)
+    kind = model_type(files)
+    if kind != "clip":
+        raise UserError(
+            f"{files.name} is a {kind} model: {files.option} takes a CLIP in Hugging Face format, such as "
+            "openai/clip-vit-base-patch32"
+        )
+    model = load_weights(CLIPModel, files, device)
     if not _has(files.folder, "tokenizer.json") and not _has(files.folder, "vocab.json", "merges.txt"):
         # transformers would quietly make a tokenizer without words
         raise UserError(
@@ -167,7 +172,7 @@ def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, toke
     from transformers import AutoModel
 
     files = find_model(name_or_dir, DENSE_OPTION)
-    model = _load_weights(AutoModel, files, device)
+    model = load_weights(AutoModel, files, device)
     if not isinstance(getattr(model.config, "patch_size", None), int):
         raise UserError(
             f"{files.name} is a {model.config.model_type} model without patch tokens: give {files.option} a "
@@ -187,7 +192,7 @@ def _say_what_builtin_knows() -> None:
     )
 
 
-def _load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
+def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
     """The model, frozen and in float32. Weights that the file lacks are an error, not random numbers."""
     from safetensors import SafetensorError
 
@@ -213,18 +218,14 @@ def _load_weights(model_class: Any, files: ModelFiles, device: torch.device | st
     return model.to(device).eval().requires_grad_(False)
 
 
-def _check_model_type(files: ModelFiles) -> None:
+def model_type(files: ModelFiles) -> str:
+    """The kind of network that a model's configuration names ("clip"). Raises UserError without one."""
     from transformers import AutoConfig
 
     try:
-        found = AutoConfig.from_pretrained(files.folder, trust_remote_code=False).model_type
+        return AutoConfig.from_pretrained(files.folder, trust_remote_code=False).model_type
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{files.folder / 'config.json'} is not a model's configuration: {error}") from error
-    if found != "clip":
-        raise UserError(
-            f"{files.name} is a {found} model: {files.option} takes a CLIP in Hugging Face format, such as "
-            "openai/clip-vit-base-patch32"
-        )
 
 
 def _download(name: str, option: str) -> Path:
