@@ -31,11 +31,10 @@ from lang3dxl_ns.evaluation.report import (
     write_atomically,
     write_report,
 )
-from lang3dxl_ns.query.lookup import CodeScorer, CodeTable, build_table, table_error
+from lang3dxl_ns.query.lookup import CodeScorer, CodeTable, mark_cells, table_error, tabulate
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.scene import PROBES, Scene, View
 from lang3dxl_ns.query.scene_file import ScenePhoto
-from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.rendering import Camera
 
 EXACT = "exact"
@@ -88,7 +87,7 @@ def measure(scene: Scene, settings: LookupBenchmark) -> dict[str, Any]:
     """All figures: of the exact path, and of a table of each size."""
     truth = _ground_truth(scene, settings)
     prompts = truth.categories if truth else list(PROBES)
-    queries = scene.queries([Prompt(text) for text in prompts])
+    queries = scene.text.plain_queries(prompts).to(scene.device)
     codes = scene.rendered_codes()
     clock = (
         time.process_time
@@ -99,7 +98,7 @@ def measure(scene: Scene, settings: LookupBenchmark) -> dict[str, Any]:
     tables, built = {}, {}
     for size in settings.sizes:
         start = clock()
-        tables[str(size)] = build_table(scene.decode, codes, size, scene.bounded)
+        tables[str(size)] = tabulate(scene.decode, mark_cells(codes, size, scene.bounded))
         built[str(size)] = clock() - start
     exact = scene.scorer(exact=True)
     scorers = {EXACT: exact} | {

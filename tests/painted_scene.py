@@ -28,6 +28,7 @@ CHANNELS = 16
 
 def decode(codes: Tensor) -> Tensor:
     closeness = (-(codes[:, None] - CODES.to(codes)).square().sum(2)).softmax(1)
+    closeness[:, WORDS.index("object")] += 0.2  # everything is a bit of an object
     return torch.cat([closeness, closeness.new_zeros(len(codes), CHANNELS - len(WORDS))], dim=1)
 
 
@@ -64,18 +65,18 @@ def render(camera: Camera) -> View:
     return View(camera, words[..., None].expand(-1, -1, 3) / 3.0, codes, alpha, torch.full_like(x, DISTANCE))
 
 
-def photo(name: str, x: float, y: float, split="train", size: int = 96) -> ScenePhoto:
+def photo(name: str, x: float, y: float, split="train", focal: int = 96, size: int = 96) -> ScenePhoto:
     view = torch.eye(4)
     view[:3, 3] = -torch.tensor([x, y, -DISTANCE])
     middle = size / 2
-    return ScenePhoto(name, split, camera_to_world(view).tolist(), size, size, middle, middle, size, size)
+    return ScenePhoto(name, split, camera_to_world(view).tolist(), focal, focal, middle, middle, size, size)
 
 
 def painted_scene(cache_dir: Path | None = None, config: QueryConfig | None = None, **changes) -> Scene:
     photos = [
         photo("left/0001.jpg", -1.5, -1),
         photo("right/0002.jpg", 1.5, 1.5),
-        photo("all/0003.jpg", 0, 0),
+        photo("all/0003.jpg", 0, 0, focal=70),
     ]
     photos.append(photo("held/0004.jpg", 0.5, 0.5, "eval"))
     file = SceneFile(photos, "clip", "0123", 1.0, torch.eye(4)[:3].tolist(), "nowhere")

@@ -125,31 +125,54 @@ class CodeTable:
         return codes.sigmoid() if self.bounded else codes
 
 
-@torch.no_grad()
-def build_table(decode: Decode, codes: Float[Tensor, "n d"], size: int, bounded: bool) -> CodeTable:
-    """Tabulate the decoder over the cells that `codes` reach, and their neighbours.
+@dataclass(frozen=True)
+class Grid:
+    """The reached cells of a grid over the code space, and their vertices."""
+
+    size: int
+    bounded: bool
+    low: Float[Tensor, " d"]
+    extent: Float[Tensor, " d"]
+    cell_of: Int[Tensor, " cells"]
+    """Number of every cell among the reached ones, −1 for the others."""
+    corners: Int[Tensor, "reached 2**d"]
+    """Rows of their vertices."""
+    vertices: Float[Tensor, "vertices d"]
+    """Codes there."""
+
+
+def mark_cells(codes: Float[Tensor, "n d"], size: int, bounded: bool) -> Grid:
+    """The cells that `codes` reach, and their neighbours.
 
     codes: those of rendered views, without pixels that show nothing (their one code is an isolated spike).
     size: cells per axis of the codes' bounding box, widened by 1 %.
     """
+    dims, device = codes.shape[1], codes.device
     coordinates = codes.sigmoid() if bounded else codes
     low, high = coordinates.amin(0), coordinates.amax(0)
-    # No wider than a hundredth of the box; a coordinate that never changes needs a box all the same.
+    # A coordinate that never changes needs a box all the same.
     margin = (0.01 * (high - low)).clamp_min(1e-4)
     low, extent = low - margin, high - low + 2 * margin
-    cells = (((coordinates - low) * (size / extent)).floor().long()).clamp_(0, size - 1)
+    cells = ((coordinates - low) * (size / extent)).floor().long().clamp_(0, size - 1)
     reached = _dilated(_occupancy(cells, size)).nonzero()
-    cell_of = torch.full((size,) * codes.shape[1], -1, dtype=torch.int32, device=codes.device)
-    cell_of[tuple(reached.T)] = torch.arange(len(reached), dtype=torch.int32, device=codes.device)
-    steps = torch.tensor(list(product((0, 1), repeat=codes.shape[1])), device=codes.device)
-    vertices = reached[:, None] + steps
-    strides = (size + 1) ** torch.arange(codes.shape[1] - 1, -1, -1, device=codes.device)
-    flat, corners = (vertices * strides).sum(2).unique(return_inverse=True)
-    places = low + flat[:, None].div(strides, rounding_mode="floor").remainder(size + 1) * (extent / size)
+    cell_of = torch.full((size,) * dims, -1, dtype=torch.int32, device=device)
+    cell_of[tuple(reached.T)] = torch.arange(len(reached), dtype=torch.int32, device=device)
+    steps = torch.tensor(list(product((0, 1), repeat=dims)), device=device)
+    strides = (size + 1) ** torch.arange(dims - 1, -1, -1, device=device)
+    flat, corners = ((reached[:, None] + steps) * strides).sum(2).unique(return_inverse=True)
+    place = flat[:, None].div(strides, rounding_mode="floor").remainder(size + 1)
+    vertices = low + place * (extent / size)
     if bounded:
-        places = places.clamp(_EDGE, 1 - _EDGE).logit()
-    features = [F.normalize(decode(part), dim=-1).half() for part in places.split(_ROWS_AT_ONCE)]
-    return CodeTable(size, bounded, low, extent, cell_of.flatten(), corners.int(), torch.cat(features))
+        vertices = vertices.clamp(_EDGE, 1 - _EDGE).logit()
+    return Grid(size, bounded, low, extent, cell_of.flatten(), corners.int(), vertices)
+
+
+@torch.no_grad()
+def tabulate(decode: Decode, grid: Grid) -> CodeTable:
+    """The decoder at the grid's vertices."""
+    features = [F.normalize(decode(part), dim=-1).half() for part in grid.vertices.split(_ROWS_AT_ONCE)]
+    places = grid.size, grid.bounded, grid.low, grid.extent, grid.cell_of, grid.corners
+    return CodeTable(*places, torch.cat(features))
 
 
 def _occupancy(cells: Int[Tensor, "n d"], size: int) -> Bool[Tensor, "..."]:
@@ -208,44 +231,36 @@ class Lookup:
         probes: prompts of the kind that people will ask, whose relevancies are compared.
         """
         checks: list[TableCheck] = []
+        if not len(codes):
+            return cls(None, checks)
         sample = codes[_random_rows(len(codes), _CHECKED_CODES).to(codes.device)]
         exact = probes.relevancy_of_cosines(cosines_of_codes(decode, sample, probes), temperature)
-        for size in config.sizes if len(codes) else ():
-            table, check = _build_and_check(decode, codes, size, bounded, probes, sample, exact, temperature)
-            checks.append(check)
-            if check.error.p999 <= config.tolerance and check.megabytes <= config.max_mb:
+        for size in config.sizes:
+            start = time.perf_counter()
+            grid = mark_cells(codes, size, bounded)
+            if len(grid.vertices) * probes.vectors.shape[1] * 2 / 2**20 > config.max_mb:
+                break
+            table = tabulate(decode, grid)
+            seconds = time.perf_counter() - start
+            read, _ = table.read(sample, table.cosines(probes.vectors))
+            error = table_error(exact, probes.relevancy_of_cosines(read, temperature))
+            checks.append(TableCheck(size, len(table.features), table.megabytes, seconds, error))
+            if error.p999 <= config.tolerance:
                 return cls(table, checks)
         return cls(None, checks)
 
     def __str__(self) -> str:
-        return "; ".join(
+        lines = [
             f"{c.size} cells per axis, {c.vertices} vertices, {c.megabytes:.0f} MB, {c.seconds:.1f} s; "
             f"error of relevancy {c.error.mean:.4f} on average, {c.error.p999:.4f} at the 99.9th percentile, "
             f"{c.error.flips:.2%} across 0.5"
             for c in self.checks
-        ) + ("" if self.table else "; not good enough: every code is decoded")
+        ]
+        return "; ".join(lines if self.table else [*lines, "no table is good enough: every code is decoded"])
 
     def description(self) -> list[dict]:
         """The checks as plain values."""
         return [asdict(check) for check in self.checks]
-
-
-def _build_and_check(
-    decode: Decode,
-    codes: Float[Tensor, "n d"],
-    size: int,
-    bounded: bool,
-    probes: Queries,
-    sample: Float[Tensor, "m d"],
-    exact: Float[Tensor, "q m"],
-    temperature: float,
-) -> tuple[CodeTable, TableCheck]:
-    start = time.perf_counter()
-    table = build_table(decode, codes, size, bounded)
-    seconds = time.perf_counter() - start
-    read, _ = table.read(sample, table.cosines(probes.vectors))
-    error = table_error(exact, probes.relevancy_of_cosines(read, temperature))
-    return table, TableCheck(size, len(table.features), table.megabytes, seconds, error)
 
 
 def _random_rows(count: int, wanted: int) -> Int[Tensor, " n"]:
@@ -291,6 +306,8 @@ class CodeScorer:
         return scores.reshape(len(queries), *shape)
 
     def _relevancy(self, codes: Float[Tensor, "n d"], queries: Queries) -> Float[Tensor, "q n"]:
+        if not len(codes):
+            return codes.new_zeros(len(queries), 0)
         if self.table is None:
             cosines = self._exact(codes, queries)
         else:

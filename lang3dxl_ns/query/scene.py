@@ -294,7 +294,7 @@ class Scene:
         path, key = self._cache_file("lookup"), self._lookup_key
         lookup = load_lookup(path, key, self.device) if path else None
         if lookup is None:
-            probes = self.queries([Prompt(text) for text in PROBES])
+            probes = self.text.plain_queries(PROBES).to(self.device)
             lookup = Lookup.build(
                 self.decode,
                 self.rendered_codes(),
@@ -319,8 +319,8 @@ class Scene:
     @cached_property
     def _small_cameras(self) -> dict[str, Camera]:
         photos = [photo for photo in self.file.photos if photo.split == "train"]
-        step = max(len(photos) / self.config.views, 1.0)
-        chosen = [photos[int(i * step)] for i in range(int(len(photos) / step))]
+        count = min(self.config.views, len(photos))
+        chosen = [photos[i * len(photos) // count] for i in range(count)]
         return {photo.name: resized(photo.camera, self.config.view_side) for photo in chosen}
 
     @cached_property
@@ -331,7 +331,7 @@ class Scene:
     @cached_property
     def _lookup_key(self) -> str:
         c = self.config
-        settings = [self._views_key, asdict(c.lookup), asdict(c.text), c.temperature, c.min_alpha, PROBES]
+        settings = [self._views_key, asdict(c.lookup), c.text.canonical, c.temperature, c.min_alpha, PROBES]
         return fingerprint({}, settings)
 
     def _cache_file(self, name: str) -> Path | None:

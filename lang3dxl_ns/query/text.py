@@ -116,6 +116,7 @@ class TextEncoder:
         self.config = config or TextConfig()
         self._encode = encode
         self._vectors: dict[str, Float[Tensor, " c"]] = {}
+        self._synonyms: dict[str, list[str]] = {}
         self._table = SynonymTable()
 
     @cached_property
@@ -126,8 +127,10 @@ class TextEncoder:
         """Common words for a prompt, most common first; none where it is common itself."""
         if self.config.synonyms == "off":
             return []
-        found = self._table(text) if self.config.synonyms == "table" else self._chat(text)
-        return [word for word in found if word.lower() != text.lower()]
+        if text not in self._synonyms:
+            found = self._table(text) if self.config.synonyms == "table" else self._chat(text)
+            self._synonyms[text] = [word for word in found if word.lower() != text.lower()]
+        return self._synonyms[text]
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
         """Vectors of prompts, their synonyms combined as configured, and of what they compete with."""
@@ -136,6 +139,10 @@ class TextEncoder:
             self.vectors(self.config.canonical),
             [self.vectors(prompt.negatives) for prompt in prompts],
         )
+
+    def plain_queries(self, texts: Sequence[str]) -> Queries:
+        """Vectors of texts as they are, without synonyms, against the canonical phrases."""
+        return Queries.of(self.vectors(texts)[:, None].unbind(), self.vectors(self.config.canonical))
 
     def _positive(self, text: str) -> Float[Tensor, "s c"]:
         words = [*self.synonyms(text), text]

@@ -59,7 +59,7 @@ def test_terms_are_known_in_singular_and_plural(text):
 @pytest.mark.parametrize(
     ("plural", "term"),
     [("niches", "niche"), ("balconies", None), ("buttresses", "buttress"), ("apses", "apse"),
-     ("oculi", "oculus"), ("tympana", "tympanum"), ("base", "base"), ("basilica", None)],
+     ("oculi", "oculus"), ("tympana", "tympanum"), ("niche", "niche"), ("basilica", None)],
 )  # fmt: skip
 def test_plurals_of_several_kinds(plural, term):
     table = SynonymTable()
