@@ -1,13 +1,16 @@
 """Language in large 3D scenes: Lang3D-XL as a nerfstudio plugin.
 
-What is useful without nerfstudio can be imported from here; each name loads its module at first use, so that
-importing the package costs nothing.
+Each name loads its module at first use, so that importing the package costs nothing; only `load_scene` needs
+nerfstudio.
 """
 
 from importlib import import_module
 from typing import Any
 
 _PUBLIC = {
+    "load_scene": "scene_loading",
+    "Scene": "query.scene",
+    "QueryConfig": "query.scene",
     "Camera": "rendering",
     "Gaussians": "rendering",
     "Rendering": "rendering",

@@ -13,7 +13,9 @@ from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.demo_run import Demo
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
+from lang3dxl_ns.lookup_benchmark import LookupBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
+from lang3dxl_ns.query_commands import Export, Query
 from lang3dxl_ns.training_benchmark import TrainingBenchmark
 
 
@@ -50,10 +52,13 @@ class Prepare(PreparationConfig):
 Benchmark = (
     Annotated[RasterizerBenchmark, tyro.conf.subcommand("rasterizer")]
     | Annotated[TrainingBenchmark, tyro.conf.subcommand("training")]
+    | Annotated[LookupBenchmark, tyro.conf.subcommand("lookup")]
 )
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Prepare, tyro.conf.subcommand("prepare")]
+    | Annotated[Query, tyro.conf.subcommand("query")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]
     | Annotated[
         Benchmark,

@@ -16,6 +16,13 @@ def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
     return torch.cat([top, camera_to_world.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
 
+def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
+    """The inverse of `view_matrix`: nerfstudio's camera → world from world → camera (OpenCV axes)."""
+    rotation = view_matrix[:3, :3].T
+    position = -rotation @ view_matrix[:3, 3:]
+    return torch.cat([rotation * view_matrix.new_tensor([1.0, -1.0, -1.0]), position], dim=1)
+
+
 def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "count 3"]:
     """Evenly spread points (a Fibonacci lattice) on a sphere of ten times the scene's radius."""
     centre = points.median(dim=0).values

@@ -25,6 +25,8 @@ from torch.optim.lr_scheduler import LambdaLR
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
+from lang3dxl_ns.query.scene_file import SCENE_FILE
+from lang3dxl_ns.scene_loading import describe_scene
 
 SHORT_RUN = 1_000
 """Iterations of a run that takes the short-run rates."""
@@ -141,8 +143,11 @@ class Lang3DXLTrainer(Trainer):
     _last_iteration = -1
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Set up, then seed: what had to be prepared has no say in the run's randomness."""
+        """Set up, then seed: what had to be prepared has no say in the run's randomness. The run's folder
+        gets a description of the scene, so that it can be queried without the photos."""
         super().setup(test_mode)
+        if self.local_rank == 0:
+            describe_scene(self.pipeline.datamanager).write(self.base_dir / SCENE_FILE)
         torch.manual_seed(self.config.machine.seed)
 
     @property

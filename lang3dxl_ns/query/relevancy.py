@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +14,78 @@ CANONICAL = ("object", "things", "stuff", "texture")
 """Phrases that fit anything (LERF): a prompt is found where it fits better than all of these."""
 TEMPERATURE = 10.0
 """As in LERF's code. The ranking of pixels and the 0.5 contour don't depend on it."""
+Decode = Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]]
+"""Codes to raw CLIP features: `SemanticField.decode_clip`."""
+
+
+@dataclass(frozen=True)
+class Queries:
+    """Several prompts as vectors: each has synonyms, any of which may fit, and phrases that it must beat.
+
+    Vectors are kept once, however many prompts share them.
+    """
+
+    vectors: Float[Tensor, "v c"]
+    """Unit length."""
+    positive: tuple[tuple[int, ...], ...]
+    """Of every prompt, the rows that mean it."""
+    negative: tuple[tuple[int, ...], ...]
+    """Of every prompt, the rows that it competes with: canonical phrases and negatives of its own."""
+
+    @classmethod
+    def of(
+        cls,
+        prompts: Sequence[Float[Tensor, "s c"]],
+        canonical: Float[Tensor, "p c"],
+        negatives: Sequence[Float[Tensor, "m c"]] | None = None,
+    ) -> Queries:
+        """Prompts (a row per synonym) against the canonical phrases and, for each prompt, `negatives`.
+
+        Vectors need no unit length. Raises ValueError where a prompt has no vector, or nothing to beat.
+        """
+        own = [canonical[:0]] * len(prompts) if negatives is None else negatives
+        if any(len(p) == 0 or len(canonical) + len(n) == 0 for p, n in zip(prompts, own, strict=True)):
+            raise ValueError("every prompt needs a vector, and a phrase to compete with")
+        blocks = [canonical]
+        shared = tuple(range(len(canonical)))
+        positive, negative, rows = [], [], len(canonical)
+        for prompt, extra in zip(prompts, own, strict=True):
+            blocks += [prompt, extra]
+            positive.append(tuple(range(rows, rows + len(prompt))))
+            rows += len(prompt)
+            negative.append(shared + tuple(range(rows, rows + len(extra))))
+            rows += len(extra)
+        return cls(F.normalize(torch.cat(blocks), dim=-1), tuple(positive), tuple(negative))
+
+    def __len__(self) -> int:
+        return len(self.positive)
+
+    def to(self, device: torch.device | str) -> Queries:
+        """The same on another device."""
+        return Queries(self.vectors.to(device), self.positive, self.negative)
+
+    def cosines(self, features: Float[Tensor, "... c"]) -> Float[Tensor, "... v"]:
+        """Cosine of every feature to every vector; a zero feature has 0 to all."""
+        return F.normalize(features, dim=-1) @ self.vectors.T
+
+    def relevancy_of_cosines(
+        self, cosines: Float[Tensor, "... v"], temperature: float = TEMPERATURE
+    ) -> Float[Tensor, "q ..."]:
+        """sigmoid(τ (max over synonyms − max over competitors)), which is the smallest of the softmaxes of
+        the best synonym against each competitor (LERF, Kerr et al. 2023): 0…1, above 0.5 where it wins."""
+        margins = [
+            _largest(cosines, mine) - _largest(cosines, theirs)
+            for mine, theirs in zip(self.positive, self.negative, strict=True)
+        ]
+        return torch.sigmoid(temperature * torch.stack(margins))
+
+
+def _largest(cosines: Float[Tensor, "... v"], rows: tuple[int, ...]) -> Float[Tensor, "..."]:
+    """Largest of some columns; column by column, which needs no copy of them all."""
+    largest = cosines[..., rows[0]]
+    for row in rows[1:]:
+        largest = torch.maximum(largest, cosines[..., row])
+    return largest
 
 
 def relevancy(
@@ -26,27 +99,34 @@ def relevancy(
     0…1; above 0.5 where the query fits better than every canonical phrase. Vectors need no unit length; a
     zero feature (nothing rendered) gives 0.5. Source: LERF, Kerr et al. 2023.
     """
-    unit = F.normalize(features, dim=-1)
-    similar = (unit @ F.normalize(queries, dim=-1).T).movedim(-1, 0)
-    neutral = (unit @ F.normalize(canonical, dim=-1).T).amax(-1)
-    return torch.sigmoid(temperature * (similar - neutral))
+    prompts = Queries.of(queries[:, None].unbind(), canonical)
+    return prompts.relevancy_of_cosines(prompts.cosines(features), temperature)
 
 
 @torch.no_grad()
+def cosines_of_codes(
+    decode: Decode, codes: Float[Tensor, "n code"], queries: Queries, max_mb: float = 256.0
+) -> Float[Tensor, "n v"]:
+    """Exact cosines of rendered codes, decoded a chunk at a time: no feature map of an image ever exists.
+
+    max_mb: memory of a chunk's features, about (three copies of float32 live at once).
+    """
+    chunk = max(int(max_mb * 2**20 / (3 * 4 * queries.vectors.shape[-1])), 1)
+    return torch.cat([queries.cosines(decode(part)) for part in codes.split(chunk)])
+
+
 def relevancy_of_codes(
-    decode: Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]],
+    decode: Decode,
     codes: Float[Tensor, "... code"],
-    queries: Float[Tensor, "q c"],
-    canonical: Float[Tensor, "p c"],
+    queries: Float[Tensor, "q c"] | Queries,
+    canonical: Float[Tensor, "p c"] | None = None,
     temperature: float = TEMPERATURE,
     max_mb: float = 256.0,
 ) -> Float[Tensor, "q ..."]:
-    """Relevancy of rendered codes, decoded a chunk at a time: no feature map of the whole image ever exists.
-
-    decode: `SemanticField.decode_clip`. max_mb: memory of a chunk's features, about (three copies of
-    float32 live at once).
-    """
+    """Exact relevancy of rendered codes to `Queries`, or to plain vectors against `canonical` ones."""
+    if not isinstance(queries, Queries):
+        assert canonical is not None, "plain query vectors need canonical ones to compete with"
+        queries = Queries.of(queries[:, None].unbind(), canonical)
     flat = codes.reshape(-1, codes.shape[-1])
-    chunk = max(int(max_mb * 2**20 / (3 * 4 * queries.shape[-1])), 1)
-    parts = [relevancy(decode(part), queries, canonical, temperature) for part in flat.split(chunk)]
-    return torch.cat(parts, 1).reshape(len(queries), *codes.shape[:-1])
+    cosines = cosines_of_codes(decode, flat, queries, max_mb)
+    return queries.relevancy_of_cosines(cosines, temperature).reshape(len(queries), *codes.shape[:-1])

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
-from lang3dxl_ns.query.relevancy import relevancy, relevancy_of_codes
+from lang3dxl_ns.query.relevancy import Queries, relevancy, relevancy_of_codes
 
 
 @pytest.fixture
@@ -63,3 +63,28 @@ def test_chunks_change_nothing(vectors, max_mb):
     expected = relevancy(field.decode_clip(codes).detach(), queries, canonical)
     chunked = relevancy_of_codes(field.decode_clip, codes, queries, canonical, max_mb=max_mb)
     torch.testing.assert_close(chunked, expected)
+
+
+def test_any_synonym_may_fit(vectors):
+    features, prompts, canonical = vectors
+    together = Queries.of([prompts], canonical)
+    best = relevancy(features, prompts, canonical).amax(0)
+    torch.testing.assert_close(together.relevancy_of_cosines(together.cosines(features))[0], best)
+
+
+def test_a_negative_of_its_own_is_one_more_phrase_to_beat(vectors):
+    features, prompts, canonical = vectors
+    own = [prompts[:0], canonical[:2], prompts[:1]]
+    queries = Queries.of(prompts[:, None].unbind(), canonical[2:], own)
+    scores = queries.relevancy_of_cosines(queries.cosines(features))
+    for i, extra in enumerate(own):
+        alone = relevancy(features, prompts[i : i + 1], torch.cat([canonical[2:], extra]))[0]
+        torch.testing.assert_close(scores[i], alone)
+
+
+def test_a_prompt_without_words_or_rivals_is_refused(vectors):
+    _, prompts, canonical = vectors
+    with pytest.raises(ValueError, match="needs a vector"):
+        Queries.of([prompts[:0]], canonical)
+    with pytest.raises(ValueError, match="compete"):
+        Queries.of([prompts], canonical[:0])

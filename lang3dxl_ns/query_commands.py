@@ -1,0 +1,172 @@
+"""`lang3dxl query` and `lang3dxl export`: ask a trained scene from the shell."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Annotated
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.evaluation.report import progress_bar, write_atomically
+from lang3dxl_ns.query.overlay import overlay
+from lang3dxl_ns.query.scene import Match, QueryConfig, Scene
+from lang3dxl_ns.query.scene_file import read_camera_path
+from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.rendering import Camera
+
+
+@dataclass(kw_only=True)
+class Query:
+    """Type words, see where: pictures of what a trained scene finds.
+
+    For every text a folder in --out with, for every view, `….overlay.png` (heat map over the rendering),
+    `….mask.png` and `….npy` (relevancy, float32); `query.json` says what was asked and found. Without
+    --image, --all or --camera-path the training view that shows the first text best is taken.
+    """
+
+    load_config: Path
+    """config.yml of the run."""
+    text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """What to look for; give it several times, or separate with `;`. Negatives: '"windows" not "arcades"'."""
+    out: Path
+    """Folder for the pictures."""
+    image: str | None = None
+    """The view of this photo, by name."""
+    all: bool = False
+    """The views of all photos, held-out ones too."""
+    camera_path: Path | None = None
+    """The views of a camera path that the viewer saved."""
+    exact: bool = False
+    """Decode every pixel instead of reading the lookup table."""
+    settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
+
+    def main(self) -> None:
+        from lang3dxl_ns.scene_loading import load_scene
+
+        if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
+            raise UserError("--image, --all and --camera-path exclude each other: give one of them")
+        scene = load_scene(self.load_config, settings=self.settings)
+        prompts = scene.prompts(self.text)
+        folders = [self.out / slug for slug in slugs([prompt.text for prompt in prompts])]
+        cameras = dict(self._cameras(scene))
+        if not self.exact:
+            print(f"lookup table: {scene.lookup}")
+        views = []
+        with progress_bar() as bar:
+            for name, camera in bar.track(cameras.items(), description="rendering"):
+                matches = scene.match(prompts, scene.render(camera), self.exact)
+                for folder, match in zip(folders, matches, strict=True):
+                    write_match(match, folder / name, self.settings.threshold)
+                views.append(_view_report(name, matches))
+        report = {"threshold": self.settings.threshold, "exact": self.exact or scene.lookup.table is None}
+        report |= {
+            "texts": [_text_report(m, f) for m, f in zip(matches, folders, strict=True)],
+            "views": views,
+        }
+        write_atomically(self.out / "query.json", json.dumps(report, indent=2, ensure_ascii=False) + "\n")
+        for i, prompt in enumerate(prompts):
+            best = max(views, key=lambda view: view["matches"][i]["score"])
+            found = best["matches"][i]
+            where = f"at pixel {found['peak'][0]}, {found['peak'][1]} of {best['view']}"
+            print(f"{prompt.text}: {found['score']:.2f} {where}; {folders[i]}")
+
+    def _cameras(self, scene: Scene) -> Iterator[tuple[str, Camera]]:
+        """File name (no suffix) and camera of every view that is asked for."""
+        if self.camera_path is not None:
+            yield from ((f"{i:05d}", c) for i, c in enumerate(read_camera_path(self.camera_path)))
+        elif self.all:
+            yield from ((_file_name(photo.name), photo.camera) for photo in scene.file.photos)
+        else:
+            name = scene.file.photo(self.image).name if self.image else _best_view(scene, self.text)
+            yield _file_name(name), scene.camera(name)
+
+
+def _best_view(scene: Scene, texts: list[str]) -> str:
+    found = scene.find(texts)[0]
+    if found.viewpoints:
+        return found.viewpoints[0].name
+    print(f"no training view shows {found.prompt.text!r}: here is the first one")
+    return scene.file.photos[0].name
+
+
+def _file_name(photo: str) -> str:
+    return str(PurePosixPath(photo).with_suffix("")).replace("/", "_")
+
+
+def slugs(texts: list[str]) -> list[str]:
+    """A folder name for each text, no two the same, whatever the texts are."""
+    found: list[str] = []
+    for i, text in enumerate(texts):
+        slug = re.sub(r"[^\w]+", "-", text.lower()).strip("-")[:40] or f"text-{i + 1}"
+        found.append(f"{slug}-{i + 1}" if slug in found else slug)
+    return found
+
+
+def write_match(match: Match, stem: Path, threshold: float) -> None:
+    """Write `stem`.overlay.png, .mask.png and .npy."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    picture = overlay(match.view.image, match.relevancy, threshold)
+    _save_png(picture, stem.with_name(f"{stem.name}.overlay.png"))
+    _save_png(match.mask.float(), stem.with_name(f"{stem.name}.mask.png"))
+    np.save(stem.with_name(f"{stem.name}.npy"), match.relevancy.cpu().numpy().astype(np.float32))
+
+
+def _save_png(pixels: Float[Tensor, "h w ..."], path: Path) -> None:
+    Image.fromarray((pixels.clamp(0, 1) * 255).round().byte().cpu().numpy()).save(path)
+
+
+def _text_report(match: Match, folder: Path) -> dict:
+    return {
+        "text": match.prompt.text,
+        "negatives": list(match.prompt.negatives),
+        "synonyms": match.synonyms,
+        "folder": folder.name,
+    }
+
+
+def _view_report(name: str, matches: list[Match]) -> dict:
+    found = [{"peak": m.peak, "score": m.score, "area": float(m.mask.float().mean())} for m in matches]
+    seconds = {"render_seconds": matches[0].view.seconds, "query_seconds": matches[0].seconds}
+    return {"view": name, **seconds, "matches": found}
+
+
+@dataclass(kw_only=True)
+class Export:
+    """Write the Gaussians that match a text as a PLY file that ordinary splat viewers open.
+
+    Matched are Gaussians by their own codes; the frame is the model's.
+    """
+
+    load_config: Path
+    """config.yml of the run."""
+    text: str
+    """What to look for, one prompt."""
+    out: Path
+    """The .ply file."""
+    all: bool = False
+    """Write all Gaussians, and how well each matches as a property `score` (0…1)."""
+    settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
+
+    def main(self) -> None:
+        from lang3dxl_ns.scene_loading import load_scene
+
+        scene = load_scene(self.load_config, settings=self.settings)
+        scores = scene.query_gaussians(self.text)
+        matching = scores > self.settings.threshold
+        if not self.all and not matching.any():
+            raise UserError(
+                f"no Gaussian matches {self.text!r}: the best reaches {float(scores.max()):.2f}; lower "
+                f"--threshold, now {self.settings.threshold}, or write all with their scores (--all)"
+            )
+        keep, extra = (None, scores) if self.all else (matching, None)
+        count = write_splats(self.out, scene.gaussians, keep, extra)
+        print(f"Wrote {count} of {len(scores)} Gaussians to {self.out}")

@@ -1,0 +1,166 @@
+"""From a run folder to a `Scene`, without a data manager: no photo is opened."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+import yaml
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.trainer import TrainerConfig
+from torch import Tensor
+
+from lang3dxl_ns.datamanager import Lang3DXLDataManager, PhotoDataset
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.geometry import camera_to_world
+from lang3dxl_ns.model import Lang3DXLModel
+from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, load_image_text_encoder
+from lang3dxl_ns.query.scene import QueryConfig, Scene, View
+from lang3dxl_ns.query.scene_file import SCENE_FILE, SceneFile, ScenePhoto
+from lang3dxl_ns.rendering import Camera
+
+
+def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
+    """What a run's folder keeps of its data."""
+    outputs, clip = datamanager.train_dataparser_outputs, datamanager.config.clip
+    known = None if clip == "none" else find_model(clip, CLIP_OPTION)
+    local = Path(clip).expanduser()
+    return SceneFile(
+        photos=_photos(datamanager.train_dataset, "train") + _photos(datamanager.eval_dataset, "eval"),
+        clip=None if known is None else str(local.absolute()) if local.is_dir() else clip,
+        clip_identity=None if known is None else known.identity,
+        scale=float(outputs.dataparser_scale),
+        transform=outputs.dataparser_transform.tolist(),
+        data=str(Path(datamanager.config.dataparser.data).expanduser().absolute()),
+    )
+
+
+def _photos(dataset: PhotoDataset, split) -> list[ScenePhoto]:
+    cameras = dataset.cameras
+    return [
+        ScenePhoto(
+            photo.name,
+            split,
+            cameras.camera_to_worlds[i].tolist(),
+            *(float(values[i]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)),
+            *(int(values[i]) for values in (cameras.width, cameras.height)),
+        )
+        for i, photo in enumerate(dataset.photos)
+    ]
+
+
+def load_scene(
+    config: str | Path, device: torch.device | str | None = None, settings: QueryConfig | None = None
+) -> Scene:
+    """The scene of a run.
+
+    Args:
+        config: the run's config.yml. Like nerfstudio's own commands this trusts the file: load those of
+            people that you trust. The latest checkpoint beside it is taken.
+        device: a GPU where there is one, by default.
+        settings: how to answer.
+
+    Raises UserError for a folder without a checkpoint, a run without semantics, a CLIP that is another one
+    than the run's.
+    """
+    path = Path(config).expanduser()
+    if not path.is_file():
+        raise UserError(f"{path} is not a file: pass the config.yml of a run")
+    run = yaml.load(path.read_text(), Loader=yaml.Loader)
+    if not isinstance(run, TrainerConfig):
+        raise UserError(f"{path} is not the config.yml of a run of nerfstudio")
+    file = SceneFile.read(path.parent / SCENE_FILE)
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    model = _load_model(run, path.parent, file, device)
+    return scene_of_model(model, file, path.parent, settings)
+
+
+def scene_of_model(
+    model: Lang3DXLModel, file: SceneFile, cache_dir: Path | None = None, settings: QueryConfig | None = None
+) -> Scene:
+    """A scene around a model that is loaded, be it still in training (then without `cache_dir`).
+
+    Raises UserError where the model has no semantics, or its CLIP has changed.
+    """
+    field = model.semantic_field
+    if field is None or file.clip is None:
+        raise UserError(
+            "this run has no semantics (it was trained with clip none): there is nothing to ask it"
+        )
+    encoder = load_image_text_encoder(file.clip, model.device)
+    if encoder.identity != file.clip_identity:
+        raise UserError(
+            f"the CLIP in {file.clip} is not the one that this run learned from: restore it, or train anew"
+        )
+    return Scene(
+        render=renderer(model),
+        decode=field.decode_clip,
+        bounded=field.settings.bounding == "sigmoid",
+        gaussians={name: parameter.detach() for name, parameter in model.gauss_params.items()},
+        file=file,
+        encode_texts=encoder.encode_texts,
+        state=model.state_dict(),
+        cache_dir=cache_dir,
+        config=settings,
+    )
+
+
+def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch.device) -> Lang3DXLModel:
+    checkpoints = sorted((folder / run.relative_model_dir).glob("step-*.ckpt"))
+    if not checkpoints:
+        raise UserError(
+            f"{folder / run.relative_model_dir} holds no checkpoint: train for longer, or copy it"
+        )
+    state = torch.load(checkpoints[-1], map_location="cpu", weights_only=True)["pipeline"]
+    photos = [photo for photo in file.photos if photo.split == "train"]
+    # The checkpoint brings its own Gaussians: start from the fewest that there can be.
+    start = replace(run.pipeline.model, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
+    model = start.setup(
+        scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
+        num_train_data=len(photos),
+        metadata={"feature_statistics": None, "photos": photos},
+        device=device,
+        grad_scaler=None,
+        seed_points=(torch.eye(4)[:, :3], torch.zeros(4, 3)),
+    )
+    assert isinstance(model, Lang3DXLModel)
+    model.load_state_dict({k.removeprefix("_model."): v for k, v in state.items() if k.startswith("_model.")})
+    return model.to(device).eval()
+
+
+def renderer(model: Lang3DXLModel) -> Callable[[Camera], View]:
+    """Draws cameras of the rasteriser with a model in evaluation."""
+
+    def render(camera: Camera) -> View:
+        start = time.perf_counter()
+        outputs = model.get_outputs_for_camera(as_nerfstudio(camera).to(model.device))
+        maps = {name: outputs[name][..., 0] for name in ("accumulation", "depth")}
+        return View(
+            camera,
+            outputs["rgb"],
+            model.rendered_codes,
+            maps["accumulation"],
+            maps["depth"],
+            time.perf_counter() - start,
+        )
+
+    return render
+
+
+def as_nerfstudio(camera: Camera) -> Cameras:
+    """The same camera as nerfstudio's."""
+    k: Float[Tensor, "3 3"] = camera.intrinsics.cpu()
+    return Cameras(
+        camera_to_worlds=camera_to_world(camera.view_matrix.cpu())[None],
+        fx=float(k[0, 0]),
+        fy=float(k[1, 1]),
+        cx=float(k[0, 2]),
+        cy=float(k[1, 2]),
+        width=camera.width,
+        height=camera.height,
+    )

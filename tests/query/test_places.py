@@ -1,0 +1,58 @@
+"""From pixels back to places."""
+
+import pytest
+import torch
+
+from lang3dxl_ns.query.places import strongest_match, world_points
+from lang3dxl_ns.rendering import Camera
+
+
+def test_points_project_back_to_their_pixels():
+    generator = torch.Generator().manual_seed(0)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator)).Q
+    view = torch.eye(4)
+    view[:3, :3], view[:3, 3] = rotation, torch.tensor([0.3, -0.2, 1.0])
+    camera = Camera(view, torch.tensor([[40.0, 0, 11.0], [0, 50.0, 7.0], [0, 0, 1]]), 20, 12)
+    depth = 1 + torch.rand(12, 20, generator=generator)
+    mask = torch.rand(12, 20, generator=generator) > 0.5
+    seen = world_points(camera, depth, mask) @ rotation.T + view[:3, 3]
+    torch.testing.assert_close(seen[:, 2], depth[mask])
+    pixels = seen @ camera.intrinsics.T / seen[:, 2:]
+    rows, columns = mask.nonzero().T
+    torch.testing.assert_close(pixels[:, :2], torch.stack([columns, rows], 1) + 0.5)
+
+
+def clouds(*places: float, count: int = 500) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.cat([p + torch.rand(count, 3, generator=generator) for p in places])
+
+
+def test_the_heavier_of_two_matches_wins_though_it_has_fewer_points():
+    points = torch.cat([clouds(0.0, count=2000), clouds(5.0, count=1000)])
+    weights = torch.cat([torch.full((2000,), 0.1), torch.full((1000,), 0.3)])
+    box = strongest_match(points, weights, gap=0.3)
+    assert all(5.0 <= low < 5.1 for low in box.low) and all(5.9 < high <= 6.0 for high in box.high)
+    assert box.share == pytest.approx(0.6, rel=1e-4)
+    assert box.centre == pytest.approx((5.5, 5.5, 5.5), abs=0.05)
+
+
+def test_nothing_depends_on_where_the_world_begins():
+    points = clouds(0.0, 3.0)
+    weights = torch.linspace(1, 2, 1000)
+    here, there = (strongest_match(points + shift, weights, 0.4) for shift in (0.0, -40.0))
+    torch.testing.assert_close(torch.tensor(here.low) - 40, torch.tensor(there.low))
+
+
+def test_a_few_stray_points_do_not_widen_the_box():
+    points = torch.cat([clouds(0.0), torch.tensor([[1.0 + 0.2 * i, 0.5, 0.5] for i in range(6)])])
+    assert strongest_match(points, torch.ones(506), gap=0.3).high[0] < 1.05
+
+
+def test_touching_at_a_corner_connects():
+    points = torch.tensor([[0.5, 0.5, 0.5], [1.5, 1.5, 1.5], [2.5, 0.5, 2.5], [9.5, 0.5, 0.5]])
+    assert strongest_match(points, torch.ones(4), gap=1.0).share == pytest.approx(0.75)
+
+
+def test_a_single_point_is_its_own_box():
+    box = strongest_match(torch.tensor([[1.0, 2.0, 3.0]]), torch.ones(1), 0.1)
+    assert box.low == box.high == (1.0, 2.0, 3.0)

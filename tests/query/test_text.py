@@ -1,0 +1,124 @@
+"""What people type becomes prompts, synonyms and vectors."""
+
+import pytest
+import torch
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.query.text import Prompt, SynonymTable, TextConfig, TextEncoder, parse_prompts
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("rose window", [Prompt("rose window")]),
+        ("a; b ;; c;", [Prompt("a"), Prompt("b"), Prompt("c")]),
+        ("  many\n\tspaces  ", [Prompt("many spaces")]),
+        ('"windows" not "decorative opening"', [Prompt("windows", ("decorative opening",))]),
+        ('windows NOT "arcades", "niches"; dome', [Prompt("windows", ("arcades", "niches")), Prompt("dome")]),
+        ('windows not "arcades" not "niches"', [Prompt("windows", ("arcades", "niches"))]),
+        ("“windows” not „arcades“", [Prompt("windows", ("arcades",))]),
+        ('"door; open" not "a; b"', [Prompt("door; open", ("a; b",))]),
+        ("do not enter sign", [Prompt("do not enter sign")]),
+        ('knot "garden"', [Prompt("knot garden")]),
+        ('a "quote that never ends', [Prompt("a quote that never ends")]),
+        ('dome not ""', [Prompt("dome")]),
+        ("🙂; окно; 窓", [Prompt("🙂"), Prompt("окно"), Prompt("窓")]),
+        ("half a\ud800 pair", [Prompt("half a pair")]),
+    ],
+)
+def test_prompts_are_read_as_typed(typed, expected):
+    assert parse_prompts(typed) == expected
+
+
+@pytest.mark.parametrize("typed", ["", "   ", ";;", '""', '" "; ', "\0", "\ud800"])
+def test_an_empty_prompt_is_refused_in_words(typed):
+    with pytest.raises(UserError, match="the prompt is empty: type what to look for"):
+        parse_prompts(typed)
+
+
+def test_negatives_alone_are_refused_in_words():
+    with pytest.raises(UserError, match="not what to find"):
+        parse_prompts('not "doors"')
+
+
+def test_the_table_holds_architectural_terms_with_common_synonyms():
+    terms = SynonymTable().terms
+    assert len(terms) >= 60
+    for term, synonyms in terms.items():
+        assert term == term.lower().strip() and isinstance(synonyms, list) and synonyms, term
+        assert all(isinstance(s, str) and s == s.strip() and "," not in s for s in synonyms), term
+        assert term not in synonyms and len(set(synonyms)) == len(synonyms), term
+    assert {"pinnacle", "lintel", "archivolt", "minaret", "muqarnas", "pendentive"} <= set(terms)
+
+
+@pytest.mark.parametrize("text", ["lintel", "Lintels", "the LINTEL", " a lintel "])
+def test_terms_are_known_in_singular_and_plural(text):
+    assert SynonymTable()(text)[0] == "beam above a door"
+
+
+@pytest.mark.parametrize(
+    ("plural", "term"),
+    [("niches", "niche"), ("balconies", None), ("buttresses", "buttress"), ("apses", "apse"),
+     ("oculi", "oculus"), ("tympana", "tympanum"), ("niche", "niche"), ("basilica", None)],
+)  # fmt: skip
+def test_plurals_of_several_kinds(plural, term):
+    table = SynonymTable()
+    assert table(plural) == (table.terms[term] if term else [])
+
+
+@pytest.fixture
+def encode():
+    """A vector per text, the same every time; counts what it is asked."""
+    asked = []
+
+    def run(texts):
+        asked.extend(texts)
+        seeds = [sum(text.encode()) for text in texts]
+        return torch.stack([torch.randn(16, generator=torch.Generator().manual_seed(s)) for s in seeds])
+
+    run.asked = asked
+    return run
+
+
+def rows(encoder: TextEncoder, text: str) -> torch.Tensor:
+    queries = encoder.queries([Prompt(text)])
+    return queries.vectors[list(queries.positive[0])]
+
+
+def test_synonyms_are_joined_averaged_or_each_on_its_own(encode):
+    words = [*SynonymTable()("oculus"), "oculus"]
+    joined, mean, each = (
+        rows(TextEncoder(encode, TextConfig(combine=c)), "oculus") for c in ("joined", "mean", "max")
+    )
+    unit = torch.nn.functional.normalize(encode(words), dim=1)
+    torch.testing.assert_close(each, unit)
+    torch.testing.assert_close(mean, torch.nn.functional.normalize(unit.mean(0, keepdim=True), dim=1))
+    torch.testing.assert_close(joined, torch.nn.functional.normalize(encode([", ".join(words)]), dim=1))
+
+
+def test_without_synonyms_a_term_stands_alone(encode):
+    encoder = TextEncoder(encode, TextConfig(synonyms="off"))
+    assert encoder.synonyms("oculus") == []
+    rows(encoder, "oculus")
+    assert "oculus" in encode.asked and "round window" not in "".join(encode.asked)
+
+
+@pytest.mark.parametrize("combine", ["joined", "mean", "max"])
+def test_a_common_word_is_the_same_however_synonyms_are_combined(encode, combine):
+    expected = torch.nn.functional.normalize(encode(["window"]), dim=1)
+    torch.testing.assert_close(rows(TextEncoder(encode, TextConfig(combine=combine)), "window"), expected)
+
+
+def test_negatives_compete_in_their_own_prompt_only(encode):
+    encoder = TextEncoder(encode, TextConfig(canonical=("object",)))
+    queries = encoder.queries([Prompt("dome", ("roof", "hat")), Prompt("wall")])
+    assert [len(group) for group in queries.negative] == [3, 1]
+    own = queries.vectors[list(queries.negative[0])]
+    torch.testing.assert_close(own, encoder.vectors(["object", "roof", "hat"]))
+
+
+def test_every_text_is_encoded_once(encode):
+    encoder = TextEncoder(encode)
+    for _ in range(3):
+        encoder.queries([Prompt("dome"), Prompt("lintel", ("dome",))])
+    assert len(encode.asked) == len(set(encode.asked))

@@ -1,0 +1,148 @@
+"""`lang3dxl query`, `export` and `benchmark lookup`, on a scene whose answers are known."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from painted_scene import CODES, painted_scene, render
+from PIL import Image
+
+from lang3dxl_ns import cli, scene_loading
+from lang3dxl_ns.query_commands import slugs
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """Runs a command on the painted scene."""
+    gaussians = {"means": torch.eye(4)[:, :3], "codes": CODES, "features_dc": torch.zeros(4, 3),
+                 "features_rest": torch.zeros(4, 15, 3), "opacities": torch.zeros(4, 1),
+                 "scales": torch.zeros(4, 3), "quats": torch.eye(4)}  # fmt: skip
+    monkeypatch.setattr(
+        scene_loading,
+        "load_scene",
+        lambda path, settings=None: painted_scene(config=settings, gaussians=gaussians),
+    )
+
+    return lambda *words: cli.main([str(word) for word in words])
+
+
+def test_query_writes_pictures_map_and_report(run, tmp_path, capsys):
+    words = ("query", "--load-config", "c", "--text", 'dome not "window"', "--text", "window;oculus")
+    run(*words, "--image", "all/0003.jpg", "--out", tmp_path)
+    report = json.loads((tmp_path / "query.json").read_text())
+    assert report["threshold"] == 0.5 and not report["exact"]
+    assert [t["text"] for t in report["texts"]] == ["dome", "window", "oculus"]
+    assert (
+        report["texts"][0]["negatives"] == ["window"] and report["texts"][2]["synonyms"][0] == "round window"
+    )
+    view = report["views"][0]
+    assert view["view"] == "all_0003" and view["render_seconds"] >= 0 and view["query_seconds"] > 0
+    relevancy = np.load(tmp_path / "dome" / "all_0003.npy")
+    assert relevancy.shape == (96, 96) and relevancy.dtype == np.float32
+    column, row = view["matches"][0]["peak"]
+    assert relevancy[row, column] == relevancy.max() == pytest.approx(view["matches"][0]["score"])
+    mask = np.asarray(Image.open(tmp_path / "dome" / "all_0003.mask.png"))
+    np.testing.assert_array_equal(mask == 255, relevancy > 0.5)
+    picture = np.asarray(Image.open(tmp_path / "dome" / "all_0003.overlay.png")).astype(int)
+    assert (np.ptp(picture[mask == 0], axis=1) == 0).all() and (
+        np.ptp(picture[mask == 255], axis=1) > 0
+    ).all()
+    assert "dome" in capsys.readouterr().out
+
+
+def test_without_a_view_the_best_one_is_taken(run, tmp_path):
+    run("query", "--load-config", "c", "--text", "dome", "--out", tmp_path)
+    assert (tmp_path / "dome" / "right_0002.npy").exists()
+
+
+def test_all_photos_are_asked(run, tmp_path):
+    run("query", "--load-config", "c", "--text", "dome", "--all", "--out", tmp_path, "--exact")
+    assert len(list((tmp_path / "dome").glob("*.npy"))) == 4
+
+
+def test_a_camera_path_is_followed(run, tmp_path):
+    pose = torch.diag(torch.tensor([1.0, -1, -1, 1]))
+    pose[2, 3] = -5
+    frame = {"camera_to_world": pose.flatten().tolist(), "fov": 60.0}
+    path = {"render_width": 30, "render_height": 20, "camera_path": [frame, frame]}
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    run(
+        "query",
+        "--load-config",
+        "c",
+        "--text",
+        "dome",
+        "--camera-path",
+        tmp_path / "path.json",
+        "--out",
+        tmp_path,
+    )
+    assert np.load(tmp_path / "dome" / "00001.npy").shape == (20, 30)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--text", " ; "), "the prompt is empty"),
+        ((), "the prompt is empty"),
+        (("--text", "dome", "--image", "x"), "no photo 'x'"),
+        (("--text", "dome", "--image", "0001", "--all"), "exclude each other"),
+    ],
+)
+def test_mistakes_end_in_a_sentence(run, tmp_path, words, message):
+    with pytest.raises(SystemExit, match=message):
+        run("query", "--load-config", "c", "--out", tmp_path, *words)
+
+
+def test_settings_are_flags(run, tmp_path):
+    words = ("query", "--load-config", "c", "--text", "dome", "--image", "0002", "--out", tmp_path)
+    run(*words, "--threshold", 0.999, "--synonyms", "off", "--sizes", 8)
+    assert not np.asarray(Image.open(tmp_path / "dome" / "right_0002.mask.png")).any()
+
+
+def test_export_writes_the_matching_gaussians_or_all_with_scores(run, tmp_path):
+    run("export", "--load-config", "c", "--text", "dome", "--out", tmp_path / "dome.ply")
+    assert b"element vertex 1\n" in (tmp_path / "dome.ply").read_bytes()
+    run("export", "--load-config", "c", "--text", "dome", "--all", "--out", tmp_path / "all.ply")
+    content = (tmp_path / "all.ply").read_bytes()
+    assert b"element vertex 4\n" in content and b"property float score\n" in content
+    with pytest.raises(SystemExit, match="no Gaussian matches 'palm tree'"):
+        run("export", "--load-config", "c", "--text", "palm tree", "--out", tmp_path / "none.ply")
+
+
+def test_folder_names_are_safe_and_differ():
+    texts = ["Rose window", "rose-window", "🙂", "../../etc", "окно", "x" * 500]
+    names = slugs(texts)
+    assert names == ["rose-window", "rose-window-2", "text-3", "etc", "окно", "x" * 40]
+
+
+@pytest.fixture
+def truth(tmp_path):
+    """Ground truth of the held-out photo: black where the dome is painted."""
+    view = render(painted_scene().file.photo("0004").camera)
+    dome = (view.image[..., 0] * 3).round() == 1
+    folder = tmp_path / "truth" / "dome"
+    folder.mkdir(parents=True)
+    Image.fromarray(np.where(dome.numpy(), 0, 255).astype(np.uint8)).save(folder / "0004-gt.png")
+    return folder.parent
+
+
+def test_the_benchmark_compares_tables_with_the_exact_path(run, tmp_path, truth):
+    words = ("benchmark", "lookup", "--load-config", "c", "--out", tmp_path, "--sizes", 8, 64)
+    run(*words, "--ground-truth", truth, "--repeats", 1, "--frame", 64, 48)
+    results = json.loads((tmp_path / "lookup.json").read_text())
+    coarse, fine = results["tables"]
+    assert results["prompts"] == ["dome"] and results["exact_map"] > 0.9
+    assert fine["mean"] < coarse["mean"] and fine["p999"] <= coarse["p999"]
+    assert fine["vertices"] > coarse["vertices"] and abs(fine["map"] - results["exact_map"]) < 0.01
+    report = (tmp_path / "lookup.md").read_text()
+    assert "lang3dxl benchmark lookup" in report and "AP difference" in report
+    assert Image.open(tmp_path / "lookup.png").size[0] > 500
+
+
+def test_without_ground_truth_the_benchmark_asks_everyday_words(run, tmp_path):
+    words = ("benchmark", "lookup", "--load-config", "c", "--out", tmp_path, "--sizes", 8, "--repeats", 1)
+    run(*words)
+    results = json.loads((tmp_path / "lookup.json").read_text())
+    assert "window" in results["prompts"] and results["exact_map"] is None
