@@ -12,6 +12,7 @@ import tyro
 from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
+from lang3dxl_ns.evaluation.numerics.command import Numerics
 from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.training_benchmark import TrainingBenchmark
 
@@ -53,6 +54,7 @@ Benchmark = (
 Command = (
     Annotated[Prepare, tyro.conf.subcommand("prepare")]
     | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]
+    | Annotated[Numerics, tyro.conf.subcommand("numerics")]
     | Annotated[
         Benchmark,
         tyro.conf.subcommand("benchmark", description="Measure: time, memory and error, side by side."),

@@ -10,10 +10,11 @@ from typing import Any
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 
-from lang3dxl_ns.datamanager import Lang3DXLDataManagerConfig
+from lang3dxl_ns.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.model import Lang3DXLModelConfig
+from lang3dxl_ns.model import Lang3DXLModel, Lang3DXLModelConfig
 
 
 @dataclass
@@ -28,9 +29,19 @@ class Lang3DXLPipelineConfig(VanillaPipelineConfig):
 class Lang3DXLPipeline(VanillaPipeline):
     """nerfstudio's pipeline; loads checkpoints strictly."""
 
+    datamanager: Lang3DXLDataManager
+    model: Lang3DXLModel
+    last_losses: dict[str, Tensor]
+    """The weighted losses of the latest training step."""
+
     def __init__(self, *args, **kwargs):
         print_user_errors_plainly()
         super().__init__(*args, **kwargs)
+
+    def get_train_loss_dict(self, step: int):
+        """Outputs, losses and metrics of the next photo."""
+        outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
+        return outputs, self.last_losses, metrics
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
         """Load a checkpoint; whatever does not fit is an error (nerfstudio would silently leave it out)."""
