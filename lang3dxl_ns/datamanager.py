@@ -129,6 +129,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
     config: Lang3DXLDataManagerConfig
     train_dataset: PhotoDataset
     eval_dataset: PhotoDataset
+    photo_in_hand: str
+    """Name of the photo that training had last."""
 
     def __init__(self, config: Lang3DXLDataManagerConfig, *args, **kwargs):
         self._left_out: set[int] = set()
@@ -239,6 +241,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             self.train_unseen_cameras = self.sample_train_cameras()
             return self.next_train(step)
         camera.metadata = {"cam_idx": index}
+        self.photo_in_hand = batch["name"]
         return camera, batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:

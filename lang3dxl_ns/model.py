@@ -32,6 +32,7 @@ from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
 from lang3dxl_ns.geometry import sphere_around, view_matrix
 from lang3dxl_ns.preparation.prepare import FeatureStatistics
 from lang3dxl_ns.rendering import Camera, Gaussians, Rendering, rasterize, spherical_harmonics
+from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.timing import part
 
 SHORT_FIELD_RUN = 5_000
@@ -131,6 +132,7 @@ class Lang3DXLModel(SplatfactoModel):
                 clip.std if dense is None else torch.cat([clip.std, dense.std]),
             )
         self.step = 0
+        self.step_is_sound = True
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.lpips = Lpips()
         self.crop_box = None
@@ -215,8 +217,9 @@ class Lang3DXLModel(SplatfactoModel):
                 parameter.requires_grad_(name == "codes")
 
     def step_post_backward(self, step: int) -> None:
-        """After an iteration: densify and prune (not at step 0, where the strategy would reset opacities)."""
-        if step > 0 and self.means.requires_grad:
+        """After an iteration: densify and prune (not at step 0, where the strategy would reset opacities,
+        and not after a step that was skipped)."""
+        if step > 0 and self.means.requires_grad and self.step_is_sound:
             before = self.num_points
             super().step_post_backward(step)
             if self.num_points != before:
@@ -296,7 +299,12 @@ class Lang3DXLModel(SplatfactoModel):
         self.last_size = (view.height, view.width)
         background = self._get_background_color()
         rendering = rasterize(
-            Gaussians(g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(-1)),
+            Gaussians(
+                g["means"],
+                g["quats"],
+                g["scales"].clamp_max(MAX_LOG_SCALE).exp(),
+                g["opacities"].sigmoid().squeeze(-1),
+            ),
             view,
             self._colours(g, pose[0, :, 3].to(self.device)),
             background,

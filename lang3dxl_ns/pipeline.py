@@ -60,6 +60,8 @@ class Lang3DXLPipeline(VanillaPipeline):
     config: Lang3DXLPipelineConfig
     datamanager: Lang3DXLDataManager
     model: Lang3DXLModel
+    last_losses: dict[str, Tensor]
+    """The weighted losses of the latest training step."""
 
     def __init__(self, *args, **kwargs):
         print_user_errors_plainly()
@@ -126,6 +128,11 @@ class Lang3DXLPipeline(VanillaPipeline):
             if output_path is not None:
                 _write_pictures(evaluated, output_path)
         return average(photos, get_std)
+
+    def get_train_loss_dict(self, step: int):
+        """Outputs, losses and metrics of the next photo."""
+        outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
+        return outputs, self.last_losses, metrics
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
         """Load a checkpoint; whatever does not fit is an error (nerfstudio would silently leave it out)."""

@@ -6,7 +6,7 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,11 +14,12 @@ from types import FrameType
 from typing import Literal
 
 import torch
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -27,6 +28,7 @@ from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.query.scene_file import SCENE_FILE
 from lang3dxl_ns.scene_loading import describe_scene
+from lang3dxl_ns.step_guard import StepGuard
 
 SHORT_RUN = 1_000
 """Iterations of a run that takes the short-run rates."""
@@ -109,6 +111,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: Lang3DXLTrainer)
     pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
+    max_skipped_steps: int = 20
+    """A step whose loss or gradient is not finite is skipped; after this many in a row the run stops."""
 
     def set_timestamp(self) -> None:
         """Called once before the configuration is printed and saved: settle what depends on the run."""
@@ -133,8 +137,27 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.load_dir, self.load_checkpoint = _absolute(self.load_dir), _absolute(self.load_checkpoint)
 
 
+class GuardedOptimizers(Optimizers):
+    """nerfstudio's optimisers, which ask before they step."""
+
+    def __init__(self, config: dict, param_groups: dict, allowed: Callable[[GradScaler], bool]):
+        super().__init__(config, param_groups)
+        self._allowed = allowed
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        """Step, or forget all gradients and leave parameters and moments as they are."""
+        if self._allowed(grad_scaler):
+            super().optimizer_scaler_step_some(grad_scaler, param_groups)
+            return
+        for name, optimizer in self.optimizers.items():
+            if any(parameter.grad is not None for parameter in self.parameters[name]):
+                grad_scaler.unscale_(optimizer)  # tells it what overflowed, so that it lowers the scale
+        self.zero_grad_all()
+
+
 class Lang3DXLTrainer(Trainer):
-    """nerfstudio's trainer with atomic checkpoints, and a resumed run that ends at the asked iteration."""
+    """nerfstudio's trainer with atomic checkpoints, a resumed run that ends at the asked iteration, and a
+    guard against steps that are not finite."""
 
     config: Lang3DXLTrainerConfig
     pipeline: Lang3DXLPipeline
@@ -155,6 +178,24 @@ class Lang3DXLTrainer(Trainer):
         """Where the training begins: 0, or after the checkpoint that it goes on from."""
         return self._start_step
 
+    def setup_optimizers(self) -> Optimizers:
+        """The optimisers, with the guard before them."""
+        self.guard = StepGuard(self.config.max_skipped_steps, CONSOLE.log)
+        groups = self.pipeline.get_param_groups()
+        return GuardedOptimizers(self.config.optimizers.copy(), groups, self._step_is_sound)
+
+    def _step_is_sound(self, grad_scaler: GradScaler) -> bool:
+        sound = self.guard.allows(
+            self.step,
+            self.pipeline.datamanager.photo_in_hand,
+            self.pipeline.last_losses,
+            self.optimizers.parameters,
+            grad_scaler.get_scale(),
+        )
+        # Densification collects the gradients of the screen positions, which are as broken.
+        self.pipeline.model.step_is_sound = sound
+        return sound
+
     def train(self) -> None:
         """Train up to `max_num_iterations` in all (nerfstudio would add that many to a resumed run)."""
         total = self.config.max_num_iterations
@@ -172,6 +213,8 @@ class Lang3DXLTrainer(Trainer):
                 super().train()
         finally:
             self.config.max_num_iterations = total
+            if summary := self.guard.summary():
+                CONSOLE.log(f"[yellow]{summary}")
 
     def train_iteration(self, step: int):
         result = super().train_iteration(step)

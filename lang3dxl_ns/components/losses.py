@@ -14,9 +14,12 @@ from jaxtyping import Bool, Float, Int
 from pytorch_msssim import ssim
 from torch import Tensor
 
+from lang3dxl_ns.precision import in_full_precision
+
 _SSIM_WINDOW = 11
 
 
+@in_full_precision
 def rgb_loss(
     prediction: Float[Tensor, "h w 3"],
     target: Float[Tensor, "h w 3"],
@@ -38,6 +41,7 @@ def rgb_loss(
     return torch.lerp(colour, structure, ssim_weight)
 
 
+@in_full_precision
 def clip_loss(
     prediction: Float[Tensor, "hd wd c"],
     target: Float[Tensor, "hd wd c"],
@@ -47,6 +51,7 @@ def clip_loss(
     return _weighted_mean((prediction - target).abs(), weight)
 
 
+@in_full_precision
 def dense_loss(
     prediction: Float[Tensor, "h w d"],
     target: Float[Tensor, "hd wd d"],
@@ -69,6 +74,7 @@ def dense_loss(
     return _weighted_mean((resize(prediction, grid) - resize(target, grid)).abs(), weight)
 
 
+@in_full_precision
 def region_variance_loss(
     features: Float[Tensor, "h w c"],
     labels: Int[Tensor, "h w"],
