@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -18,6 +19,9 @@ from lang3dxl_ns.lookup_benchmark import LookupBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.query_commands import Export, Query
 from lang3dxl_ns.training_benchmark import TrainingBenchmark
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.datamanager import Lang3DXLDataManager
 
 
 @dataclass(kw_only=True)
@@ -34,20 +38,47 @@ class Prepare(PreparationConfig):
     """Where to keep the targets (default: lang3dxl_cache inside the data folder)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.datamanager import Lang3DXLDataManagerConfig
-        from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
-        from lang3dxl_ns.methods import DEVICE
-
-        settings = {f.name: getattr(self, f.name) for f in fields(PreparationConfig)}
-        config = Lang3DXLDataManagerConfig(
-            dataparser=PhotoCollectionDataParserConfig(data=self.data),
-            data=self.data,
-            cache_dir=self.cache_dir,
-            **settings,
-        )
-        datamanager = config.setup(device=DEVICE, test_mode="test")
+        datamanager = _datamanager(self, self.data, self.cache_dir)
         if datamanager.targets is not None:
             print(f"Targets of {len(datamanager.targets.names)} photos are in {datamanager.cache_dir}")
+
+
+@dataclass(kw_only=True)
+class Needs(PreparationConfig):
+    """Measure what a scene needs, without training: which optional components will be built, and why.
+
+    `ns-train lang3dxl` measures the same and goes by it wherever a component is left on "auto".
+    """
+
+    data: Path
+    """Folder with images/ and sparse/0/."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def main(self) -> None:
+        import json
+
+        from lang3dxl_ns.scene_needs import as_data, needs_table
+
+        # What nerfstudio says while it loads is not part of the answer.
+        with contextlib.redirect_stdout(sys.stderr):
+            needs = _datamanager(self, self.data, None).needs
+        print(json.dumps(as_data(needs), indent=2) if self.json else needs_table(needs))
+
+
+def _datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:
+    """The data manager of a folder of photos, as these settings would prepare it; prepares nothing yet."""
+    from lang3dxl_ns.datamanager import Lang3DXLDataManagerConfig
+    from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
+    from lang3dxl_ns.methods import DEVICE
+
+    config = Lang3DXLDataManagerConfig(
+        dataparser=PhotoCollectionDataParserConfig(data=data),
+        data=data,
+        cache_dir=cache_dir,
+        **{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)},
+    )
+    return config.setup(device=DEVICE, test_mode="test")
 
 
 Benchmark = (
@@ -58,6 +89,7 @@ Benchmark = (
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Prepare, tyro.conf.subcommand("prepare")]
+    | Annotated[Needs, tyro.conf.subcommand("needs")]
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]

@@ -26,16 +26,18 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markdown import Markdown
 from torch import Tensor
 
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.preparation.collection import prepare_collection
+from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo import Photo, scaled_size
 from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, points_in_view
 from lang3dxl_ns.preparation.prepare import PreparationConfig, TargetReader
-from lang3dxl_ns.preparation.regions import region_source
+from lang3dxl_ns.preparation.regions import RegionSource, region_source
+from lang3dxl_ns.scene_needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.timing import part
 
 
@@ -150,8 +152,13 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return PhotoDataset(outputs, self.config.camera_res_scale_factor)
 
     def setup_train(self) -> None:
-        """Before training, prepare what is missing and tell the model what there is to learn."""
-        if self.test_mode == "val" and self.targets is not None:
+        """Before training, prepare what is missing and tell the model what there is to learn, and what the
+        scene needs."""
+        if self.test_mode != "val":
+            return
+        self.train_dataset.metadata["needs"] = {need.component: need.needed for need in self.needs}
+        CONSOLE.print(Markdown(f"**What this scene needs**\n\n{needs_table(self.needs)}"))
+        if self.targets is not None:
             prepared = set(self.targets.names)  # without damaged photos
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
             self.train_dataset.metadata["feature_statistics"] = self.targets.feature_statistics(names)
@@ -163,8 +170,6 @@ class Lang3DXLDataManager(FullImageDatamanager):
         photos = list(self.photos.values())
         if self.config.clip == "none":
             return None
-        c = self.config
-        regions = region_source(c.regions, c.region_level, c.sam, self.data_folder, self.device)
         return prepare_collection(
             photos,
             self._reconstruction(),
@@ -172,8 +177,24 @@ class Lang3DXLDataManager(FullImageDatamanager):
             self.cache_dir,
             self.device,
             log=CONSOLE.log,
-            regions=regions,
+            regions=self._region_source,
         ).reader
+
+    @cached_property
+    def _region_source(self) -> RegionSource | None:
+        c = self.config
+        return region_source(c.regions, c.region_level, c.sam, self.data_folder, self.device)
+
+    @cached_property
+    def needs(self) -> list[Need]:
+        """What of the optional components this scene needs, measured on first use."""
+        learns = self.config.clip != "none"
+        sources = Sources(
+            dense=learns and self.config.dense != "none",
+            regions=learns and self._region_source is not None,
+        )
+        photos, reconstruction = list(self.photos.values()), self._reconstruction()
+        return scene_needs(photos, reconstruction, plan_crops(photos, reconstruction, self.config), sources)
 
     @cached_property
     def photos(self) -> dict[str, Photo]:

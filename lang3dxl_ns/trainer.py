@@ -28,6 +28,7 @@ from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.query.scene_file import SCENE_FILE
 from lang3dxl_ns.scene_loading import describe_scene
+from lang3dxl_ns.scene_needs import write_needs
 from lang3dxl_ns.step_guard import StepGuard
 
 SHORT_RUN = 1_000
@@ -171,6 +172,8 @@ class Lang3DXLTrainer(Trainer):
         super().setup(test_mode)
         if self.local_rank == 0:
             describe_scene(self.pipeline.datamanager).write(self.base_dir / SCENE_FILE)
+            if test_mode == "val":
+                write_needs(self.pipeline.datamanager.needs, self.base_dir)
         torch.manual_seed(self.config.machine.seed)
 
     @property

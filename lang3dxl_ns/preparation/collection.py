@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from lang3dxl_ns.errors import UserError
@@ -23,6 +25,60 @@ from lang3dxl_ns.preparation.regions import RegionSource
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.presets import load_preset
 
+SCALE_RATIO = 1.6
+"""Ratio of the physical pixel sizes of far and near photos up to which one pyramid of fixed size serves: each
+photo then lies within half a level (levels are √2 apart) of the middle one."""
+
+
+@dataclass(frozen=True)
+class CropPlan:
+    """Which crops the photos are to have, and why."""
+
+    scales: list[float]
+    """Sides, ascending: world units, or fractions of a photo's width."""
+    pixel_sizes: dict[str, float] | None
+    """World units per pixel of each photo as it is read; None where the scales are fractions."""
+    spread: float | None
+    """Ratio of the photos' pixel sizes, 95th over 5th percentile; None without 3D points."""
+    reasons: list[str]
+
+
+def plan_crops(
+    photos: Sequence[Photo], reconstruction: Reconstruction, config: PreparationConfig
+) -> CropPlan:
+    """Choose crop sizes: the configured ones, else proposed from the scene.
+
+    Crops have one size in the world, unless the scene has no 3D points to measure with, or its photos agree
+    in scale so well (`SCALE_RATIO`) that under "auto" one size in the photo does the same.
+    """
+    if config.scale_mode == "relative" or not len(reconstruction.points):
+        scales = relative_scales() if config.scale_range is None else relative_scales(7, *config.scale_range)
+        reasons = [f"crops of {_listed(scales)} of the photo's width"]
+        if config.scale_mode != "relative":
+            reasons.insert(0, "the scene has no 3D points: crops have no size in the world")
+        return CropPlan(scales, None, None, reasons)
+    sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
+    chosen = _scale_range(config, reconstruction, sizes)
+    scales = physical_scales(chosen.smallest, chosen.largest)
+    reasons = [
+        f"{chosen.reason}; crop sides: {_listed(scales)} (--pipeline.datamanager.scale-range overrides)"
+    ]
+    if untracked:
+        reasons.append(
+            f"{len(untracked)} photos have no tracked points: their scale is that of the points in view, "
+            f"or the scene's median: {some(untracked)}"
+        )
+    # The reconstruction's sizes are per pixel of the model's photos; a file may be a resized copy.
+    per_file_pixel = {p.name: sizes[p.name] * reconstruction.photos[p.name].width / p.width for p in photos}
+    low, high = np.percentile([per_file_pixel[p.name] * p.width for p in photos], (5, 95))
+    spread = float(high / low)
+    if config.scale_mode == "auto" and spread <= SCALE_RATIO:
+        width = float(np.median([per_file_pixel[p.name] * p.width for p in photos]))
+        fractions = [scale / width for scale in scales]
+        reasons.append(f"photos agree in scale: fixed crops of {_listed(fractions)} of their width")
+        return CropPlan(fractions, None, spread, reasons)
+    return CropPlan(scales, per_file_pixel, spread, reasons)
+
 
 def prepare_collection(
     photos: Sequence[Photo],
@@ -33,31 +89,11 @@ def prepare_collection(
     log: Callable[[str], None] = print,
     regions: RegionSource | None = None,
 ) -> PreparedTargets:
-    """Make the missing targets of the photos in `cache_dir`; crops in the reconstruction's units.
-
-    Physical sizes need points: without any, crops are fractions of the photo's width, and the log says so.
-    """
-    physical = config.scale_mode == "physical" and len(reconstruction.points) > 0
-    if not physical:
-        if config.scale_mode == "physical":
-            log(
-                "the scene has no 3D points: crops are fractions of the photo's width, not sizes in the world"
-            )
-        scales = relative_scales() if config.scale_range is None else relative_scales(7, *config.scale_range)
-        log(f"crops of {_listed(scales)} of the photo's width")
-        return prepare(photos, None, config, scales, FeatureStore(cache_dir), device, regions)
-    sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
-    if untracked:
-        log(
-            f"{len(untracked)} photos have no tracked points: their scale is that of the points in view, "
-            f"or the scene's median: {some(untracked)}"
-        )
-    chosen = _scale_range(config, reconstruction, sizes)
-    scales = physical_scales(chosen.smallest, chosen.largest)
-    log(f"{chosen.reason}; crop sides: {_listed(scales)} (--pipeline.datamanager.scale-range overrides)")
-    # The reconstruction's sizes are per pixel of the model's photos; a file may be a resized copy.
-    per_file_pixel = {p.name: sizes[p.name] * reconstruction.photos[p.name].width / p.width for p in photos}
-    return prepare(photos, per_file_pixel, config, scales, FeatureStore(cache_dir), device, regions)
+    """Make the missing targets of the photos in `cache_dir`; the log says which crops, and why."""
+    plan = plan_crops(photos, reconstruction, config)
+    for reason in plan.reasons:
+        log(reason)
+    return prepare(photos, plan.pixel_sizes, config, plan.scales, FeatureStore(cache_dir), device, regions)
 
 
 def _scale_range(

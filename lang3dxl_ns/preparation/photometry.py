@@ -49,6 +49,8 @@ def measure_photometry(
         geometry = reconstruction.photos.get(photo.name)
         if geometry is None or len(geometry.points) < _FEWEST_POINTS:
             continue
+        if len(geometry.pixels) != len(geometry.points):  # a scene without tracks
+            continue
         try:
             colours, usable = _log_colours(photo, geometry.pixels / [geometry.width, geometry.height])
         except UserError:

@@ -54,9 +54,9 @@ class PreparationConfig:
     Left out: proposed from the scene."""
     scale_preset: str | None = None
     """Scene whose published range to use instead, such as "holyscenes/milano"."""
-    scale_mode: Literal["physical", "relative"] = "physical"
+    scale_mode: Literal["auto", "physical", "relative"] = "auto"
     """Whether crops have one size in the world or one size in the photo. In the world, the crop that fits a
-    window fits it in near and far photos."""
+    window fits it in near and far photos; `auto`: in the world, unless the photos agree in scale anyway."""
     pixel_distance: DistanceRule = "median"
     """How far a photo's subject is: the camera's distance to the median of its tracked points, to their mean,
     or to the mean of those away from the edges ("mean-inner", the paper's text)."""
