@@ -134,6 +134,8 @@ class Lang3DXLTrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up, then seed: what had to be prepared has no say in the run's randomness."""
         super().setup(test_mode)
+        for optimizer in self.optimizers.optimizers.values():
+            add_rows_to_state(optimizer)
         torch.manual_seed(self.config.machine.seed)
 
     def train(self) -> None:
@@ -174,6 +176,15 @@ class Lang3DXLTrainer(Trainer):
             for other in self.checkpoint_dir.glob("*.ckpt"):
                 if other != path:
                     other.unlink()
+
+
+def add_rows_to_state(optimizer: Optimizer) -> None:
+    """Give rows that a resumed run has added to a parameter, such as vectors of new photos, a state of zero."""
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if value.dim() and len(value) < len(parameter):
+                added = value.new_zeros(len(parameter) - len(value), *value.shape[1:])
+                state[name] = torch.cat((value, added))
 
 
 def _absolute(path: Path | None) -> Path | None:
