@@ -19,9 +19,7 @@ def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
 
 
 @torch.no_grad()
-def in_view(
-    camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]
-) -> Bool[Tensor, " n"]:
+def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     """Which Gaussians may show: none that does is missing, some that don't are among them.
 
     Holds the ball of 3.5 standard deviations around each against the planes through the image's edges.

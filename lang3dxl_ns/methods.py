@@ -60,7 +60,7 @@ def _optimizers() -> dict[str, dict]:
             "scheduler": RunScheduleConfig(start=0.1, warm=0.05, end=0.1),
         },
         "appearance_vectors": {
-            "optimizer": RunAdamConfig(lr=1e-3, short_lr=1e-2),
+            "optimizer": RunAdamConfig(lr=1e-3, short_lr=5e-3),
             "scheduler": RunScheduleConfig(end=0.1),
         },
         "camera_opt": {

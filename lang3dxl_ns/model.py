@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -259,7 +258,9 @@ class Lang3DXLModel(SplatfactoModel):
             groups["downsampler"] = list(self.downsampler.parameters())
         if self.appearance is not None:
             groups["appearance_vectors"] = [self.appearance.vectors]
-            groups["appearance"] = [p for p in self.appearance.parameters() if p is not self.appearance.vectors]
+            groups["appearance"] = [
+                p for p in self.appearance.parameters() if p is not self.appearance.vectors
+            ]
         return {name: parameters for name, parameters in groups.items() if parameters}
 
     @property
@@ -323,37 +324,32 @@ class Lang3DXLModel(SplatfactoModel):
         camera.rescale_output_resolution(downscale)
         self.last_size = (view.height, view.width)
         background = self._get_background_color()
-        gaussians = Gaussians(
-            g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(-1)
-        )
-        render = partial(
-            rasterize,
-            camera=view,
-            background=background,
-            antialiased=self.config.rasterize_mode == "antialiased",
-            absgrad=self.strategy.absgrad and self.training,
-        )
-        render_all = partial(
-            render,
+        gaussians = Gaussians(g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(-1))
+        colours, in_photo = self._colours(g, pose[0, :, 3].to(self.device)), gaussians
+        if self.appearance is not None:
+            vector = self._light(camera, pose[0].to(self.device))
+            visible = in_view(view, gaussians.means, gaussians.scales).nonzero().squeeze(1)
+            seed = self.step if self.training else None
+            colours, in_photo = self.appearance(gaussians, colours, vector, visible, seed)
+        settings: dict[str, Any] = {
+            "antialiased": self.config.rasterize_mode == "antialiased",
+            "absgrad": self.strategy.absgrad and self.training,
+        }
+        rendering = rasterize(
+            gaussians,
+            view,
+            colours,
+            background,
             features=g["codes"] if "codes" in g and self._warm_up_is_over else None,
             detach_features=not self.config.feature_gradient_to_geometry,
             render_depth=not self.training or self.config.output_depth_during_training,
+            **settings,
         )
-        colours = self._colours(g, pose[0, :, 3].to(self.device))
-        if self.appearance is None:
-            return render_all(gaussians, channels=colours), background
-        vector = self._light(camera, pose[0].to(self.device))
-        visible = in_view(view, gaussians.means, gaussians.scales).nonzero().squeeze(1)
-        colours, opacities = self.appearance(
-            gaussians.means, colours, gaussians.opacities, vector, visible,
-            seed=self.step if self.training else None,
-        )  # fmt: skip
-        if not self.config.appearance.opacity_shift:
-            return render_all(gaussians, channels=colours), background
-        # Semantics, coverage and depth are of the scene, not of a photo: they keep the opacities.
-        scene = render_all(gaussians, channels=colours.detach())
-        photo = render(replace(gaussians, opacities=opacities), channels=colours)
-        return replace(scene, image=photo.image, info=photo.info), background
+        if in_photo is not gaussians:
+            # Semantics, coverage and depth are of the scene, not of a photo: they keep its opacities.
+            photo = rasterize(in_photo, view, colours, background, **settings)
+            rendering = replace(rendering, image=photo.image, info=photo.info)
+        return rendering, background
 
     def _light(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
         """Vector of the training photo, of the chosen look, or by the rule for other views."""
@@ -366,7 +362,6 @@ class Lang3DXLModel(SplatfactoModel):
         if self.look is not None:
             return self.appearance.vector(self.look)
         return self.appearance.vector_of_view(position, direction)
-
 
     def _colours(self, g: Mapping[str, Tensor], camera_centre: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
         """Colours seen from a point; the degree of the harmonics rises by one every 1,000 iterations, in
@@ -451,7 +446,8 @@ class Lang3DXLModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict, batch: dict
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Held-out photo: PSNR (`cc_psnr`: after matching its colours), SSIM, LPIPS where its weights are at hand, and feature metrics."""
+        """Held-out photo: PSNR (`cc_psnr`: once its colours are matched), SSIM, LPIPS where its weights are at
+        hand, and feature metrics."""
         target = self.get_gt_img(batch["image"])
         predicted = outputs["rgb"]
         chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]

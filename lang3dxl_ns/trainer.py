@@ -179,7 +179,7 @@ class Lang3DXLTrainer(Trainer):
 
 
 def add_rows_to_state(optimizer: Optimizer) -> None:
-    """Give rows that a resumed run has added to a parameter, such as vectors of new photos, a state of zero."""
+    """Start the rows that a resumed run has added to a parameter (vectors of new photos) at a state of 0."""
     for parameter, state in optimizer.state.items():
         for name, value in state.items():
             if value.dim() and len(value) < len(parameter):
