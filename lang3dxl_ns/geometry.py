@@ -1,12 +1,14 @@
-"""Frames and places: nerfstudio's cameras for the rasteriser, and a sky around the scene."""
+"""Frames and places: nerfstudio's cameras for the rasteriser, what they see, and a sky around the scene."""
 
 from __future__ import annotations
 
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+
+from lang3dxl_ns.rendering import Camera
 
 
 def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
@@ -23,11 +25,34 @@ def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
     return torch.cat([rotation * view_matrix.new_tensor([1.0, -1.0, -1.0]), position], dim=1)
 
 
+@torch.no_grad()
+def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Which Gaussians may show: none that does is missing, some that don't are among them.
+
+    Holds the ball of 3.5 standard deviations around each against the planes through the image's edges.
+    """
+    points = means @ camera.view_matrix[:3, :3].T + camera.view_matrix[:3, 3]
+    reach = 3.5 * scales.amax(dim=1)
+    seen = points[:, 2] > 0
+    margin = 8  # pixels: the rasteriser blurs every splat by one or two
+    for axis, size in ((0, camera.width), (1, camera.height)):
+        focal, middle = camera.intrinsics[axis, axis], camera.intrinsics[axis, 2]
+        for side, edge in ((-1, middle + margin), (1, size + margin - middle)):
+            outside = side * focal * points[:, axis] - edge * points[:, 2]
+            seen &= outside <= reach * torch.hypot(focal, edge)
+    return seen
+
+
+def centre_and_radius(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], float]:
+    """Middle of a scene, and the distance from it within which nine tenths of its points lie."""
+    centre = points.median(dim=0).values
+    return centre, float((points - centre).norm(dim=1).quantile(0.9))
+
+
 def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "count 3"]:
     """Evenly spread points (a Fibonacci lattice) on a sphere of ten times the scene's radius."""
-    centre = points.median(dim=0).values
-    radius = 10 * (points - centre).norm(dim=1).quantile(0.9)
+    centre, radius = centre_and_radius(points)
     i = torch.arange(count) + 0.5
     z, longitude = 1 - 2 * i / count, i * math.pi * (3 - math.sqrt(5))
     around = (1 - z * z).sqrt()
-    return centre + radius * torch.stack([around * longitude.cos(), around * longitude.sin(), z], dim=1)
+    return centre + 10 * radius * torch.stack([around * longitude.cos(), around * longitude.sin(), z], dim=1)

@@ -57,6 +57,14 @@ def _optimizers() -> dict[str, dict]:
             "optimizer": RunAdamConfig(lr=5e-4, short_lr=5e-3, weight_decay=1e-5),
             "scheduler": learned(),
         },
+        "appearance": {
+            "optimizer": RunAdamConfig(lr=5e-4, short_lr=5e-3),
+            "scheduler": RunScheduleConfig(start=0.1, warm=0.05, end=0.1),
+        },
+        "appearance_vectors": {
+            "optimizer": RunAdamConfig(lr=1e-3, short_lr=5e-3),
+            "scheduler": RunScheduleConfig(end=0.1),
+        },
         "camera_opt": {
             "optimizer": AdamOptimizerConfig(lr=1e-4, eps=1e-15),
             "scheduler": RunScheduleConfig(shape="log-linear", end=5e-3),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from gsplat.strategy import DefaultStrategy
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.model_components.lib_bilagrid import color_correct
 from nerfstudio.models.splatfacto import (
     RGB2SH,
     SplatfactoModel,
@@ -24,12 +25,13 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from lang3dxl_ns.components import losses, schedules
+from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
-from lang3dxl_ns.geometry import sphere_around, view_matrix
+from lang3dxl_ns.geometry import centre_and_radius, in_view, sphere_around, view_matrix
 from lang3dxl_ns.preparation.prepare import FeatureStatistics
 from lang3dxl_ns.rendering import Camera, Gaussians, Rendering, rasterize, spherical_harmonics
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
@@ -48,6 +50,8 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     """Decoder from a 3-number code to CLIP and dense features."""
     downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
     """Brings decoded features to the grid of the CLIP target; training only."""
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    """Colours that change with the light of a photo."""
     clip_weight: float = 1.0
     """Weight of the CLIP loss (mean absolute difference)."""
     dense_weight: float | None = None
@@ -96,6 +100,8 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
         self.total_steps = iterations
         if self.semantic_field.preset == "auto":
             self.semantic_field.preset = "short" if short else "default"
+        if self.appearance.preset == "auto":
+            self.appearance.preset = "short" if short else "paper"
         if self.densify_grad_thresh is None:
             self.densify_grad_thresh = 2e-3 if short else 2e-4
         if self.dense_weight is None:
@@ -111,6 +117,9 @@ class Lang3DXLModel(SplatfactoModel):
     config: Lang3DXLModelConfig
     semantic_field: SemanticField | None
     downsampler: AttenuatedDownsampler | None
+    appearance: AppearanceField | None
+    look: str | None
+    """Photo in whose light views are shown; None: the appearance's rule for unseen views."""
     clip_mean: Tensor
     dense_mean: Tensor
 
@@ -131,6 +140,8 @@ class Lang3DXLModel(SplatfactoModel):
                 torch.cat([self.clip_mean, self.dense_mean]),
                 clip.std if dense is None else torch.cat([clip.std, dense.std]),
             )
+        self.look = None
+        self.appearance = self._make_appearance() if self._wants_appearance else None
         self.step = 0
         self.step_is_sound = True
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
@@ -149,6 +160,7 @@ class Lang3DXLModel(SplatfactoModel):
         else:
             means = (torch.rand(self.config.num_random, 3) - 0.5) * self.config.random_scale
             colours = torch.rand(self.config.num_random, 3)
+        self.extent = centre_and_radius(means)
         if self.config.sky_gaussians:
             sky = sphere_around(means, self.config.sky_gaussians)
             means = torch.cat([means, sky])
@@ -183,6 +195,18 @@ class Lang3DXLModel(SplatfactoModel):
         self.semantic_field = SemanticField(self.config.semantic_field, len(clip_mean), len(dense_mean))
         self.downsampler = AttenuatedDownsampler(self.config.downsampler, len(clip_mean))
         self.gauss_params["codes"] = Parameter(self.semantic_field.initial_codes(self.num_points))
+
+    @property
+    def _wants_appearance(self) -> bool:
+        """`auto` is on unless the scene's needs, where they were measured, say otherwise."""
+        if self.config.appearance.use != "auto":
+            return self.config.appearance.use == "on"
+        return bool((self.kwargs["metadata"].get("needs") or {}).get("appearance", True))
+
+    def _make_appearance(self) -> AppearanceField:
+        names = [photo.name for photo in self.kwargs["metadata"].get("photos", ())]
+        generator = torch.Generator().manual_seed(0)
+        return AppearanceField(self.config.appearance, names, *self.extent, generator=generator)
 
     def _make_strategy(self) -> DefaultStrategy:
         c, steps = self.config, self.config.total_steps
@@ -235,6 +259,11 @@ class Lang3DXLModel(SplatfactoModel):
             groups["field_encoding"] = list(self.semantic_field.encoding_parameters())
             groups["field_decoder"] = list(self.semantic_field.decoder_parameters())
             groups["downsampler"] = list(self.downsampler.parameters())
+        if self.appearance is not None:
+            groups["appearance_vectors"] = [self.appearance.vectors]
+            groups["appearance"] = [
+                p for p in self.appearance.parameters() if p is not self.appearance.vectors
+            ]
         return {name: parameters for name, parameters in groups.items() if parameters}
 
     @property
@@ -298,23 +327,45 @@ class Lang3DXLModel(SplatfactoModel):
         camera.rescale_output_resolution(downscale)
         self.last_size = (view.height, view.width)
         background = self._get_background_color()
+        scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
+        gaussians = Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1))
+        colours, in_photo = self._colours(g, pose[0, :, 3].to(self.device)), gaussians
+        if self.appearance is not None:
+            vector = self._light(camera, pose[0].to(self.device))
+            visible = in_view(view, gaussians.means, gaussians.scales).nonzero().squeeze(1)
+            seed = self.step if self.training else None
+            colours, in_photo = self.appearance(gaussians, colours, vector, visible, seed)
+        settings: dict[str, Any] = {
+            "antialiased": self.config.rasterize_mode == "antialiased",
+            "absgrad": self.strategy.absgrad and self.training,
+        }
         rendering = rasterize(
-            Gaussians(
-                g["means"],
-                g["quats"],
-                g["scales"].clamp_max(MAX_LOG_SCALE).exp(),
-                g["opacities"].sigmoid().squeeze(-1),
-            ),
+            gaussians,
             view,
-            self._colours(g, pose[0, :, 3].to(self.device)),
+            colours,
             background,
             features=g["codes"] if "codes" in g and self._warm_up_is_over else None,
             detach_features=not self.config.feature_gradient_to_geometry,
             render_depth=not self.training or self.config.output_depth_during_training,
-            antialiased=self.config.rasterize_mode == "antialiased",
-            absgrad=self.strategy.absgrad and self.training,
+            **settings,
         )
+        if in_photo is not gaussians:
+            # Semantics, coverage and depth are of the scene, not of a photo: they keep its opacities.
+            photo = rasterize(in_photo, view, colours, background, **settings)
+            rendering = replace(rendering, image=photo.image, info=photo.info)
         return rendering, background
+
+    def _light(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
+        """Vector of the training photo, of the chosen look, or by the rule for other views."""
+        assert self.appearance is not None
+        position, direction = pose[:, 3].detach(), -pose[:, 2].detach()
+        if self.training and camera.metadata and "cam_idx" in camera.metadata:
+            name = self.kwargs["metadata"]["photos"][camera.metadata["cam_idx"]].name
+            self.appearance.remember(name, position, direction)
+            return self.appearance.vector(name)
+        if self.look is not None:
+            return self.appearance.vector(self.look)
+        return self.appearance.vector_of_view(position, direction)
 
     def _colours(self, g: Mapping[str, Tensor], camera_centre: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
         """Colours seen from a point; the degree of the harmonics rises by one every 1,000 iterations, in
@@ -400,11 +451,18 @@ class Lang3DXLModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict, batch: dict
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Held-out photo: PSNR, SSIM, LPIPS where its weights are at hand, and feature metrics."""
+        """Held-out photo: PSNR (`cc_psnr`: once its colours are matched), SSIM, LPIPS where its weights are at
+        hand, and feature metrics."""
         target = self.get_gt_img(batch["image"])
         predicted = outputs["rgb"]
         chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]
-        metrics = {"psnr": float(psnr(predicted, target)), "ssim": float(self.ssim(*chw))}
+        # Corrected on the CPU, whose solver also takes pictures of a single colour.
+        corrected = color_correct(predicted.cpu(), target.cpu())
+        metrics = {
+            "psnr": float(psnr(predicted, target)),
+            "cc_psnr": float(psnr(corrected, target.cpu())),
+            "ssim": float(self.ssim(*chw)),
+        }
         perceptual = self.lpips(*chw)
         if perceptual is not None:
             metrics["lpips"] = perceptual
@@ -435,11 +493,24 @@ class Lang3DXLModel(SplatfactoModel):
         Parameters are resized in place: the optimisers hold them, and new ones would never be trained.
         """
         self._match_semantics(state)
+        self._match_appearance(state)
         self.step = self.config.total_steps
         for name, parameter in self.gauss_params.items():
             saved = state[f"gauss_params.{name}"]
             parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super(SplatfactoModel, self).load_state_dict(state, **kwargs)
+
+    def _match_appearance(self, state: Mapping[str, Any]) -> None:
+        """`auto` means what the checkpoint has; `on` and `off` have to agree with it."""
+        saved = "appearance.vectors" in state
+        if saved == (self.appearance is not None):
+            return
+        if self.config.appearance.use != "auto":
+            raise UserError(
+                f"the checkpoint was trained {'with' if saved else 'without'} appearance: load it with "
+                f"--pipeline.model.appearance.use auto, or train anew"
+            )
+        self.appearance = self._make_appearance().to(self.device) if saved else None
 
     def _match_semantics(self, state: Mapping[str, Any]) -> None:
         """Build the components that the checkpoint has, or say how they differ."""

@@ -170,6 +170,8 @@ class Lang3DXLTrainer(Trainer):
         """Set up, then seed: what had to be prepared has no say in the run's randomness. The run's folder
         gets a description of the scene, so that it can be queried without the photos."""
         super().setup(test_mode)
+        for optimizer in self.optimizers.optimizers.values():
+            add_rows_to_state(optimizer)
         if self.local_rank == 0:
             describe_scene(self.pipeline.datamanager).write(self.base_dir / SCENE_FILE)
             if test_mode == "val":
@@ -278,6 +280,15 @@ class Lang3DXLTrainer(Trainer):
             for other in self.checkpoint_dir.glob("*.ckpt"):
                 if other != path:
                     other.unlink()
+
+
+def add_rows_to_state(optimizer: Optimizer) -> None:
+    """Start the rows that a resumed run has added to a parameter (vectors of new photos) at a state of 0."""
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if value.dim() and len(value) < len(parameter):
+                added = value.new_zeros(len(parameter) - len(value), *value.shape[1:])
+                state[name] = torch.cat((value, added))
 
 
 def _absolute(path: Path | None) -> Path | None:

@@ -1,0 +1,240 @@
+"""Light that differs between photos: every Gaussian's colour is shifted, steered by a vector per photo.
+
+One photo is taken at noon, the next at dusk. A small network sees where a Gaussian is, its base colour and
+the photo's vector, and says how far its colour in that photo is from the base (SWAG, Dahmani et al. 2024, as
+used in Lang3D-XL). Only colours, and on request opacities, depend on the photo: semantics never do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from lang3dxl_ns.components.hash_grid import HashGrid
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.rendering.gaussians import Gaussians
+
+HIDDEN = 64
+TEMPERATURE = 0.1
+"""Of the Binary Concrete distribution that opacity shifts are drawn from."""
+FIRST_DEVIATION = 0.1
+"""Of the initial vectors. The published 1 makes every photo a case of its own: on eleven photos that differ
+in exposure and white balance the error after 300 steps is twice that of 0.1."""
+FIRST_LOGIT = -4.0
+"""Log odds of a Gaussian being taken out of a training step by an untrained opacity shift: about 2 %."""
+GRIDS: dict[str, dict[str, int]] = {
+    # Light changes smoothly over a building: a coarse grid learns it in hundreds of steps, at half the time.
+    "short": {
+        "levels": 4,
+        "features_per_level": 4,
+        "log2_table_size": 14,
+        "min_resolution": 8,
+        "max_resolution": 64,
+    },
+    "paper": {
+        "levels": 12,
+        "features_per_level": 2,
+        "log2_table_size": 19,
+        "min_resolution": 16,
+        "max_resolution": 2048,
+    },
+}
+
+
+@dataclass
+class AppearanceConfig:
+    """Settings of the appearance field."""
+
+    use: Literal["auto", "on", "off"] = "auto"
+    """`auto`: on, unless the scene's measured needs say that its photos share one light. Off means absent:
+    no parameters, no time."""
+    preset: Literal["auto", "short", "paper"] = "auto"
+    """Hash grid over places: `short` is coarse, for runs on a CPU; `paper` as published; `auto`: by the
+    length of the run."""
+    vector_dim: int = 24
+    """Numbers that describe a photo."""
+    unseen: Literal["nearest", "mean"] = "nearest"
+    """Light of a view that is no training photo: that of the `nearest` training camera, by position (in units
+    of the cameras' spread) and direction, or the `mean` vector."""
+    opacity_shift: bool = False
+    """Let photos take Gaussians out, for what stands in one photo only. Costs a second rendering."""
+
+
+class AppearanceField(nn.Module):
+    """Colours of Gaussians as one photo shows them.
+
+    Untrained, it changes no colour. Vectors belong to photos by name: a checkpoint's vectors stay with their
+    photos whatever the photos of the present run, and photos that it does not know get fresh ones.
+
+    Args:
+        config: the settings.
+        names: of the training photos.
+        centre: middle of the scene, world units.
+        radius: distance from the middle within which most of the scene lies, world units.
+        generator: source of the initial weights and vectors.
+    """
+
+    def __init__(
+        self,
+        config: AppearanceConfig,
+        names: Sequence[str],
+        centre: Float[Tensor, "3"],
+        radius: float,
+        *,
+        generator: torch.Generator | None = None,
+    ):
+        super().__init__()
+        self.config = config
+        grid = GRIDS["short" if config.preset == "auto" else config.preset]
+        self.grid = HashGrid(3, **grid, generator=generator)
+        inputs = self.grid.output_dim + 3 + config.vector_dim
+        # The first layer in two parts: the photo's is the same for all Gaussians, and computed once.
+        self.from_gaussian = _linear(inputs - config.vector_dim, HIDDEN, inputs, generator)
+        self.from_photo = _linear(config.vector_dim, HIDDEN, inputs, generator, bias=False)
+        self.hidden = _linear(HIDDEN, HIDDEN, HIDDEN, generator)
+        self.output = nn.utils.skip_init(nn.Linear, HIDDEN, 4 if config.opacity_shift else 3)
+        for parameter in self.output.parameters():
+            nn.init.zeros_(parameter)
+        vectors = FIRST_DEVIATION * torch.randn(len(names), config.vector_dim, generator=generator)
+        self.vectors = nn.Parameter(vectors)
+
+        self.centre: Tensor
+        self.radius: Tensor
+        self.positions: Tensor
+        self.directions: Tensor
+        self.learned: Tensor
+        self.register_buffer("centre", centre.detach().clone())
+        self.register_buffer("radius", centre.new_tensor(radius))
+        self.register_buffer("positions", torch.zeros(len(names), 3))
+        self.register_buffer("directions", torch.zeros(len(names), 3))
+        self.register_buffer("learned", torch.zeros(len(names), dtype=torch.bool))
+        self._set_names(names)
+
+    def forward(
+        self,
+        gaussians: Gaussians,
+        colours: Float[Tensor, "n 3"],
+        vector: Float[Tensor, " v"],
+        visible: Int[Tensor, " m"],
+        seed: int | None = None,
+    ) -> tuple[Float[Tensor, "n 3"], Gaussians]:
+        """Colours, and with `opacity_shift` the Gaussians' opacities, in the light of a photo's vector.
+
+        No gradient reaches the Gaussians' places through it. Colours are at least 0, opacities in 0…1.
+
+        Args:
+            gaussians: in the world frame; come back as they are without `opacity_shift`.
+            colours: before the shift, at least 0.
+            vector: of the photo.
+            visible: rows of the Gaussians to work on; the others stay as they are.
+            seed: of the noise in the opacity shift, in training; None for none.
+        """
+        base = colours[visible]
+        features = torch.cat((self.grid(self._unit_cube(gaussians.means[visible])), base), 1)
+        hidden = F.relu(self.from_gaussian(features) + self.from_photo(vector))
+        shift = self.output(F.relu(self.hidden(hidden)))
+        colours = colours.index_copy(0, visible, (base + shift[:, :3]).clamp_min(0.0))
+        if self.config.opacity_shift:
+            before = gaussians.opacities
+            drop = self._binary_concrete(shift[:, 3] + FIRST_LOGIT, visible, len(before), seed)
+            opacities = before.index_copy(0, visible, (before[visible] - drop).clamp(0.0, 1.0))
+            gaussians = replace(gaussians, opacities=opacities)
+        return colours, gaussians
+
+    def network_parameters(self) -> list[nn.Parameter]:
+        """What all photos share; `vectors` is what each has of its own."""
+        return [parameter for parameter in self.parameters() if parameter is not self.vectors]
+
+    def vector(self, name: str) -> Float[Tensor, " v"]:
+        """Vector of a training photo.
+
+        Raises:
+            UserError: no training photo has this name.
+        """
+        if name not in self._rows:
+            raise UserError(
+                f"{name} is not a photo that this scene was trained on: choose one of "
+                f"{', '.join(self.names[:5])}{', …' if len(self.names) > 5 else ''}"
+            )
+        return self.vectors[self._rows[name]]
+
+    @torch.no_grad()
+    def remember(self, name: str, position: Float[Tensor, "3"], direction: Float[Tensor, "3"]) -> None:
+        """Note that a photo is being learned from, and how its camera stands (unit viewing direction)."""
+        row = self._rows[name]
+        self.positions[row], self.directions[row], self.learned[row] = position, direction, True
+
+    def vector_of_view(
+        self, position: Float[Tensor, "3"], direction: Float[Tensor, "3"]
+    ) -> Float[Tensor, " v"]:
+        """Vector for a view that is no training photo, by the rule `unseen`; zero before any training."""
+        vectors = self.vectors[self.learned]
+        if len(vectors) == 0:
+            return self.vectors.new_zeros(self.config.vector_dim)
+        if self.config.unseen == "mean":
+            return vectors.mean(0)
+        positions = self.positions[self.learned]
+        spread = (positions - positions.mean(0)).norm(dim=1).mean().clamp_min(1e-9)
+        moved = (positions - position).norm(dim=1) / spread
+        turned = (self.directions[self.learned] - direction).norm(dim=1)
+        return vectors[(moved.square() + turned.square()).argmin()]
+
+    def _unit_cube(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Places as grid coordinates in [0, 1]: space contracted to a ball (Mip-NeRF 360, Barron et al.
+        2022), of which the scene takes the inner half and everything as far as the sky the rest."""
+        x = (means.detach() - self.centre) / self.radius
+        distance = x.norm(dim=1, keepdim=True).clamp_min(1.0)
+        return 0.5 + 0.25 * x * (2 - 1 / distance) / distance
+
+    def _binary_concrete(
+        self, logits: Float[Tensor, " m"], visible: Int[Tensor, " m"], count: int, seed: int | None
+    ) -> Float[Tensor, " m"]:
+        """A draw per Gaussian of a relaxed coin, close to 0 or 1 (Maddison et al. 2017): with noise u,
+        sigmoid((logit + log u − log(1 − u)) / temperature); u = 1/2 without a seed."""
+        if seed is not None:
+            # Drawn for all on the CPU: the same whatever is visible, and on whatever device.
+            noise = torch.rand(count, generator=torch.Generator().manual_seed(seed))
+            logits = logits + torch.logit(noise, eps=1e-6).to(logits)[visible]
+        return torch.sigmoid(logits / TEMPERATURE)
+
+    # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────
+
+    def _set_names(self, names: Sequence[str]) -> None:
+        self.names = list(names)
+        self._rows = {name: row for row, name in enumerate(self.names)}
+
+    def get_extra_state(self) -> list[str]:
+        return self.names
+
+    def set_extra_state(self, state: list[str]) -> None:
+        """The names are taken over together with their rows, in `_load_from_state_dict`."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args) -> None:
+        """Take the checkpoint's photos first, then those of this run that it does not know."""
+        saved = state_dict.get(f"{prefix}_extra_state")
+        if saved is not None:
+            known = set(saved)
+            new = [row for row, name in enumerate(self.names) if name not in known]
+            for key in ("vectors", "positions", "directions", "learned"):
+                tensor = getattr(self, key).data
+                rows = state_dict[prefix + key].to(tensor)
+                state_dict[prefix + key] = torch.cat((rows, tensor[new]))
+                getattr(self, key).data = torch.empty_like(state_dict[prefix + key])
+            self._set_names([*saved, *(self.names[row] for row in new)])
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _linear(
+    inputs: int, outputs: int, fan_in: int, generator: torch.Generator | None, bias: bool = True
+) -> nn.Linear:
+    """A linear layer with torch's customary initial range for `fan_in` inputs, from the generator."""
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
+    for parameter in layer.parameters():
+        nn.init.uniform_(parameter, -(fan_in**-0.5), fan_in**-0.5, generator=generator)
+    return layer
