@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import replace
+from math import isqrt
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -12,12 +13,7 @@ from gsplat.strategy import DefaultStrategy
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import color_correct
-from nerfstudio.models.splatfacto import (
-    RGB2SH,
-    SplatfactoModel,
-    SplatfactoModelConfig,
-    num_sh_bases,
-)
+from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
@@ -25,89 +21,19 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from lang3dxl_ns.components import losses, schedules
-from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
-from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.appearance import AppearanceField
+from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
+from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
-from lang3dxl_ns.geometry import centre_and_radius, in_view, sphere_around, view_matrix
+from lang3dxl_ns.geometry import centre_and_radius, in_view, view_matrix
+from lang3dxl_ns.initial_gaussians import initial_gaussians, seed_positions
+from lang3dxl_ns.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.preparation.prepare import FeatureStatistics
 from lang3dxl_ns.rendering import Camera, Gaussians, Rendering, rasterize, spherical_harmonics
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.timing import part
-
-SHORT_FIELD_RUN = 5_000
-"""Runs of fewer iterations take the field's `short` preset."""
-
-
-@dataclass
-class Lang3DXLModelConfig(SplatfactoModelConfig):
-    """Splatfacto's settings, with the method's schedule, and the semantic components."""
-
-    _target: type = field(default_factory=lambda: Lang3DXLModel)
-    semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
-    """Decoder from a 3-number code to CLIP and dense features."""
-    downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
-    """Brings decoded features to the grid of the CLIP target; training only."""
-    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
-    """Colours that change with the light of a photo."""
-    clip_weight: float = 1.0
-    """Weight of the CLIP loss (mean absolute difference)."""
-    dense_weight: float | None = None
-    """Weight of the dense (DINO) loss. None: 2 in short runs, 0.5 in long ones."""
-    region_weight: float = 5e-4
-    """Weight of the variance inside regions; takes part where a scene has regions."""
-    decode_size: tuple[int, int] | None = None
-    """The code map is decoded at a random size in this range: pixels of its longer side, inclusive.
-    None: 56 to 72 in short runs, 80 to 120 (the paper's) in long ones."""
-    warm_up: float = 0.0
-    """Fraction of the run that trains colours only, before the semantic losses begin."""
-    freeze_geometry_after_warm_up: bool = False
-    """Stop training everything but the codes and the semantic components when the warm-up ends."""
-    feature_gradient_to_geometry: bool = False
-    """Let the semantic losses move Gaussians and opacities too, as the authors' code does."""
-    divide_codes_by_alpha: bool = False
-    """Decode code ÷ coverage instead of the code, so that half-covered pixels keep their code."""
-    sky_gaussians: int = 2_000
-    """Gaussians on a sphere around the scene, which take up the sky and the far distance, where a COLMAP
-    model has no points; 0 for none."""
-    total_steps: int = 30_000
-    """Iterations of the run, to which the fractions below refer; set by the trainer."""
-    densify_from: float = 1 / 15
-    """Fraction of the run at which densification begins (the paper: 2,000 of 30,000)."""
-    densify_until: float = 0.5
-    """Fraction of the run at which it ends."""
-    densify_every: float = 1 / 15
-    """Fraction of the run between two densifications (the paper: every 2,000)."""
-    background_color: Literal["random", "black", "white"] = "black"
-    """Black, as in the paper: where nothing is seen the code is zero as well."""
-    num_downscales: int = 0
-    """Photos have many sizes already: no extra coarse-to-fine resolution."""
-    ssim_lambda: float = 0.5
-    """Weight of 1 − SSIM against L1 in the colour loss."""
-    cull_alpha_thresh: float = 0.005
-    """Gaussians below this opacity are pruned."""
-    use_absgrad: bool = False
-    """Densify by the norm of the mean gradient, as in the paper."""
-    densify_grad_thresh: float | None = None  # type: ignore[assignment]
-    """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-4 (the
-    paper's) in long runs; 2e-3 in short ones, which begin to densify while gradients are still large."""
-
-    def fit_to_run(self, iterations: int) -> None:
-        """Settle what depends on the length of the run."""
-        short = iterations < SHORT_FIELD_RUN
-        self.total_steps = iterations
-        if self.semantic_field.preset == "auto":
-            self.semantic_field.preset = "short" if short else "default"
-        if self.appearance.preset == "auto":
-            self.appearance.preset = "short" if short else "paper"
-        if self.densify_grad_thresh is None:
-            self.densify_grad_thresh = 2e-3 if short else 2e-4
-        if self.dense_weight is None:
-            self.dense_weight = 2.0 if short else 0.5
-        if self.decode_size is None:
-            self.decode_size = (56, 72) if short else (80, 120)
 
 
 class Lang3DXLModel(SplatfactoModel):
@@ -126,10 +52,12 @@ class Lang3DXLModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Build Gaussians, components, metrics and strategy (on the CPU; the pipeline moves them)."""
         self.config.fit_to_run(self.config.total_steps)
-        self.gauss_params = nn.ParameterDict(self._initial_gaussians())
-        self.camera_optimizer = self.config.camera_optimizer.setup(
-            num_cameras=self.num_train_data, device="cpu"
-        )
+        if not self._wants("view dependence", self.config.view_dependence):
+            self.config.sh_degree = 0
+        means, colours = seed_positions(self.config, self.seed_points)
+        self.extent = centre_and_radius(means)
+        self.gauss_params = nn.ParameterDict(initial_gaussians(self.config, means, colours))
+        self._make_camera_optimizer(self._wants("camera optimiser", self.config.camera_optimisation, False))
         self.semantic_field = self.downsampler = None
         statistics: FeatureStatistics | None = self.kwargs["metadata"].get("feature_statistics")
         if statistics is not None:
@@ -141,7 +69,9 @@ class Lang3DXLModel(SplatfactoModel):
                 clip.std if dense is None else torch.cat([clip.std, dense.std]),
             )
         self.look = None
-        self.appearance = self._make_appearance() if self._wants_appearance else None
+        self.appearance = None
+        if self._wants("appearance", self.config.appearance.use):
+            self.appearance = self._make_appearance()
         self.step = 0
         self.step_is_sound = True
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
@@ -153,41 +83,6 @@ class Lang3DXLModel(SplatfactoModel):
         self.strategy = self._make_strategy()
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
-    def _initial_gaussians(self) -> dict[str, Parameter]:
-        """A Gaussian per seed point, as wide as the mean distance to its three nearest neighbours."""
-        if self.seed_points is not None and not self.config.random_init:
-            means, colours = self.seed_points[0].float(), self.seed_points[1].float() / 255
-        else:
-            means = (torch.rand(self.config.num_random, 3) - 0.5) * self.config.random_scale
-            colours = torch.rand(self.config.num_random, 3)
-        self.extent = centre_and_radius(means)
-        if self.config.sky_gaussians:
-            sky = sphere_around(means, self.config.sky_gaussians)
-            means = torch.cat([means, sky])
-            colours = torch.cat([colours, torch.full_like(sky, 0.5)])
-        n = len(means)
-        if n < 4:
-            raise UserError(
-                f"the scene has {n} seed points, too few to start from: reconstruct it again, or pass "
-                f"--pipeline.model.random-init True"
-            )
-        spacing = torch.from_numpy(self.k_nearest_sklearn(means, 3)[0]).mean(dim=-1, keepdim=True)
-        # Points that coincide would make Gaussians of no size.
-        spacing = spacing.clamp_min(1e-3 * float(spacing.median().clamp_min(1e-6)))
-        return {
-            "means": Parameter(means),
-            "scales": Parameter(spacing.log().repeat(1, 3)),
-            # Uniform over rotations; from a generator of its own, so that preparation has no say in it.
-            "quats": Parameter(
-                F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)
-            ),
-            "features_dc": Parameter(
-                RGB2SH(colours) if self.config.sh_degree > 0 else torch.logit(colours, eps=1e-4)
-            ),
-            "features_rest": Parameter(torch.zeros(n, num_sh_bases(self.config.sh_degree) - 1, 3)),
-            "opacities": Parameter(torch.logit(0.1 * torch.ones(n, 1))),
-        }
-
     def _add_semantics(self, clip_mean: Float[Tensor, " c"], dense_mean: Float[Tensor, " d"]) -> None:
         """Give every Gaussian a code, and build the field and the downsampler for features of this width."""
         self.register_buffer("clip_mean", clip_mean)
@@ -196,12 +91,17 @@ class Lang3DXLModel(SplatfactoModel):
         self.downsampler = AttenuatedDownsampler(self.config.downsampler, len(clip_mean))
         self.gauss_params["codes"] = Parameter(self.semantic_field.initial_codes(self.num_points))
 
-    @property
-    def _wants_appearance(self) -> bool:
-        """`auto` is on unless the scene's needs, where they were measured, say otherwise."""
-        if self.config.appearance.use != "auto":
-            return self.config.appearance.use == "on"
-        return bool((self.kwargs["metadata"].get("needs") or {}).get("appearance", True))
+    def _wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
+        """Whether to build an optional component; `auto`: if the scene's measured needs say so."""
+        if choice == "auto":
+            return (self.kwargs["metadata"].get("needs") or {}).get(component, unmeasured)
+        return choice == "on"
+
+    def _make_camera_optimizer(self, wanted: bool) -> None:
+        settings = self.config.camera_optimizer
+        if wanted and settings.mode == "off":
+            settings.mode = "SO3xR3"
+        self.camera_optimizer = settings.setup(num_cameras=self.num_train_data, device="cpu")
 
     def _make_appearance(self) -> AppearanceField:
         names = [photo.name for photo in self.kwargs["metadata"].get("photos", ())]
@@ -261,9 +161,7 @@ class Lang3DXLModel(SplatfactoModel):
             groups["downsampler"] = list(self.downsampler.parameters())
         if self.appearance is not None:
             groups["appearance_vectors"] = [self.appearance.vectors]
-            groups["appearance"] = [
-                p for p in self.appearance.parameters() if p is not self.appearance.vectors
-            ]
+            groups["appearance"] = self.appearance.network_parameters()
         return {name: parameters for name, parameters in groups.items() if parameters}
 
     @property
@@ -451,8 +349,8 @@ class Lang3DXLModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict, batch: dict
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Held-out photo: PSNR (`cc_psnr`: once its colours are matched), SSIM, LPIPS where its weights are at
-        hand, and feature metrics."""
+        """Held-out photo: PSNR (`cc_psnr`: once its colours are matched), SSIM, LPIPS where its weights are
+        at hand, and feature metrics."""
         target = self.get_gt_img(batch["image"])
         predicted = outputs["rgb"]
         chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]
@@ -494,6 +392,10 @@ class Lang3DXLModel(SplatfactoModel):
         """
         self._match_semantics(state)
         self._match_appearance(state)
+        self.config.sh_degree = isqrt(state["gauss_params.features_rest"].shape[1] + 1) - 1
+        if "camera_optimizer.pose_adjustment" in state and self.config.camera_optimizer.mode == "off":
+            self._make_camera_optimizer(wanted=True)
+            self.to(self.device)
         self.step = self.config.total_steps
         for name, parameter in self.gauss_params.items():
             saved = state[f"gauss_params.{name}"]

@@ -23,7 +23,8 @@ from lang3dxl_ns.evaluation.average_precision import deviation_over_photos, mean
 from lang3dxl_ns.evaluation.holyscenes import GroundTruth, mean_average_precision, scoring_size
 from lang3dxl_ns.evaluation.language import LanguageScorer, Maps, blurred, inside, open_scorer
 from lang3dxl_ns.evaluation.report import progress_bar
-from lang3dxl_ns.model import Lang3DXLModel, Lang3DXLModelConfig
+from lang3dxl_ns.model import Lang3DXLModel
+from lang3dxl_ns.model_config import Lang3DXLModelConfig
 
 
 @dataclass
