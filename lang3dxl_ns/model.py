@@ -446,8 +446,8 @@ class Lang3DXLModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict, batch: dict
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Held-out photo: PSNR (`cc_psnr`: once its colours are matched), SSIM, LPIPS where its weights are at
-        hand, and feature metrics."""
+        """Held-out photo: PSNR (`cc_psnr`: with its colours matched first), SSIM, LPIPS where its weights
+        are at hand, and feature metrics."""
         target = self.get_gt_img(batch["image"])
         predicted = outputs["rgb"]
         chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]
