@@ -12,6 +12,12 @@ USE = "pipeline__model__appearance__use"
 SHIFT = "pipeline__model__appearance__opacity_shift"
 
 
+@pytest.fixture
+def train(train):
+    """Training with appearance, whatever the small scene needs."""
+    return lambda *args, **changes: train(*args, **{USE: "on", **changes})
+
+
 def step_camera(trainer, index=0):
     """Camera and batch of a training photo, as the data manager hands them out."""
     datamanager = trainer.pipeline.datamanager
@@ -51,9 +57,8 @@ def test_needs_of_the_scene_decide_where_nobody_does(train, scene, monkeypatch):
         ("on", {"appearance": False}, True),
         ("off", {"appearance": True}, False),
     ):
-        model.config.appearance.use = use
         model.kwargs["metadata"]["needs"] = needs
-        assert model._wants_appearance is expected
+        assert model._wants("appearance", use) is expected
 
 
 def test_first_iteration_moves_gaussians_as_without_appearance(train, scene):

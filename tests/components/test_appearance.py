@@ -49,13 +49,13 @@ def test_untrained_field_changes_nothing():
     assert torch.equal(shifted, colours) and same is gaussians
 
 
-def test_two_lights_are_learned_within_some_hundred_steps():
+def test_two_lights_are_learned_with_eighty_views_of_each():
     """Photo b is photo a at half the brightness, and bluish on one side of the scene."""
     field, cloud = make_field(), make_cloud(100)
     evening = 0.5 * cloud[1] + (cloud[0].means[:, :1] > 0) * torch.tensor([0, 0, 0.2])
     targets = {"a.jpg": cloud[1], "b.jpg": evening}
     optimizer = torch.optim.Adam(field.parameters(), lr=5e-3, eps=1e-15)
-    for _ in range(150):
+    for _ in range(80):
         for name, target in targets.items():
             optimizer.zero_grad()
             (shine(field, cloud, name)[0] - target).abs().mean().backward()
@@ -130,7 +130,7 @@ def test_every_place_has_a_coordinate_of_its_own_inside_the_unit_cube():
 def test_colours_and_opacities_stay_in_their_range():
     field, cloud = make_field(trained=True, opacity_shift=True), make_cloud()
     with torch.no_grad():
-        field.output.bias.copy_(torch.tensor([-3.0, 0.0, 3.0, 4.0]))
+        field.output.bias.copy_(torch.tensor([-3.0, 0.0, 3.0, 9.0]))
     for seed in (None, 0):
         colours, opacities = shine(field, cloud, seed=seed)
         assert (colours >= 0).all() and (colours == 0).any()
