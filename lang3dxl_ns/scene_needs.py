@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +13,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.report import markdown_table, write_report
 from lang3dxl_ns.preparation.collection import SCALE_RATIO, CropPlan
 from lang3dxl_ns.preparation.photo import Photo
@@ -154,16 +154,12 @@ def write_needs(needs: Sequence[Need], folder: Path) -> None:
     write_report(folder, NEEDS_FILE, f"# What this scene needs\n\n{needs_table(needs)}", as_data(needs))
 
 
-def wanted(choice: str, component: str, needs: dict[str, bool] | None) -> bool:
-    """Whether a component is built: as `choice` ("on", "off") says, or "auto" as the scene's needs say.
-
-    needs: verdicts by component; None where nothing was measured, and everything is built.
-    """
-    if choice not in ("auto", "on", "off"):
-        raise UserError(f"{component} is {choice!r}: choose auto, on or off")
-    if choice != "auto":
-        return choice == "on"
-    return True if needs is None else needs.get(component, True)
+def read_needs(folder: Path) -> dict[str, bool]:
+    """The verdicts that a run's folder holds, by component; empty where it has none."""
+    path = folder / f"{NEEDS_FILE}.json"
+    if not path.is_file():
+        return {}
+    return {component: need["needed"] for component, need in json.loads(path.read_text()).items()}
 
 
 def _figure(value: float | None) -> str | None:

@@ -11,9 +11,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Literal
+from typing import Any, Literal
 
 import torch
+import yaml
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -28,7 +29,7 @@ from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.query.scene_file import SCENE_FILE
 from lang3dxl_ns.scene_loading import describe_scene
-from lang3dxl_ns.scene_needs import write_needs
+from lang3dxl_ns.scene_needs import read_needs, write_needs
 from lang3dxl_ns.step_guard import StepGuard
 
 SHORT_RUN = 1_000
@@ -129,13 +130,36 @@ class Lang3DXLTrainerConfig(TrainerConfig):
                 group["optimizer"].fit(iterations)
             if isinstance(group["scheduler"], RunScheduleConfig):
                 group["scheduler"].total_steps = iterations
+        self.load_dir, self.load_checkpoint = _absolute(self.load_dir), _absolute(self.load_checkpoint)
+        if self.load_dir or self.load_checkpoint:
+            self._follow(self.load_dir.parent if self.load_dir else self.load_checkpoint.parents[1])
         self.pipeline.model.fit_to_run(iterations)
         self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
         datamanager = self.pipeline.datamanager
         datamanager.data = _absolute(datamanager.data or self.data)
         self.data = datamanager.data
         self.output_dir = Path(self.output_dir).expanduser().absolute()
-        self.load_dir, self.load_checkpoint = _absolute(self.load_dir), _absolute(self.load_checkpoint)
+
+    def _follow(self, run: Path) -> None:
+        """A resumed run keeps what `auto` meant when it began."""
+        if not (run / "config.yml").is_file():
+            return
+        earlier = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader).pipeline.model
+        needs, mine = read_needs(run), self.pipeline.model
+        for part in ("semantic_field", "appearance"):
+            if getattr(mine, part).preset == "auto":
+                getattr(mine, part).preset = getattr(earlier, part).preset
+
+        def settle(owner: Any, before: Any, name: str, component: str) -> None:
+            choice = getattr(before, name)
+            if choice == "auto" and component in needs:
+                choice = "on" if needs[component] else "off"
+            if getattr(owner, name) == "auto":
+                setattr(owner, name, choice)
+
+        settle(mine.appearance, earlier.appearance, "use", "appearance")
+        settle(mine, earlier, "view_dependence", "view dependence")
+        settle(mine, earlier, "camera_optimisation", "camera optimiser")
 
 
 class GuardedOptimizers(Optimizers):
