@@ -97,7 +97,7 @@ def test_mistakes_end_in_a_sentence(run, tmp_path, words, message):
 
 def test_settings_are_flags(run, tmp_path):
     words = ("query", "--load-config", "c", "--text", "dome", "--image", "0002", "--out", tmp_path)
-    run(*words, "--threshold", 0.999, "--synonyms", "off", "--sizes", 8)
+    run(*words, "--threshold", 0.9999, "--synonyms", "off", "--sizes", 8)
     assert not np.asarray(Image.open(tmp_path / "dome" / "right_0002.mask.png")).any()
 
 
