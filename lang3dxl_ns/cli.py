@@ -10,8 +10,10 @@ from typing import Annotated
 import tyro
 
 from lang3dxl_ns.demo.scene_writer import DemoScene
+from lang3dxl_ns.demo_run import Demo
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
+from lang3dxl_ns.evaluation.numerics.command import Numerics
 from lang3dxl_ns.lookup_benchmark import LookupBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.query_commands import Export, Query
@@ -54,10 +56,12 @@ Benchmark = (
     | Annotated[LookupBenchmark, tyro.conf.subcommand("lookup")]
 )
 Command = (
-    Annotated[Prepare, tyro.conf.subcommand("prepare")]
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Prepare, tyro.conf.subcommand("prepare")]
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]
+    | Annotated[Numerics, tyro.conf.subcommand("numerics")]
     | Annotated[
         Benchmark,
         tyro.conf.subcommand("benchmark", description="Measure: time, memory and error, side by side."),

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
@@ -31,9 +31,11 @@ from torch import Tensor
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.preparation.collection import prepare_collection
+from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo import Photo, scaled_size
 from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, points_in_view
 from lang3dxl_ns.preparation.prepare import PreparationConfig, TargetReader
+from lang3dxl_ns.preparation.regions import region_source
 from lang3dxl_ns.timing import part
 
 
@@ -127,6 +129,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
     config: Lang3DXLDataManagerConfig
     train_dataset: PhotoDataset
     eval_dataset: PhotoDataset
+    photo_in_hand: str
+    """Name of the photo that training had last."""
 
     def __init__(self, config: Lang3DXLDataManagerConfig, *args, **kwargs):
         self._left_out: set[int] = set()
@@ -156,22 +160,49 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def targets(self) -> TargetReader | None:
         """The prepared targets of all photos, or None where only colours are trained. Made on first use,
         so that the viewer and exports never wait for them."""
+        photos = list(self.photos.values())
         if self.config.clip == "none":
             return None
+        c = self.config
+        regions = region_source(c.regions, c.region_level, c.sam, self.data_folder, self.device)
         return prepare_collection(
-            [*self.train_dataset.photos, *self.eval_dataset.photos],
+            photos,
             self._reconstruction(),
             self.config,
             self.cache_dir,
             self.device,
             log=CONSOLE.log,
+            regions=regions,
         ).reader
+
+    @cached_property
+    def photos(self) -> dict[str, Photo]:
+        """All photos by name, with their foreground masks, which both datasets then read. Made on first use,
+        as the targets are."""
+        datasets = (self.train_dataset, self.eval_dataset)
+        photos = {photo.name: photo for dataset in datasets for photo in dataset.photos}
+        masked = with_foreground(
+            list(photos.values()), self.config, self.data_folder, self.cache_dir, self.device, CONSOLE.log
+        )
+        photos = {photo.name: photo for photo in masked}
+        for dataset in datasets:
+            dataset.photos[:] = [photos[photo.name] for photo in dataset.photos]
+        return photos
+
+    def foreground(self, name: str) -> Bool[Tensor, "h w"] | None:
+        """Where a photo counts, at the size that it is trained at; None where all of it does."""
+        return self.photos[name].read_mask(self.config.camera_res_scale_factor)
+
+    @property
+    def data_folder(self) -> Path:
+        """Folder of the scene."""
+        data = Path(self.config.dataparser.data)
+        return data if data.is_dir() else data.parent
 
     @property
     def cache_dir(self) -> Path:
         """Folder of prepared targets."""
-        data = Path(self.config.dataparser.data)
-        return self.config.cache_dir or (data if data.is_dir() else data.parent) / "lang3dxl_cache"
+        return self.config.cache_dir or self.data_folder / "lang3dxl_cache"
 
     def _reconstruction(self) -> Reconstruction:
         """The model in its own units: COLMAP's, or for other dataparsers one made of the seed points."""
@@ -210,6 +241,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             self.train_unseen_cameras = self.sample_train_cameras()
             return self.next_train(step)
         camera.metadata = {"cam_idx": index}
+        self.photo_in_hand = batch["name"]
         return camera, batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
@@ -233,17 +265,21 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Everything a step needs of one photo:
 
         `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, `name`, and with semantics `clip_target`
-        [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D].
+        [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and
+        `regions` [h, w] (labels, −1 for none).
         """
         photo = dataset.photos[index]
         batch: dict[str, Any] = {key: value.to(self.device) for key, value in data.items()}
         batch |= {"image_idx": index, "name": photo.name}
         if self.targets is not None:
             clip, dense = self.targets.clip(photo.name), self.targets.dense(photo.name)
+            regions = self.targets.regions(photo.name)
             batch["clip_target"] = clip.features.to(self.device).float()
             batch["crop_sides"] = clip.crop_fractions
             if dense is not None:
                 batch["dense_target"] = dense.to(self.device).float()
+            if regions is not None:
+                batch["regions"] = regions.to(self.device).long()
         return dataset.cameras[index : index + 1].to(self.device), batch
 
 

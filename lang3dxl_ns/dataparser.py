@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, read_reconstruction
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 
 @dataclass
@@ -31,7 +33,7 @@ class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
     """Photos, relative to the data folder; dense/images is tried too."""
     masks_path: Path | None = Path("masks")
     """Foreground masks, white = keep, named like the photos (.png or .jpg); a photo without one is used
-    whole."""
+    whole. --pipeline.datamanager.foreground has other sources."""
     downscale_factor: int | None = 1
     """Left at 1: photos are resized as they are read (--pipeline.datamanager.camera-res-scale-factor)."""
 
@@ -65,6 +67,10 @@ class PhotoCollectionDataParser(ColmapDataParser):
         finally:
             self.config.masks_path = masks
         outputs.metadata["photos"] = [self.photos[path] for path in outputs.image_filenames]
+        # From here on the transform is again that of the model's own coordinates.
+        transform = outputs.dataparser_transform.double()
+        transform[:, 3] -= transform[:, :3] @ torch.from_numpy(self._origin)
+        outputs.dataparser_transform = transform.float()
         return outputs
 
     def _get_image_indices(self, image_filenames, split):
@@ -84,8 +90,30 @@ class PhotoCollectionDataParser(ColmapDataParser):
         applied[2] *= -1
         return {"frames": frames, "camera_model": "PINHOLE", "applied_transform": applied.tolist()}
 
+    @cached_property
+    def _origin(self) -> np.ndarray:
+        """What is subtracted from positions while they are in float64: the middle of the cameras.
+
+        The parent casts to float32, which resolves map coordinates (millions of metres) to half a metre.
+        """
+        assert self.reconstruction is not None
+        if self.config.center_method == "none":
+            return np.zeros(3)
+        return np.mean([geometry.centre for geometry in self.reconstruction.photos.values()], axis=0)
+
+    def _load_3D_points(self, colmap_path: Path, transform_matrix: torch.Tensor, scale_factor: float) -> dict:
+        """The model's points in the scene's frame, with their colours."""
+        assert self.reconstruction is not None
+        transform = transform_matrix.double()
+        points = torch.from_numpy(self.reconstruction.points - self._origin)
+        return {
+            "points3D_xyz": (scale_factor * (points @ transform[:, :3].T + transform[:, 3])).float(),
+            "points3D_rgb": torch.from_numpy(self.reconstruction.colours),
+        }
+
     def _frame(self, geometry: PhotoGeometry) -> dict:
         world_from_camera = np.linalg.inv(np.vstack([geometry.camera_from_world, [0, 0, 0, 1]]))
+        world_from_camera[:3, 3] -= self._origin
         world_from_camera[:3, 1:3] *= -1  # OpenCV axes to OpenGL's
         world_from_camera = world_from_camera[[0, 2, 1, 3]]  # COLMAP guesses gravity along -y; here z is up
         world_from_camera[2] *= -1
@@ -138,11 +166,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         """The photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""
         if self.config.masks_path is None:
             return None
-        mask = self.config.data / self.config.masks_path / name
-        candidates = [mask.with_suffix(suffix) for suffix in IMAGE_SUFFIXES] + [
-            mask.with_name(mask.name + ".png")
-        ]
-        return next((path for path in candidates if path.is_file()), None)
+        return find_mask(self.config.data / self.config.masks_path, name)
 
 
 def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Path:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -79,3 +81,17 @@ lang3dxl = MethodSpecification(
     ),
     description="Lang3D-XL: language in large 3D scenes, from photo collections; on CUDA and on any CPU.",
 )
+
+
+def run_config(
+    data: Path, output_dir: Path, experiment_name: str, iterations: int, clip: str, dense: str
+) -> Lang3DXLTrainerConfig:
+    """Configuration of a run of `lang3dxl` inside another command: no viewer, no evaluation on the way."""
+    config = deepcopy(lang3dxl.config)
+    assert isinstance(config, Lang3DXLTrainerConfig)
+    config.data = config.pipeline.datamanager.data = data
+    config.output_dir, config.experiment_name = output_dir, experiment_name
+    config.vis, config.steps_per_eval_image = "tensorboard", 0
+    config.max_num_iterations = iterations
+    config.pipeline.datamanager.clip, config.pipeline.datamanager.dense = clip, dense
+    return config

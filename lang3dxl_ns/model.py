@@ -32,6 +32,7 @@ from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
 from lang3dxl_ns.geometry import sphere_around, view_matrix
 from lang3dxl_ns.preparation.prepare import FeatureStatistics
 from lang3dxl_ns.rendering import Camera, Gaussians, Rendering, rasterize, spherical_harmonics
+from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.timing import part
 
 SHORT_FIELD_RUN = 5_000
@@ -131,6 +132,7 @@ class Lang3DXLModel(SplatfactoModel):
                 clip.std if dense is None else torch.cat([clip.std, dense.std]),
             )
         self.step = 0
+        self.step_is_sound = True
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.lpips = Lpips()
         self.crop_box = None
@@ -215,8 +217,9 @@ class Lang3DXLModel(SplatfactoModel):
                 parameter.requires_grad_(name == "codes")
 
     def step_post_backward(self, step: int) -> None:
-        """After an iteration: densify and prune (not at step 0, where the strategy would reset opacities)."""
-        if step > 0 and self.means.requires_grad:
+        """After an iteration: densify and prune (not at step 0, where the strategy would reset opacities,
+        and not after a step that was skipped)."""
+        if step > 0 and self.means.requires_grad and self.step_is_sound:
             before = self.num_points
             super().step_post_backward(step)
             if self.num_points != before:
@@ -296,7 +299,12 @@ class Lang3DXLModel(SplatfactoModel):
         self.last_size = (view.height, view.width)
         background = self._get_background_color()
         rendering = rasterize(
-            Gaussians(g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(-1)),
+            Gaussians(
+                g["means"],
+                g["quats"],
+                g["scales"].clamp_max(MAX_LOG_SCALE).exp(),
+                g["opacities"].sigmoid().squeeze(-1),
+            ),
             view,
             self._colours(g, pose[0, :, 3].to(self.device)),
             background,
@@ -349,7 +357,8 @@ class Lang3DXLModel(SplatfactoModel):
             weight = None if small_mask is None else weight
             loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, batch["clip_target"], weight)}
             if dense is not None and "dense_target" in batch:
-                loss["dense"] = ramp * c.dense_weight * losses.dense_loss(dense, batch["dense_target"])
+                difference = losses.dense_loss(dense, batch["dense_target"], small_mask)
+                loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
                 labels = _resize(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()
                 loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
@@ -415,7 +424,7 @@ class Lang3DXLModel(SplatfactoModel):
         metrics = feature_metrics("clip", predicted, batch["clip_target"], self.clip_mean, weight)
         if dense is not None and "dense_target" in batch:
             target = losses.resize(batch["dense_target"], dense.shape[:2])
-            metrics |= feature_metrics("dense", dense, target, self.dense_mean)
+            metrics |= feature_metrics("dense", dense, target, self.dense_mean, small_mask)
         return metrics
 
     # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────

@@ -21,7 +21,7 @@ from lang3dxl_ns.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConf
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.average_precision import deviation_over_photos, mean_over_photos
 from lang3dxl_ns.evaluation.holyscenes import GroundTruth, mean_average_precision, scoring_size
-from lang3dxl_ns.evaluation.language import LanguageScorer, Maps, open_scorer
+from lang3dxl_ns.evaluation.language import LanguageScorer, Maps, blurred, inside, open_scorer
 from lang3dxl_ns.evaluation.report import progress_bar
 from lang3dxl_ns.model import Lang3DXLModel, Lang3DXLModelConfig
 
@@ -44,11 +44,12 @@ class EvaluatedPhoto:
 
     name: str
     metrics: dict[str, float]
-    """PSNR … and, with ground truth, `ap_{category}` and `teacher_ap_{category}`."""
+    """PSNR … and, with ground truth, `ap_{category}`, `raw_ap_{category}` (before the blur) and
+    `teacher_ap_{category}`."""
     images: dict[str, Tensor]
     """`img` (photo beside rendering, [H, 2W, 3]) and, with semantics, `semantics`."""
     field_maps: Maps
-    """Relevancy by category at half the photo's size; empty without ground truth."""
+    """Relevancy by category at half the photo's size, blurred as published; empty without ground truth."""
     teacher_maps: Maps
     """The same of the photo's own CLIP target."""
 
@@ -59,6 +60,8 @@ class Lang3DXLPipeline(VanillaPipeline):
     config: Lang3DXLPipelineConfig
     datamanager: Lang3DXLDataManager
     model: Lang3DXLModel
+    last_losses: dict[str, Tensor]
+    """The weighted losses of the latest training step."""
 
     def __init__(self, *args, **kwargs):
         print_user_errors_plainly()
@@ -71,8 +74,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         """Scores words where the scene has ground truth and the run has semantics."""
         folder = self.config.ground_truth
         if folder is None:
-            data = Path(self.datamanager.config.dataparser.data)
-            folder = (data if data.is_dir() else data.parent) / "ground_truth"
+            folder = self.datamanager.data_folder / "ground_truth"
             if not folder.is_dir():
                 return None
         if self.model.semantic_field is None:
@@ -106,9 +108,11 @@ class Lang3DXLPipeline(VanillaPipeline):
         photo = self.datamanager.eval_dataset.photos[batch["image_idx"]]
         size = scoring_size(photo.height, photo.width)
         keep = batch["mask"][..., 0] if "mask" in batch else None
-        evaluated.field_maps = scorer.field_maps(field_.decode_clip, self.model.rendered_codes, size, keep)
-        evaluated.teacher_maps = scorer.teacher_maps(batch["clip_target"], size, keep)
-        for prefix, maps in (("", evaluated.field_maps), ("teacher_", evaluated.teacher_maps)):
+        raw = inside(scorer.field_maps(field_.decode_clip, self.model.rendered_codes, size), keep)
+        evaluated.field_maps = inside(blurred(raw), keep)
+        evaluated.teacher_maps = inside(blurred(scorer.teacher_maps(batch["clip_target"], size)), keep)
+        scored = {"": evaluated.field_maps, "raw_": raw, "teacher_": evaluated.teacher_maps}
+        for prefix, maps in scored.items():
             evaluated.metrics |= scorer.scores(photo.name, maps, prefix)
 
     def get_average_eval_image_metrics(
@@ -124,6 +128,11 @@ class Lang3DXLPipeline(VanillaPipeline):
             if output_path is not None:
                 _write_pictures(evaluated, output_path)
         return average(photos, get_std)
+
+    def get_train_loss_dict(self, step: int):
+        """Outputs, losses and metrics of the next photo."""
+        outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
+        return outputs, self.last_losses, metrics
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
         """Load a checkpoint; whatever does not fit is an error (nerfstudio would silently leave it out)."""
@@ -145,10 +154,10 @@ def _write_pictures(evaluated: EvaluatedPhoto, folder: Path) -> None:
 
 
 def average(photos: list[dict[str, float]], with_deviation: bool = False) -> dict[str, Any]:
-    """Means over photos of every figure; `map` and `teacher_map`, unweighted means over the categories of
-    `ap_…` and `teacher_ap_…`; `ap_…_photos`, how many photos a category was scored on."""
+    """Means over photos of every figure; `map`, `raw_map` and `teacher_map`, unweighted means over the
+    categories of `ap_…`, `raw_ap_…` and `teacher_ap_…`; `ap_…_photos`, how many photos that is."""
     means: dict[str, Any] = mean_over_photos(photos)
-    totals = {f"{who}map": mean_average_precision(means, who) for who in ("", "teacher_")}
+    totals = {f"{who}map": mean_average_precision(means, who) for who in ("", "raw_", "teacher_")}
     counts = {
         f"{name}_photos": sum(name in photo for photo in photos) for name in means if name.startswith("ap_")
     }

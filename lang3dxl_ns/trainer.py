@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import math
 import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Literal
 
 import torch
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -22,6 +28,7 @@ from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.query.scene_file import SCENE_FILE
 from lang3dxl_ns.scene_loading import describe_scene
+from lang3dxl_ns.step_guard import StepGuard
 
 SHORT_RUN = 1_000
 """Iterations of a run that takes the short-run rates."""
@@ -104,6 +111,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: Lang3DXLTrainer)
     pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
+    max_skipped_steps: int = 20
+    """A step whose loss or gradient is not finite is skipped; after this many in a row the run stops."""
 
     def set_timestamp(self) -> None:
         """Called once before the configuration is printed and saved: settle what depends on the run."""
@@ -128,11 +137,33 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.load_dir, self.load_checkpoint = _absolute(self.load_dir), _absolute(self.load_checkpoint)
 
 
+class GuardedOptimizers(Optimizers):
+    """nerfstudio's optimisers, which ask before they step."""
+
+    def __init__(self, config: dict, param_groups: dict, allowed: Callable[[GradScaler], bool]):
+        super().__init__(config, param_groups)
+        self._allowed = allowed
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        """Step, or forget all gradients and leave parameters and moments as they are."""
+        if self._allowed(grad_scaler):
+            super().optimizer_scaler_step_some(grad_scaler, param_groups)
+            return
+        for name, optimizer in self.optimizers.items():
+            if any(parameter.grad is not None for parameter in self.parameters[name]):
+                grad_scaler.unscale_(optimizer)  # tells it what overflowed, so that it lowers the scale
+        self.zero_grad_all()
+
+
 class Lang3DXLTrainer(Trainer):
-    """nerfstudio's trainer with atomic checkpoints, and a resumed run that ends at the asked iteration."""
+    """nerfstudio's trainer with atomic checkpoints, a resumed run that ends at the asked iteration, and a
+    guard against steps that are not finite."""
 
     config: Lang3DXLTrainerConfig
     pipeline: Lang3DXLPipeline
+    interrupted = False
+    """Whether the training was asked to stop before its end."""
+    _last_iteration = -1
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up, then seed: what had to be prepared has no say in the run's randomness. The run's folder
@@ -141,6 +172,29 @@ class Lang3DXLTrainer(Trainer):
         if self.local_rank == 0:
             describe_scene(self.pipeline.datamanager).write(self.base_dir / SCENE_FILE)
         torch.manual_seed(self.config.machine.seed)
+
+    @property
+    def first_iteration(self) -> int:
+        """Where the training begins: 0, or after the checkpoint that it goes on from."""
+        return self._start_step
+
+    def setup_optimizers(self) -> Optimizers:
+        """The optimisers, with the guard before them."""
+        self.guard = StepGuard(self.config.max_skipped_steps, CONSOLE.log)
+        groups = self.pipeline.get_param_groups()
+        return GuardedOptimizers(self.config.optimizers.copy(), groups, self._step_is_sound)
+
+    def _step_is_sound(self, grad_scaler: GradScaler) -> bool:
+        sound = self.guard.allows(
+            self.step,
+            self.pipeline.datamanager.photo_in_hand,
+            self.pipeline.last_losses,
+            self.optimizers.parameters,
+            grad_scaler.get_scale(),
+        )
+        # Densification collects the gradients of the screen positions, which are as broken.
+        self.pipeline.model.step_is_sound = sound
+        return sound
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in all (nerfstudio would add that many to a resumed run)."""
@@ -155,9 +209,50 @@ class Lang3DXLTrainer(Trainer):
             CONSOLE.log(f"Resuming at iteration {self._start_step} of {total}")
         self.config.max_num_iterations = total - self._start_step
         try:
-            super().train()
+            with self._stoppable():
+                super().train()
         finally:
             self.config.max_num_iterations = total
+            if summary := self.guard.summary():
+                CONSOLE.log(f"[yellow]{summary}")
+
+    def train_iteration(self, step: int):
+        result = super().train_iteration(step)
+        self._last_iteration = step
+        return result
+
+    @contextmanager
+    def _stoppable(self) -> Iterator[None]:
+        """Let Ctrl-C or a SIGTERM end the training after the iteration under way, with a checkpoint; a
+        second one ends it at once."""
+
+        def stop(number: int, _frame: FrameType | None) -> None:
+            self.interrupted = self.stop_training = True
+            signal.signal(number, previous[signal.Signals(number)])
+
+        if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+            yield
+            return
+        previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        for number in previous:
+            signal.signal(number, stop)
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def _after_train(self) -> None:
+        """Save; after an interruption also say how to go on, and don't wait in the viewer."""
+        if self.interrupted:
+            self.step = max(self._last_iteration, self._start_step)  # not the one that was about to begin
+            self.config.viewer.quit_on_train_completion = True
+            CONSOLE.print(
+                f"Stopped after {self.step + 1} iterations. To go on: the same command with "
+                f"--load-dir {self.checkpoint_dir}",
+                soft_wrap=True,
+            )
+        super()._after_train()
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ProcessPoolExecutor
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -50,18 +49,12 @@ def _train_and_evaluate(settings: TrainingBenchmark) -> dict[str, Any]:
     import torch
 
     from lang3dxl_ns import timing
-    from lang3dxl_ns.methods import lang3dxl
-    from lang3dxl_ns.trainer import Lang3DXLTrainer, Lang3DXLTrainerConfig
+    from lang3dxl_ns.methods import run_config
+    from lang3dxl_ns.trainer import Lang3DXLTrainer
 
-    config = deepcopy(lang3dxl.config)
-    assert isinstance(config, Lang3DXLTrainerConfig)
-    config.data = config.pipeline.datamanager.data = settings.data
-    config.output_dir = settings.out / "runs"
-    config.experiment_name = "joint" if settings.clip != "none" else "rgb"
-    config.vis = "tensorboard"
-    config.steps_per_eval_image = 0
-    config.max_num_iterations = settings.iterations
-    config.pipeline.datamanager.clip, config.pipeline.datamanager.dense = settings.clip, settings.dense
+    name = "joint" if settings.clip != "none" else "rgb"
+    runs = settings.out / "runs"
+    config = run_config(settings.data, runs, name, settings.iterations, settings.clip, settings.dense)
     config.pipeline.datamanager.camera_res_scale_factor = settings.scale
     config.set_timestamp()
     config.save_config()

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
 
 from lang3dxl_ns.errors import UserError
 
@@ -121,12 +122,61 @@ def test_config_is_complete_and_readable_from_any_folder(train, scene, tmp_path,
     assert pipeline.model.num_points > 0
 
 
+def first_batch(trainer):
+    """Of a trained model: camera and batch of a training photo, and what the model makes of the camera."""
+    camera, batch = trainer.pipeline.datamanager.next_train(0)
+    model = trainer.pipeline.model.train()
+    return batch, model, model.get_outputs(camera)
+
+
+def test_regions_are_a_loss_where_they_are_asked_for_and_nothing_at_all_elsewhere(train, scene):
+    batch, model, outputs = first_batch(train(scene, iterations=2))
+    assert "regions" not in batch
+    assert "regions" not in model.get_loss_dict(outputs, batch)
+    batch, model, outputs = first_batch(
+        train(scene, iterations=2, pipeline__datamanager__regions="felzenszwalb")
+    )
+    assert batch["regions"].dtype == torch.int64
+    loss = model.get_loss_dict(outputs, batch)["regions"]
+    assert 0 < loss.item() < float("inf")
+    (gradient,) = torch.autograd.grad(loss, model.codes)
+    assert gradient.abs().max() > 0
+
+
+def test_the_mask_bounds_every_semantic_loss_and_queries_can_read_it(train, scene, tmp_path):
+    """Targets that differ only off the mask, here the left half, cost the same."""
+    for path in (scene / "images").iterdir():
+        mask = Image.new("L", (8, 6), 0)
+        mask.paste(255, (4, 0, 8, 6))
+        (tmp_path / "right").mkdir(exist_ok=True)
+        mask.save(tmp_path / "right" / f"{path.stem}.png")
+    options = {"regions": "felzenszwalb", "foreground": str(tmp_path / "right")}
+    trainer = train(
+        scene, iterations=2, **{f"pipeline__datamanager__{name}": value for name, value in options.items()}
+    )
+    batch, model, outputs = first_batch(trainer)
+    datamanager = trainer.pipeline.datamanager
+    assert torch.equal(datamanager.foreground(batch["name"]), batch["mask"][..., 0])
+    assert 0.4 < batch["mask"].float().mean() < 0.6
+    before = model.get_loss_dict(outputs, batch)
+    changes = {"dense_target": 100.0, "regions": 7}  # far from the border, which resizing blurs
+    for where, same in ((slice(None, 0.4), True), (slice(0.6, None), False)):
+        changed = dict(batch)
+        for key, value in changes.items():
+            width = batch[key].shape[1]
+            start, stop = (None if at is None else round(at * width) for at in (where.start, where.stop))
+            changed[key] = batch[key].clone()
+            changed[key][:, start:stop] = value
+        after = model.get_loss_dict(outputs, changed)
+        for name in ("dense", "regions"):
+            assert torch.allclose(after[name], before[name], rtol=1e-5, atol=0) is same, (name, same)
+
+
 def test_masked_pixels_have_no_say(train, scene, tmp_path):
     """Photos that differ only off the mask train the same model."""
     import shutil
 
     import numpy as np
-    from PIL import Image
 
     results = []
     for paint in (0, 255):

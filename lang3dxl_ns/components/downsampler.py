@@ -23,11 +23,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from lang3dxl_ns.precision import in_full_precision
+
 KernelName = Literal["pyramid", "footprint", "box"]
 
 # exp(-2 * 30) is far above the smallest float32, so one maximum over the whole map serves every window.
 _LARGEST_BOUND_FOR_ONE_MAXIMUM = 30.0
-_LOG_OF_ZERO = -1e30  # finite, so that a softmax over an empty window has no NaN in its gradient
 _ROUND_OFF = 1e-9  # of a window; less coverage than this is an error of rounding, not a pixel
 
 
@@ -84,15 +85,26 @@ class AttenuatedDownsampler(nn.Module):
         features are 0 and pass no gradient; elsewhere it serves as the weight of the loss. Features off the
         mask have no influence at all. Raises ValueError for crop sides that are not positive and ascending.
         """
+        masked = features if mask is None else features * mask.to(features.dtype)[..., None]
+        logits = None if self.network is None else self.logits(masked)
+        return self._average(features, grid, tuple(float(side) for side in crop_sides), mask, logits)
+
+    @in_full_precision
+    def _average(
+        self,
+        features: Float[Tensor, "h w c"],
+        grid: tuple[int, int],
+        sides: tuple[float, ...],
+        mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None,
+        logits: Float[Tensor, "h w"] | None,
+    ) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
         h, w, _ = features.shape
-        sides = tuple(float(side) for side in crop_sides)
         kernel = separable_kernel(self.config.kernel, (h, w), grid, sides, features.dtype, features.device)
         inside = features.new_ones(h, w) if mask is None else mask.to(features.dtype)
-        masked = features if mask is None else features * inside[..., None]
         share = apply_kernel(kernel, inside[..., None]).squeeze(-1)
-        if self.network is None:
+        if logits is None:
+            masked = features if mask is None else features * inside[..., None]
             return _divide(apply_kernel(kernel, masked), share), share
-        logits = self.logits(masked)
         bound = self.config.logit_bound
         one_maximum = bound is not None and bound <= _LARGEST_BOUND_FOR_ONE_MAXIMUM
         mean = mean_with_one_maximum if one_maximum else mean_with_window_maxima
@@ -125,19 +137,31 @@ def mean_with_window_maxima(
     logits: Float[Tensor, "h w"],
     mask: Float[Tensor, "h w"],
 ) -> Float[Tensor, "hd wd c"]:
-    """Weighted mean of every window, stable for any logits.
+    """Weighted mean of every window, with a shift of the logits for each: for any logits, −∞ included.
 
-    A log-sum-exp composes axis by axis: along y each window keeps a mean and the log of its mass, and those
-    masses are the logits along x and over the kernel's boxes.
+    Axis by axis: along y every window has a maximum of its own, subtracted before `exp`; along x those maxima
+    are the logits. Only differences of logits are ever taken, and no logarithm. A shift changes no mean, so
+    the maxima carry no gradient.
     """
     (boxes, hd, h), (_, wd, w) = kernel.rows.shape, kernel.columns.shape
-    along_y = _log(kernel.rows).reshape(boxes * hd, h) + (logits + _log(mask)).T[:, None]  # [w, j·hd, h]
-    means = torch.softmax(along_y, dim=-1) @ features.transpose(0, 1)  # [w, j·hd, c]
-    means = means.view(w, boxes, hd, -1).permute(2, 1, 0, 3).reshape(hd, boxes * w, -1)
-    masses = torch.logsumexp(along_y, dim=-1).view(w, boxes, hd).permute(2, 1, 0).reshape(hd, 1, boxes * w)
-    along_x = masses + _log(kernel.columns).transpose(0, 1).reshape(wd, boxes * w)  # [hd, wd, j·w]
-    empty = torch.logsumexp(along_x, dim=-1, keepdim=True) < _LOG_OF_ZERO / 2
-    return torch.where(empty, 0.0, torch.softmax(along_x, dim=-1) @ means)
+    rows = kernel.rows.reshape(boxes * hd, h)
+    along_y, maxima = _exp_shifted((logits + (mask > 0).log()).T[:, None], rows)  # [w, j·hd, h]
+    values = torch.cat([features, torch.ones_like(logits)[..., None]], dim=-1) * mask[..., None]
+    sums = (along_y @ values.transpose(0, 1)).view(w, boxes, hd, -1).permute(2, 1, 0, 3)
+    sums = sums.reshape(hd, boxes * w, -1)
+    columns = kernel.columns.transpose(0, 1).reshape(wd, boxes * w)
+    maxima = maxima.view(w, boxes, hd).permute(2, 1, 0).reshape(hd, 1, boxes * w)
+    total = _exp_shifted(maxima, columns)[0] @ sums  # [hd, wd, c + 1]
+    return _divide(total[..., :-1], total[..., -1])
+
+
+def _exp_shifted(
+    logits: Float[Tensor, "b one_or_n a"], kernel: Float[Tensor, "n a"]
+) -> tuple[Float[Tensor, "b n a"], Float[Tensor, "b n"]]:
+    """kernel · exp(logits − their maximum where the kernel is not 0), and that maximum (−∞ for none)."""
+    inside = torch.where(kernel > 0, logits, -torch.inf)
+    maxima = inside.detach().amax(-1)
+    return kernel * torch.exp(inside - maxima.clamp(min=torch.finfo(maxima.dtype).min)[..., None]), maxima
 
 
 def apply_kernel(kernel: SeparableKernel, values: Float[Tensor, "h w c"]) -> Float[Tensor, "hd wd c"]:
@@ -265,7 +289,3 @@ def _weight_network(channels: int, hidden: int, generator: torch.Generator | Non
 def _divide(total: Float[Tensor, "hd wd c"], mass: Float[Tensor, "hd wd"]) -> Float[Tensor, "hd wd c"]:
     """total / mass, and 0 without gradient where there is no mass (and so no total)."""
     return total / torch.where(mass > 0, mass, 1.0)[..., None]
-
-
-def _log(weights: Tensor) -> Tensor:
-    return torch.where(weights > 0, weights.clamp(min=torch.finfo(weights.dtype).tiny).log(), _LOG_OF_ZERO)

@@ -75,7 +75,8 @@ class HashGrid(nn.Module):
         self.offsets: Tensor
         self.dense_resolutions: Tensor
         offsets = [sum(sizes[:level]) for level in range(levels)]
-        self.register_buffer("cells", torch.tensor([r - 2.0 for r in resolutions]), persistent=False)
+        # Integers: `.half()` and the like must not round them.
+        self.register_buffer("cells", torch.tensor([r - 2 for r in resolutions]), persistent=False)
         self.register_buffer("offsets", torch.tensor(offsets), persistent=False)
         dense = torch.tensor(resolutions[: self.dense_levels], dtype=torch.int64)
         self.register_buffer("dense_resolutions", dense, persistent=False)
@@ -83,8 +84,14 @@ class HashGrid(nn.Module):
     def forward(
         self, x: Float[Tensor, "n d"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> Float[Tensor, "n out"]:
-        """Interpolated features of every point; `level_weights` scales each level (see `coarse_to_fine`)."""
-        x = x.to(self.table.dtype).clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT)
+        """Interpolated features of every point; `level_weights` scales each level (see `coarse_to_fine`).
+
+        Features have the table's number type. Coordinates are computed in float32 at least: in 16 bits a
+        fine level would have no fractions left.
+        """
+        x = x.to(torch.promote_types(self.table.dtype, torch.float32)).clamp(
+            -COORDINATE_LIMIT, COORDINATE_LIMIT
+        )
         position = x.detach().T[:, None] * self.cells[:, None] + 0.5
         lower = position.floor()
         index = self._vertex_entries(lower.long())
@@ -138,7 +145,7 @@ class _Interpolate(torch.autograd.Function):
         # Points vary fastest in `index` and `fraction`, which suits elementwise work; in bags corners do.
         rows = _as_bags(index)
         axis_weights = torch.stack((1 - fraction, fraction), 1)
-        weights = _as_bags(_corner_weights(list(axis_weights), level_weights))
+        weights = _as_bags(_corner_weights(list(axis_weights), level_weights)).to(table.dtype)
         ctx.save_for_backward(table, rows, weights, axis_weights, cells, level_weights)
         features = F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
         return features.view(len(x), len(cells) * table.shape[1])
@@ -155,14 +162,14 @@ class _Interpolate(torch.autograd.Function):
             gather = _table_gradient_added if grad.is_cuda else _table_gradient_sorted
             grad_table = gather(len(table), rows, weights, grad_bags)
         if ctx.needs_input_grad[0]:
-            slope = cells[:, None].expand_as(axis_weights[0, 0])
+            slope = cells.to(axis_weights)[:, None].expand_as(axis_weights[0, 0])
             derivatives = []
             for axis in range(len(axis_weights)):
                 factors = list(axis_weights)
                 factors[axis] = torch.stack((-slope, slope))
-                slopes = _as_bags(_corner_weights(factors, level_weights))
+                slopes = _as_bags(_corner_weights(factors, level_weights)).to(table.dtype)
                 derivative = F.embedding_bag(rows, table, per_sample_weights=slopes, mode="sum")
-                derivatives.append((derivative * grad_bags).view(grad.shape).sum(1))
+                derivatives.append((derivative * grad_bags).view(grad.shape).sum(1, dtype=slope.dtype))
             grad_x = torch.stack(derivatives, 1)
         return grad_x, grad_table, None, None, None, None
 

@@ -14,9 +14,12 @@ from jaxtyping import Bool, Float, Int
 from pytorch_msssim import ssim
 from torch import Tensor
 
+from lang3dxl_ns.precision import in_full_precision
+
 _SSIM_WINDOW = 11
 
 
+@in_full_precision
 def rgb_loss(
     prediction: Float[Tensor, "h w 3"],
     target: Float[Tensor, "h w 3"],
@@ -38,6 +41,7 @@ def rgb_loss(
     return torch.lerp(colour, structure, ssim_weight)
 
 
+@in_full_precision
 def clip_loss(
     prediction: Float[Tensor, "hd wd c"],
     target: Float[Tensor, "hd wd c"],
@@ -47,10 +51,11 @@ def clip_loss(
     return _weighted_mean((prediction - target).abs(), weight)
 
 
+@in_full_precision
 def dense_loss(
     prediction: Float[Tensor, "h w d"],
     target: Float[Tensor, "hd wd d"],
-    weight: Bool[Tensor, "hd wd"] | Float[Tensor, "hd wd"] | None = None,
+    weight: Bool[Tensor, "hw ww"] | Float[Tensor, "hw ww"] | None = None,
     compare_at: Literal["auto", "target"] = "auto",
 ) -> Float[Tensor, ""]:
     """Mean absolute difference between decoded dense features and their target, on one grid.
@@ -59,7 +64,7 @@ def dense_loss(
     resizes the target instead, which needs no gradient and so costs a fraction, unless the target has less
     than half as many cells as the prediction: details that it doesn't show should not be pressed out of the
     prediction. The resize is bilinear and antialiased: it averages where it shrinks, and keeps positions
-    within a tenth of a cell. The weight belongs to the target and is resized with it.
+    within a tenth of a cell. The weight, of any size, is resized like the features.
     """
     at_prediction = compare_at == "auto" and prediction.numel() <= 2 * target.numel()
     rows, columns, _ = (prediction if at_prediction else target).shape
@@ -69,6 +74,7 @@ def dense_loss(
     return _weighted_mean((resize(prediction, grid) - resize(target, grid)).abs(), weight)
 
 
+@in_full_precision
 def region_variance_loss(
     features: Float[Tensor, "h w c"],
     labels: Int[Tensor, "h w"],

@@ -25,6 +25,9 @@ PARTS = (
 ELEMENTS = ("none", "window", "portal")
 CATEGORIES = ("windows", "portals", "domes", "towers", "spires", "minarets")
 
+SMALLEST_POSITIVE = 1e-3
+"""Share of a photo: less of a category than this (173 pixels of 480×360) nobody would have outlined."""
+
 BUILDING_PARTS = ("wall", "roof", "dome", "tower", "spire", "minaret", "column", "clutter")
 """The parts of the landmark itself; the rest is its surroundings."""
 

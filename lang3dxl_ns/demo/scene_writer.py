@@ -18,7 +18,7 @@ from PIL import Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lang3dxl_ns.demo.contact_sheet import contact_sheet
-from lang3dxl_ns.demo.labels import CATEGORIES, building_mask, category_masks
+from lang3dxl_ns.demo.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
 from lang3dxl_ns.demo.landmark import Landmark
 from lang3dxl_ns.demo.photography import Shot, View, random_photo_size, random_view, take_photo
 from lang3dxl_ns.demo.sparse_model import (
@@ -35,8 +35,6 @@ HELD_OUT_EVERY = 8
 """nerfstudio's interval split: of the photos sorted by name, 0, 8, 16 … are not trained on."""
 TRUTH_EVERY = 2
 """Every second photo has ground truth, the held-out ones among them."""
-SMALLEST_POSITIVE = 1e-4
-"""Share of a photo: less of a category than this (17 pixels of 480×360) nobody would have annotated."""
 OVERSAMPLING = 2
 """Rays per pixel and axis."""
 

@@ -16,7 +16,7 @@ import tyro
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
-from lang3dxl_ns.demo.labels import CATEGORIES, category_masks
+from lang3dxl_ns.demo.labels import CATEGORIES, SMALLEST_POSITIVE, category_masks
 from lang3dxl_ns.demo.views import (
     COLOUR,
     ELEMENT,
@@ -34,7 +34,6 @@ from lang3dxl_ns.query.relevancy import CANONICAL, relevancy
 
 CROP_SIDES = (32, 48, 68)
 """Pixels of a 480×360 view; chosen on validation landmarks."""
-_FEWEST_PIXELS = 100  # of the half-size map; a category with fewer is not a positive photo
 
 
 def teacher_precision(
@@ -59,7 +58,7 @@ def teacher_precision(
     scores = {}
     for name, score in zip(CATEGORIES, maps, strict=True):
         precision = average_precision(score, masks[name])
-        if precision is not None and masks[name].sum() >= _FEWEST_PIXELS:
+        if precision is not None and masks[name].mean() >= SMALLEST_POSITIVE:
             scores[name] = precision
     return scores
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from lang3dxl_ns.evaluation.holyscenes import GroundTruth, resize_map, score_maps
@@ -13,6 +14,8 @@ from lang3dxl_ns.preparation.encoders import ImageTextEncoder
 from lang3dxl_ns.query.relevancy import CANONICAL, relevancy, relevancy_of_codes
 
 Maps = dict[str, Float[Tensor, "h w"]]
+BLUR = 2.5
+"""Pixels at half the photo's size, by which the publication blurs relevancy maps."""
 
 
 class LanguageScorer:
@@ -32,35 +35,43 @@ class LanguageScorer:
         decode: Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]],
         codes: Float[Tensor, "H W code"],
         size: tuple[int, int],
-        keep: Bool[Tensor, "H W"] | None = None,
     ) -> Maps:
-        """Maps of rendered codes, at `size`; 0 outside `keep`, the foreground, where there is one."""
+        """Maps of rendered codes, at `size`."""
         maps = relevancy_of_codes(
             decode, codes, self._queries.to(codes.device), self._canonical.to(codes.device)
         )
-        return self._finished(resize_map(maps, size), keep)
+        return self._named(resize_map(maps, size))
 
-    def teacher_maps(
-        self,
-        target: Float[Tensor, "hd wd c"],
-        size: tuple[int, int],
-        keep: Bool[Tensor, "H W"] | None = None,
-    ) -> Maps:
+    def teacher_maps(self, target: Float[Tensor, "hd wd c"], size: tuple[int, int]) -> Maps:
         """Maps of a CLIP target, whose features are interpolated to `size` first, as in Lang3D-XL."""
         features = resize_map(target.permute(2, 0, 1), size).permute(1, 2, 0)
         maps = relevancy(features, self._queries.to(features.device), self._canonical.to(features.device))
-        return self._finished(maps, keep)
+        return self._named(maps)
 
     def scores(self, photo: str, maps: Maps, prefix: str = "") -> dict[str, float]:
         """`{prefix}ap_{category}` of every category that the photo shows and has a mask of."""
         size = next(iter(maps.values())).shape
         return score_maps(maps, self.truth.masks(photo, (size[0], size[1])), prefix)
 
-    def _finished(self, maps: Float[Tensor, "q h w"], keep: Bool[Tensor, "H W"] | None) -> Maps:
-        if keep is not None:
-            size = (maps.shape[1], maps.shape[2])
-            maps = maps * (resize_map(keep[None].to(maps), size) >= 0.5)
+    def _named(self, maps: Float[Tensor, "q h w"]) -> Maps:
         return dict(zip(self.truth.categories, maps, strict=True))
+
+
+def blurred(maps: Maps, sigma: float = BLUR) -> Maps:
+    """Every map under a Gaussian of `sigma` pixels."""
+    return {
+        name: torch.from_numpy(gaussian_filter(scores.cpu().numpy(), sigma)).to(scores.device)
+        for name, scores in maps.items()
+    }
+
+
+def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
+    """Every map, 0 outside the foreground `keep`, where there is one."""
+    if keep is None:
+        return maps
+    size = next(iter(maps.values())).shape
+    there = resize_map(keep[None].float(), (size[0], size[1]))[0] >= 0.5
+    return {name: scores * there for name, scores in maps.items()}
 
 
 def open_scorer(truth: GroundTruth, clip: str, device: torch.device | str) -> LanguageScorer:

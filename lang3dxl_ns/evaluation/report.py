@@ -138,12 +138,12 @@ def _measure_peak(setup: Callable[..., Callable[[], object]], args: Sequence[Any
         before = torch.cuda.memory_allocated()
         work()
         return torch.cuda.max_memory_allocated() - before
-    before = _host_peak(reset=True)
+    before = host_peak(reset=True)
     work()
-    return _host_peak() - before
+    return host_peak() - before
 
 
-def _host_peak(reset: bool = False) -> int:
+def host_peak(reset: bool = False) -> int:
     """Most memory (bytes) this process has held; `reset` first forgets any peak above what it holds now."""
     if sys.platform == "linux":
         # getrusage would count the parent's peak too: Linux carries it over into a new process.

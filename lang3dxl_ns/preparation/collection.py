@@ -18,6 +18,8 @@ from lang3dxl_ns.preparation.physical_scale import (
     relative_scales,
 )
 from lang3dxl_ns.preparation.prepare import PreparationConfig, PreparedTargets, prepare
+from lang3dxl_ns.preparation.progress import some
+from lang3dxl_ns.preparation.regions import RegionSource
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.presets import load_preset
 
@@ -29,6 +31,7 @@ def prepare_collection(
     cache_dir: Path,
     device: torch.device | str,
     log: Callable[[str], None] = print,
+    regions: RegionSource | None = None,
 ) -> PreparedTargets:
     """Make the missing targets of the photos in `cache_dir`; crops in the reconstruction's units.
 
@@ -42,19 +45,19 @@ def prepare_collection(
             )
         scales = relative_scales() if config.scale_range is None else relative_scales(7, *config.scale_range)
         log(f"crops of {_listed(scales)} of the photo's width")
-        return prepare(photos, None, config, scales, FeatureStore(cache_dir), device)
+        return prepare(photos, None, config, scales, FeatureStore(cache_dir), device, regions)
     sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
     if untracked:
         log(
             f"{len(untracked)} photos have no tracked points: their scale is that of the points in view, "
-            f"or the scene's median: {_some(untracked)}"
+            f"or the scene's median: {some(untracked)}"
         )
     chosen = _scale_range(config, reconstruction, sizes)
     scales = physical_scales(chosen.smallest, chosen.largest)
     log(f"{chosen.reason}; crop sides: {_listed(scales)} (--pipeline.datamanager.scale-range overrides)")
     # The reconstruction's sizes are per pixel of the model's photos; a file may be a resized copy.
     per_file_pixel = {p.name: sizes[p.name] * reconstruction.photos[p.name].width / p.width for p in photos}
-    return prepare(photos, per_file_pixel, config, scales, FeatureStore(cache_dir), device)
+    return prepare(photos, per_file_pixel, config, scales, FeatureStore(cache_dir), device, regions)
 
 
 def _scale_range(
@@ -77,7 +80,3 @@ def _scale_range(
 
 def _listed(values: Sequence[float]) -> str:
     return ", ".join(f"{value:.3g}" for value in values)
-
-
-def _some(names: Sequence[str], shown: int = 10) -> str:
-    return ", ".join(names[:shown]) + (", …" if len(names) > shown else "")

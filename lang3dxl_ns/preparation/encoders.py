@@ -24,7 +24,10 @@ from lang3dxl_ns.errors import UserError
 CLIP_OPTION = "--pipeline.datamanager.clip"
 DENSE_OPTION = "--pipeline.datamanager.dense"
 
-_BUILTIN_CLIP = Path(__file__).parents[1] / "demo" / "clip"
+BUILTIN = "builtin"
+"""Name of the small encoders that ship with this package."""
+_DEMO = Path(__file__).parents[1] / "demo"
+_BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
 _WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
@@ -43,19 +46,14 @@ class ModelFiles:
 
 def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     """A model's files: a local folder, a Hugging Face name (downloaded once), or "builtin", which is the CLIP
-    that ships with this package.
+    or dense encoder that ships with this package, according to the option.
 
     Raises UserError when there is no such folder, the model can't be downloaded, or files are missing.
     """
     name = str(name_or_dir)
     local = Path(name).expanduser()
-    if name == "builtin":
-        if not _BUILTIN_CLIP.is_dir():
-            raise UserError(
-                f"the built-in CLIP ships with a later version of lang3dxl-ns: give {option} a model name, "
-                "such as openai/clip-vit-base-patch32, or a folder"
-            )
-        folder = _BUILTIN_CLIP
+    if name == BUILTIN:
+        folder = _BUILTIN_FOLDERS[option]
     else:
         folder = local if local.is_dir() else _download(name, option)
     return ModelFiles(name, folder, _fingerprint(folder, option), option)
@@ -143,8 +141,15 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
     from transformers import CLIPImageProcessor, CLIPModel, CLIPTokenizer
 
     files = find_model(name_or_dir, CLIP_OPTION)
-    _check_model_type(files)
-    model = _load_weights(CLIPModel, files, device)
+    if files.name == BUILTIN:
+        _say_what_builtin_knows()
+    kind = model_type(files)
+    if kind != "clip":
+        raise UserError(
+            f"{files.name} is a {kind} model: {files.option} takes a CLIP in Hugging Face format, such as "
+            "openai/clip-vit-base-patch32"
+        )
+    model = load_weights(CLIPModel, files, device)
     if not _has(files.folder, "tokenizer.json") and not _has(files.folder, "vocab.json", "merges.txt"):
         # transformers would quietly make a tokenizer without words
         raise UserError(
@@ -167,7 +172,7 @@ def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, toke
     from transformers import AutoModel
 
     files = find_model(name_or_dir, DENSE_OPTION)
-    model = _load_weights(AutoModel, files, device)
+    model = load_weights(AutoModel, files, device)
     if not isinstance(getattr(model.config, "patch_size", None), int):
         raise UserError(
             f"{files.name} is a {model.config.model_type} model without patch tokens: give {files.option} a "
@@ -176,7 +181,18 @@ def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, toke
     return DenseEncoder(model, tokens, files.identity)
 
 
-def _load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
+@lru_cache(maxsize=1)  # once is enough
+def _say_what_builtin_knows() -> None:
+    from rich import get_console
+
+    get_console().print(
+        "The built-in CLIP knows the demo's landmarks and nothing else; for your photos name a real one: "
+        f"{CLIP_OPTION} openai/clip-vit-base-patch32 {DENSE_OPTION} facebook/dinov2-small",
+        soft_wrap=True,
+    )
+
+
+def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
     """The model, frozen and in float32. Weights that the file lacks are an error, not random numbers."""
     from safetensors import SafetensorError
 
@@ -202,18 +218,14 @@ def _load_weights(model_class: Any, files: ModelFiles, device: torch.device | st
     return model.to(device).eval().requires_grad_(False)
 
 
-def _check_model_type(files: ModelFiles) -> None:
+def model_type(files: ModelFiles) -> str:
+    """The kind of network that a model's configuration names ("clip"). Raises UserError without one."""
     from transformers import AutoConfig
 
     try:
-        found = AutoConfig.from_pretrained(files.folder, trust_remote_code=False).model_type
+        return AutoConfig.from_pretrained(files.folder, trust_remote_code=False).model_type
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{files.folder / 'config.json'} is not a model's configuration: {error}") from error
-    if found != "clip":
-        raise UserError(
-            f"{files.name} is a {found} model: {files.option} takes a CLIP in Hugging Face format, such as "
-            "openai/clip-vit-base-patch32"
-        )
 
 
 def _download(name: str, option: str) -> Path:

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
@@ -111,6 +111,24 @@ class Photo:
         size = scaled_size(self.width, self.height, scale)
         return torch.from_numpy(np.array(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST)))
 
+    def read_file(self, longer_side: int) -> UInt8[Tensor, "h w 3"]:
+        """The file as it lies on disk, lens and all, shrunk to at most `longer_side` pixels.
+
+        A mask drawn on this is one that `read_mask` understands. Raises UserError for an unreadable file.
+        """
+        image = _read_rgb(self.path, self.name)
+        image.thumbnail((longer_side, longer_side), Image.Resampling.BILINEAR)
+        return torch.from_numpy(np.array(image))
+
+    def undistort_labels(self, labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
+        """Labels drawn on the file, at any size, as `read` shows them: nearest, −1 where it shows nothing.
+
+        Labels must fit into 32 bits.
+        """
+        if not self._distorted:
+            return labels
+        return torch.from_numpy(self._undistort(labels.numpy().astype(np.int32), nearest=True, empty=-1))
+
     def content_hash(self) -> str:
         """Hash of the file's bytes: changes when the photo does. The camera and the mask are not in it."""
         with _readable(self.path, self.name):
@@ -120,8 +138,10 @@ class Photo:
     def _distorted(self) -> bool:
         return self.fisheye or any(self.distortion)
 
-    def _undistort(self, image: UInt8[Array, "h w *c"]) -> UInt8[Array, "h w *c"]:
-        """The pinhole's view of a file of any size, black where the camera saw nothing."""
+    def _undistort(
+        self, image: UInt8[Array, "h w *c"] | Int32[Array, "h w"], nearest: bool = False, empty: int = 0
+    ) -> Any:
+        """The pinhole's view of a file of any size, `empty` where the camera saw nothing."""
         import cv2
 
         height, width = image.shape[:2]
@@ -135,8 +155,9 @@ class Photo:
         columns, rows = module.initUndistortRectifyMap(
             pinhole, coefficients, np.eye(3), pinhole, (width, height), cv2.CV_32FC1
         )
-        view = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        view[~_seen(columns, rows)] = 0
+        blend = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+        view = cv2.remap(image, columns, rows, blend, borderMode=cv2.BORDER_REPLICATE)
+        view[~_seen(columns, rows)] = empty
         return view
 
 

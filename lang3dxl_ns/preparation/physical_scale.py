@@ -133,7 +133,7 @@ def pixel_size(
     ranges belong to; "paper" is the paper's text, 2 d tan θ with θ = arctan(W / f) / W; "exact" the pinhole's
     d / f. Width and height versions are averaged.
 
-    None when the photo has no tracked points or they lie on the camera. Method: Lang3D-XL, physical scale.
+    None when the photo has no tracked points in front of the camera. Method: Lang3D-XL, physical scale.
     """
     d = _subject_distance(photo, distance)
     if d is None:
@@ -174,7 +174,7 @@ def physical_scales(smallest: float, largest: float) -> list[float]:
         raise UserError(
             f"scale range {smallest}–{largest} is empty: give 0 < smallest ≤ largest, in world units"
         )
-    count = max(1, round(2 * math.log2(largest / smallest)))
+    count = max(1, round(2 * (math.log2(largest) - math.log2(smallest))))
     return np.geomspace(smallest, largest, count).tolist()
 
 
@@ -230,11 +230,15 @@ def _extent(points: Float[Array, "m 3"]) -> float:
 
 
 def _subject_distance(photo: PhotoGeometry, rule: DistanceRule) -> float | None:
-    """Distance from the camera to the middle of its tracked points; None without a usable one."""
-    points = photo.points
+    """Distance from the camera to the middle of its tracked points; None without a usable one.
+
+    A point behind the camera can't be seen: its track is wrong, and it doesn't count.
+    """
+    in_front = photo.points @ photo.camera_from_world[2, :3] + photo.camera_from_world[2, 3] > 0
+    points = photo.points[in_front]
     if rule == "mean-inner":
         size = np.array([photo.width, photo.height])
-        inner = (np.abs(photo.pixels / size - 0.5) < 0.5 - EDGE_MARGIN).all(axis=1)
+        inner = (np.abs(photo.pixels[in_front] / size - 0.5) < 0.5 - EDGE_MARGIN).all(axis=1)
         points = points[inner] if inner.any() else points
     if not len(points):
         return None

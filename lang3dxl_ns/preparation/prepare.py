@@ -1,4 +1,4 @@
-"""Makes and reads the targets of a scene: CLIP grids and dense features, one photo after the other.
+"""Makes and reads the targets of a scene: CLIP grids, dense features and regions, one photo after the other.
 
 Every entry carries the settings that made it. A second run makes only what is missing or was made with other
 settings, so a run that was stopped, at any moment, is simply started again.
@@ -6,15 +6,14 @@ settings, so a run that was stopped, at any moment, is simply started again.
 
 from __future__ import annotations
 
+import math
 import shutil
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.errors import UserError
@@ -29,14 +28,15 @@ from lang3dxl_ns.preparation.encoders import (
 )
 from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.preparation.physical_scale import AngleRule, DistanceRule, crop_sides
+from lang3dxl_ns.preparation.progress import progress, say, some
 from lang3dxl_ns.preparation.pyramid import build_clip_target, crop_centres
+from lang3dxl_ns.preparation.regions import RegionLevel, RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.store import FeatureStore
 
-CLIP, DENSE = "clip", "dense"
+CLIP, DENSE, REGIONS = "clip", "dense", "regions"
 
 _CROP_RULE = 1
 """Raised when the crops or their average change: entries made by an older rule are then made again."""
-_QUIET_S = 5.0
 _STD_FLOOR = 0.01
 
 
@@ -68,6 +68,23 @@ class PreparationConfig:
     disk and over four times the time."""
     crop_batch: int = 256
     """Crops encoded at once: more are faster on a GPU, and take more of its memory."""
+    foreground: str = "auto"
+    """Where photos count: "auto" (masks/ in the data folder, where there is one), "none" (everywhere), "text"
+    (where a model sees the prompts), or a folder of masks, white = keep, named like the photos."""
+    foreground_prompts: tuple[str, ...] = ("building",)
+    """What to keep with "text": all that any of the prompts names."""
+    foreground_model: str = "IDEA-Research/grounding-dino-tiny"
+    """What finds the prompts: a GroundingDINO, whose boxes `sam` fills, or a CLIPSeg, lighter and coarser
+    (CIDAS/clipseg-rd64-refined). A name or a folder."""
+    regions: str = "auto"
+    """Segments inside which features should agree: "auto" (regions/ in the data folder, where there is one),
+    "none", "sam", "felzenszwalb" (needs no weights), or a folder of label maps named like the photos: 16-bit
+    PNG, 0 = no region, or .npy, negative = no region."""
+    region_level: RegionLevel = "small"
+    """Which of SAM's masks a pixel belongs to where they overlap. Small, as in the paper."""
+    sam: str = "facebook/sam-vit-base"
+    """SAM for regions and for boxes: a name or a folder. The authors use facebook/sam-vit-huge, several times
+    as slow; label maps are too small to show much of the difference."""
 
 
 @dataclass
@@ -106,9 +123,15 @@ class FeatureStatistics:
 class TargetReader:
     """The prepared targets of a scene's photos, by photo name; nothing is loaded before it is touched."""
 
-    def __init__(self, store: FeatureStore, names: Sequence[str], with_dense: bool = True) -> None:
+    def __init__(
+        self,
+        store: FeatureStore,
+        names: Sequence[str],
+        with_dense: bool = True,
+        with_regions: Collection[str] = (),
+    ) -> None:
         self.names = list(names)
-        self._store, self._with_dense = store, with_dense
+        self._store, self._with_dense, self._with_regions = store, with_dense, frozenset(with_regions)
         self.clip_dim: int = store.shapes(CLIP, self.names[0])["features"][-1]
         self.dense_dim: int = store.shapes(DENSE, self.names[0])["features"][-1] if with_dense else 0
 
@@ -123,6 +146,10 @@ class TargetReader:
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
         """The dense features of the squashed photo, float16; None when prepared without."""
         return self._store.read(DENSE, name)["features"] if self._with_dense else None
+
+    def regions(self, name: str) -> Int[Tensor, "h w"] | None:
+        """Region labels of the photo, −1 for none; None (and nothing is read) for a photo without regions."""
+        return self._store.read(REGIONS, name)["labels"] if name in self._with_regions else None
 
     def check(self, encoder: ImageTextEncoder) -> None:
         """Raises UserError when a photo's target is missing or comes from another CLIP than `encoder`."""
@@ -170,10 +197,12 @@ class _Task:
     scales: list[float]
     clip: dict[str, Any] | None
     dense: dict[str, Any] | None
+    regions: dict[str, Any] | None
+    has_regions: bool
 
     @property
     def is_done(self) -> bool:
-        return self.clip is None and self.dense is None
+        return self.clip is None and self.dense is None and self.regions is None
 
 
 def prepare(
@@ -183,27 +212,31 @@ def prepare(
     scales: Sequence[float],
     store: FeatureStore,
     device: torch.device | str,
+    regions: RegionSource | None = None,
 ) -> PreparedTargets:
     """Makes the missing targets of all photos and says beforehand how many, and how much disk they take.
 
     pixel_sizes: world units per pixel *of the photo as it is read* (its `width`), by photo name; None for
     relative scales. scales: crop sides in world units, or in photo widths without pixel sizes.
+    regions: where label maps come from; None for none.
 
     Photos that can't be read are left out with a warning. Raises UserError when none can be read, a model
     can't be loaded, or the disk is too small.
     """
     left_out: dict[str, str] = {}
-    tasks = _plan(photos, pixel_sizes, config, scales, store, left_out)
+    tasks = _plan(photos, pixel_sizes, config, scales, store, regions, left_out)
     missing = [task for task in tasks if not task.is_done]
     if missing:
-        _make(missing, len(tasks), config, store, device, left_out)
+        _make(missing, len(tasks), config, store, device, regions, left_out)
     names = [task.photo.name for task in tasks if task.photo.name not in left_out]
     if not names:
         raise UserError("no photo can be prepared: " + ("; ".join(left_out.values()) or "the scene has none"))
     if left_out:
-        _say(f"left out {len(left_out)} of {len(photos)} photos:", *(f"  {why}" for why in left_out.values()))
+        say(f"left out {len(left_out)} of {len(photos)} photos:", *(f"  {why}" for why in left_out.values()))
     encoded = sum(task.photo.name not in left_out for task in missing)
-    return PreparedTargets(TargetReader(store, names, config.dense != "none"), left_out, encoded)
+    with_regions = [task.photo.name for task in tasks if task.has_regions]
+    reader = TargetReader(store, names, config.dense != "none", with_regions)
+    return PreparedTargets(reader, left_out, encoded)
 
 
 def _plan(
@@ -212,13 +245,14 @@ def _plan(
     config: PreparationConfig,
     scales: Sequence[float],
     store: FeatureStore,
+    regions: RegionSource | None,
     left_out: dict[str, str],
 ) -> list[_Task]:
     """A task per photo; photos whose file can't be read go to `left_out`."""
     clip_model = find_model(config.clip, CLIP_OPTION).identity
     dense_model = None if config.dense == "none" else find_model(config.dense, DENSE_OPTION).identity
     tasks = []
-    with _progress("checking photos", len(photos)) as advance:
+    with progress("checking photos", len(photos)) as advance:
         for photo in photos:
             advance()
             try:
@@ -230,12 +264,18 @@ def _plan(
             sides, sizes = crop_sides(scales, pixel_size, photo.width)
             clip = {**source, "encoder": clip_model, "crop_sides": sides, "rule": _CROP_RULE}
             dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens}
-            task = _Task(photo, sides, sizes, clip=None, dense=None)
+            labels = None if regions is None else regions.settings(photo)
+            task = _Task(photo, sides, sizes, None, None, None, has_regions=labels is not None)
             if not store.is_current(CLIP, photo.name, clip):
                 task.clip = clip
             if dense_model and not store.is_current(DENSE, photo.name, dense):
                 task.dense = dense
+            if labels is not None and not store.is_current(REGIONS, photo.name, {**source, **labels}):
+                task.regions = {**source, **labels}
             tasks.append(task)
+    without = [task.photo.name for task in tasks if not task.has_regions]
+    if regions is not None and without:
+        say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
     return tasks
 
 
@@ -252,6 +292,7 @@ def _make(
     config: PreparationConfig,
     store: FeatureStore,
     device: torch.device | str,
+    regions: RegionSource | None,
     left_out: dict[str, str],
 ) -> None:
     """Loads the models that are needed and writes the missing entries, photo by photo."""
@@ -260,14 +301,14 @@ def _make(
     dense = load_dense_encoder(config.dense, device, config.dense_tokens) if with_dense else None
     store.remove_leftovers()
     _announce(missing, photos, _bytes_needed(missing, clip, dense), store)
-    with _progress("encoding photos", len(missing)) as advance:
+    with progress("encoding photos", len(missing)) as advance:
         for task in missing:
             try:
-                image = task.photo.read()  # once for both kinds
+                image = task.photo.read()  # once for all kinds
             except UserError as error:
                 left_out[task.photo.name] = str(error)
             else:
-                _encode(task, image.to(device), clip, dense, config.crop_batch, store)
+                _encode(task, image.to(device), clip, dense, regions, config.crop_batch, store)
             advance()
 
 
@@ -276,6 +317,7 @@ def _encode(
     image: Float[Tensor, "h w 3"],
     clip: ImageTextEncoder | None,
     dense: DenseEncoder | None,
+    regions: RegionSource | None,
     crop_batch: int,
     store: FeatureStore,
 ) -> None:
@@ -287,6 +329,9 @@ def _encode(
         store.write(CLIP, task.photo.name, tensors, task.clip)
     if task.dense and dense:
         store.write(DENSE, task.photo.name, {"features": dense.encode(image)}, task.dense)
+    if task.regions and regions:
+        labels = stored_labels(regions.labels(task.photo, image))
+        store.write(REGIONS, task.photo.name, {"labels": labels}, task.regions)
 
 
 def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: DenseEncoder | None) -> int:
@@ -300,6 +345,8 @@ def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: 
             total += 2 * rows * columns * (clip.dim + 1)
         if task.dense and dense:
             total += 2 * dense.tokens**2 * dense.dim
+        if task.regions:
+            total += 2 * math.prod(label_size(task.photo.height, task.photo.width))
     return total
 
 
@@ -313,30 +360,10 @@ def _announce(missing: list[_Task], photos: int, needed: int, store: FeatureStor
             f"{_gigabytes(free)} are free: free some space, or use a larger smallest crop "
             f"(scale range) or fewer dense tokens"
         )
-    _say(
+    say(
         f"preparing {len(missing)} photos ({photos - len(missing)} of {photos} are ready): "
         f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free"
     )
-
-
-@contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A function to call for each of `total`; after five seconds it shows a bar and the time left."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    start = time.monotonic()
-    bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    shown = bar.add_task(what, total=total)
-
-    def advance() -> None:
-        bar.advance(shown)
-        if time.monotonic() - start > _QUIET_S:
-            bar.start()  # does nothing the second time
-
-    try:
-        yield advance
-    finally:
-        bar.stop()
 
 
 def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:
@@ -357,10 +384,3 @@ def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:
 
 def _gigabytes(size: int) -> str:
     return f"{size / 1e9:.2f} GB"
-
-
-def _say(*lines: str) -> None:
-    from rich import get_console
-
-    for line in lines:
-        get_console().print(line, markup=False, highlight=False, soft_wrap=True)

@@ -53,13 +53,17 @@ class FeatureStore:
 
         stored = {key: _compact(tensor, f"{key} of {name} ({kind})") for key, tensor in tensors.items()}
         content = save(stored, metadata={"settings": _canonical(settings)})
+        self.write_bytes(self.path(kind, name), content, f"{name} ({kind})")
+
+    def write_bytes(self, path: Path, content: bytes, what: str) -> None:
+        """Writes a file of the store, atomically. Raises UserError when the disk is full."""
         try:
-            _write_atomically(self.path(kind, name), content)
+            _write_atomically(path, content)
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             raise UserError(
-                f"no space left in {self.root} while writing {name} ({kind}): free some space and run the "
+                f"no space left in {self.root} while writing {what}: free some space and run the "
                 "same command again, what was written before is kept"
             ) from error
 

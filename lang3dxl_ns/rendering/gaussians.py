@@ -9,6 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+MAX_LOG_SCALE = 60.0
+"""Clamp logarithms of scales to this before `exp`: an infinite scale has the gradient 0 · ∞ = NaN."""
+
 
 @dataclass
 class Gaussians:
@@ -28,6 +31,10 @@ class Gaussians:
         return Gaussians(
             self.means.detach(), self.quats.detach(), self.scales.detach(), self.opacities.detach()
         )
+
+    def moved(self, by: Float[Tensor, "3"]) -> Gaussians:
+        """The same Gaussians, their centres shifted."""
+        return Gaussians(self.means + by, self.quats, self.scales, self.opacities)
 
     def without_broken(self) -> Gaussians:
         """Those with a NaN or infinite value become transparent and get no gradient; the rest stay."""
@@ -54,6 +61,19 @@ class Camera:
     """Pixels; origin at the top-left corner of the top-left pixel, so pixel centres lie at +0.5."""
     width: int
     height: int
+
+    def at_origin(self, like: Tensor) -> tuple[Camera, Float[Tensor, "3"]]:
+        """The camera in a world whose origin is the camera's own place (rounded), and that place.
+
+        Far from the origin (map coordinates are millions) R·x + t is a small difference of large numbers.
+        R·(x − place) + (R·place + t) is the same without them, if the bracket that belongs to the camera is
+        computed in float64. Type and device are those of `like`.
+        """
+        view = self.view_matrix.to(like.device, torch.float64)
+        place = -(view[:3, :3].T @ view[:3, 3]).detach().to(like.dtype)
+        shift = torch.eye(4).to(view)
+        shift[:3, 3] = place
+        return Camera((view @ shift).to(like.dtype), self.intrinsics, self.width, self.height), place
 
 
 @dataclass

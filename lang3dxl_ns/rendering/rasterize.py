@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.precision import in_full_precision
 from lang3dxl_ns.rendering.compositing import composite
 from lang3dxl_ns.rendering.gaussians import Camera, Gaussians, Rendering
 from lang3dxl_ns.rendering.gsplat_backend import rasterize_with_gsplat
@@ -17,6 +18,7 @@ from lang3dxl_ns.rendering.tile_plan import ALPHA_MIN
 Backend = Literal["auto", "torch", "gsplat"]
 
 
+@in_full_precision
 def rasterize(
     gaussians: Gaussians,
     camera: Camera,
@@ -60,8 +62,9 @@ def rasterize(
         backend = "gsplat" if gaussians.means.is_cuda else "torch"
     # gsplat's kernels can't be launched over nothing.
     render = rasterize_with_gsplat if backend == "gsplat" and len(channels) else _rasterize_with_torch
+    camera, place = camera.at_origin(gaussians.means)
     return render(
-        gaussians.without_broken(), camera, channels, background,
+        gaussians.without_broken().moved(-place), camera, channels, background,
         features=features, detach_features=detach_features, render_depth=render_depth,
         antialiased=antialiased, absgrad=absgrad, near=near, eps2d=eps2d,
     )  # fmt: skip

@@ -29,17 +29,18 @@ def rasterize_reference(
     eps2d: float = 0.3,
 ) -> Rendering:
     """As `rasterize`, in time proportional to Gaussians × pixels; all values finite, `info` stays empty."""
-    means2d, covariances, depths = project_reference(gaussians, camera)
-    blurred = covariances + eps2d * torch.eye(2).to(covariances)
+    means2d, axes, depths = project_reference(gaussians, camera)
+    whitening = whitening_reference(axes, eps2d)
     opacities = gaussians.opacities
     if antialiased:
-        opacities = opacities * torch.sqrt(torch.linalg.det(covariances) / torch.linalg.det(blurred))
-    order = torch.argsort(depths)
+        sharp = torch.sqrt(torch.linalg.det(axes @ axes.mT))
+        opacities = opacities * sharp * torch.linalg.det(whitening).abs()
+    order = torch.argsort(depths, stable=True)
     order = order[depths[order] > near]
     attached = torch.cat([channels, torch.ones_like(depths)[:, None], depths[:, None]], dim=1)
     detached = channels[:, :0] if features is None else features
     maps, detached_maps = composite_reference(
-        means2d[order], torch.linalg.inv(blurred)[order], opacities[order], attached[order], detached[order],
+        means2d[order], whitening[order], opacities[order], attached[order], detached[order],
         camera.width, camera.height, detach=detach_features,
     )  # fmt: skip
 
@@ -52,13 +53,13 @@ def rasterize_reference(
 
 def project_reference(
     gaussians: Gaussians, camera: Camera
-) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, " n"]]:
-    """Pixel centres, screen covariances (pixels²) and depths by the textbook's matrices."""
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+    """Pixel centres, axes A with screen covariance A Aᵀ (pixels), and depths by the textbook's matrices."""
     q = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
     identity = torch.eye(3).to(q).expand(len(q), 3, 3)
     cross = torch.linalg.cross(q[:, None, 1:].expand(-1, 3, 3), identity).mT
     rotations = identity + 2 * q[:, :1, None] * cross + 2 * cross @ cross  # Rodrigues
-    covariances = rotations @ torch.diag_embed(gaussians.scales**2) @ rotations.mT
+    axes = rotations @ torch.diag_embed(gaussians.scales)
 
     view_rotation, translation = camera.view_matrix[:3, :3], camera.view_matrix[:3, 3]
     points = gaussians.means @ view_rotation.T + translation
@@ -73,12 +74,23 @@ def project_reference(
     slopes = slopes.clamp(-centre / focal - margin, (size - centre) / focal + margin)
     jacobian = torch.cat([torch.diag(focal).expand(len(q), 2, 2), -(focal * slopes)[:, :, None]], dim=2)
     to_screen = jacobian / depths[:, None, None] @ view_rotation
-    return means2d, to_screen @ covariances @ to_screen.mT, depths
+    return means2d, to_screen @ axes, depths
+
+
+def whitening_reference(axes: Float[Tensor, "n 2 3"], eps2d: float) -> Float[Tensor, "n 2 2"]:
+    """W with W Wᵀ the inverse of the blurred covariance A Aᵀ + ε.
+
+    By QR, which never squares the axes: of a needle a million pixels long the covariance itself has too many
+    digits for float64.
+    """
+    blur = eps2d**0.5 * torch.eye(2).to(axes).expand(len(axes), 2, 2)
+    _, triangle = torch.linalg.qr(torch.cat([axes.mT, blur], dim=1))
+    return torch.linalg.inv(triangle)
 
 
 def composite_reference(
     means2d: Float[Tensor, "n 2"],
-    conics: Float[Tensor, "n 2 2"],
+    whitening: Float[Tensor, "n 2 2"],
     opacities: Float[Tensor, " n"],
     attached: Float[Tensor, "n c"],
     detached: Float[Tensor, "n d"],
@@ -102,8 +114,8 @@ def composite_reference(
     for block in pixels.split(PIXELS_AT_A_TIME):
         # Leaving out what is skipped in every pixel of the block changes nothing and saves the memory.
         with torch.no_grad():
-            used = (pixel_alphas(block, means2d, conics, opacities) > 0).any(0)
-        splats = [value[used] for value in (means2d, conics, opacities, attached, detached)]
+            used = (pixel_alphas(block, means2d, whitening, opacities) > 0).any(0)
+        splats = [value[used] for value in (means2d, whitening, opacities, attached, detached)]
         maps.append(checkpoint(block_maps, block, *splats, use_reentrant=False))
     first, second = (torch.cat(parts) for parts in zip(*maps, strict=True))
     return first.view(height, width, -1), second.view(height, width, second.shape[1])
@@ -112,11 +124,11 @@ def composite_reference(
 def pixel_weights(
     pixels: Float[Tensor, "p 2"],
     means2d: Float[Tensor, "n 2"],
-    conics: Float[Tensor, "n 2 2"],
+    whitening: Float[Tensor, "n 2 2"],
     opacities: Float[Tensor, " n"],
 ) -> Float[Tensor, "p n"]:
     """Alpha × transmittance; 0 from the Gaussian on that would take the transmittance to 1e-4 or below."""
-    alphas = pixel_alphas(pixels, means2d, conics, opacities)
+    alphas = pixel_alphas(pixels, means2d, whitening, opacities)
     after = torch.cumprod(1 - alphas, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     return torch.where(after > 1e-4, alphas * before, 0.0)
@@ -125,11 +137,11 @@ def pixel_weights(
 def pixel_alphas(
     pixels: Float[Tensor, "p 2"],
     means2d: Float[Tensor, "n 2"],
-    conics: Float[Tensor, "n 2 2"],
+    whitening: Float[Tensor, "n 2 2"],
     opacities: Float[Tensor, " n"],
 ) -> Float[Tensor, "p n"]:
     """Opacity × Gaussian, at most 0.999, 0 below 1/255."""
     x, y = pixels[:, :1] - means2d[:, 0], pixels[:, 1:] - means2d[:, 1]
-    xx, xy, yy = conics[:, 0, 0], conics[:, 0, 1], conics[:, 1, 1]
-    alphas = opacities * torch.exp(-0.5 * (xx * x * x + 2 * xy * x * y + yy * y * y))
+    first, second = (x * column[:, 0] + y * column[:, 1] for column in whitening.unbind(2))
+    alphas = opacities * torch.exp(-0.5 * (first.square() + second.square()))
     return torch.where(alphas >= 1 / 255, alphas.clamp_max(0.999), 0.0)

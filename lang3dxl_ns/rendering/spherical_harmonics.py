@@ -9,6 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.precision import in_full_precision
+
 _BAND_0 = math.sqrt(1 / (4 * math.pi))
 _BAND_1 = math.sqrt(3 / (4 * math.pi))
 _BAND_2 = math.sqrt(15 / (4 * math.pi))
@@ -47,6 +49,7 @@ def _basis(degree: int, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"
     return torch.stack(columns, dim=1)
 
 
+@in_full_precision
 def spherical_harmonics(
     degree: int,
     directions: Float[Tensor, "n 3"],

@@ -165,6 +165,15 @@ def test_dense_weights_choose_cells_of_the_target():
     assert dense_loss(prediction, target, weight, "target").item() == pytest.approx(1)
 
 
+def test_dense_weights_may_have_the_size_of_the_prediction():
+    prediction, target = torch.zeros(10, 14, 2), torch.zeros(12, 12, 2)
+    target[:, 8:] = 1
+    mask = torch.zeros(10, 14, dtype=torch.bool)
+    mask[:, 12:] = True
+    assert dense_loss(prediction, target, mask).item() == pytest.approx(1)
+    assert dense_loss(prediction, target, mask, "target").item() == pytest.approx(1)
+
+
 # ------------------------------------------------------------------ regions
 
 

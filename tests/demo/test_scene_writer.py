@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 
 from lang3dxl_ns.demo.contact_sheet import contact_sheet
-from lang3dxl_ns.demo.labels import PART, building_mask, category_masks
+from lang3dxl_ns.demo.labels import PART, SMALLEST_POSITIVE, building_mask, category_masks
 from lang3dxl_ns.demo.landmark import Landmark
 from lang3dxl_ns.demo.photography import take_photo
-from lang3dxl_ns.demo.scene_writer import SMALLEST_POSITIVE, DemoScene, photo_view, write_scene
+from lang3dxl_ns.demo.scene_writer import DemoScene, photo_view, write_scene
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.preparation.physical_scale import read_reconstruction
 

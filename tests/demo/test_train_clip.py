@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from transformers import CLIPModel
 
 from lang3dxl_ns.demo import train_dense
 from lang3dxl_ns.demo.captions import ADJECTIVES, CANONICAL, CLASS, GENERIC, Caption
@@ -152,20 +153,16 @@ def test_a_dense_encoder_made_from_the_clip_reads_photos_at_any_grid(cache, trai
         assert features.flatten(0, 1).std(0).min() > 0
 
 
-@pytest.fixture(scope="module")
-def shipped():
-    folder = encoders._BUILTIN_CLIP
-    if not folder.is_dir():
-        pytest.skip("no small CLIP is shipped")
-    return folder
-
-
-def test_the_shipped_model_is_small(shipped):
-    assert sum(path.stat().st_size for path in shipped.iterdir()) <= 8e6
+def test_the_shipped_models_are_small_and_whole():
+    clip = encoders.find_model("builtin", encoders.CLIP_OPTION).folder
+    dense = encoders.find_model("builtin", encoders.DENSE_OPTION).folder
+    assert sum(path.stat().st_size for path in clip.iterdir()) <= 8e6
+    assert sum(path.stat().st_size for path in dense.iterdir()) <= 8e6
+    assert CLIPModel.from_pretrained(clip).config.vision_config.image_size <= 64
 
 
 @pytest.mark.slow
-def test_the_shipped_model_finds_what_it_is_asked_for_on_a_landmark_it_has_never_seen(shipped, tmp_path):
+def test_the_shipped_model_finds_what_it_is_asked_for_on_a_landmark_it_has_never_seen(tmp_path):
     views = [np.load(render_landmark(tmp_path, seed, 1))[0] for seed in (0, 1)]
     score = score_teacher(load_image_text_encoder("builtin", "cpu"), views)
     chance = np.mean([[mask.mean() for mask in category_masks(view[3], view[4]).values()] for view in views])

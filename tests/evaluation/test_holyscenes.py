@@ -13,7 +13,7 @@ from lang3dxl_ns.evaluation.holyscenes import (
     score_maps,
     scoring_size,
 )
-from lang3dxl_ns.evaluation.language import LanguageScorer
+from lang3dxl_ns.evaluation.language import LanguageScorer, blurred, inside
 
 
 def write_mask(folder, category, number, mask, quality=75):
@@ -99,8 +99,13 @@ def test_field_and_teacher_are_scored_by_the_same_rules_and_the_foreground_cuts_
     assert scorer.scores("0001.jpg", field) == {"ap_domes": 1.0}
     assert scorer.scores("0001.jpg", teacher, "teacher_") == {"teacher_ap_domes": 1.0}
     keep = torch.zeros(40, 60, dtype=torch.bool)
-    for maps in (
-        scorer.field_maps(lambda f: f, features, size, keep),
-        scorer.teacher_maps(features, size, keep),
-    ):
-        assert not maps["domes"].any()
+    assert not inside(field, keep)["domes"].any()
+    assert inside(field, ~keep)["domes"].equal(field["domes"])
+
+
+def test_the_blur_keeps_the_mean_of_a_map_and_takes_single_pixels_out():
+    maps = {"domes": torch.full((40, 60), 0.5)}
+    maps["domes"][20, 30] = 1.0
+    smooth = blurred(maps)["domes"]
+    torch.testing.assert_close(smooth.mean(), maps["domes"].mean())
+    assert smooth.max() < 0.52

@@ -153,14 +153,15 @@ def test_a_plain_vit_is_read_at_other_grids_than_its_own(tmp_path):
     )
 
 
-def test_the_builtin_model_is_announced_for_later_and_used_once_it_is_there(
-    clip, clip_folder, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(encoders, "_BUILTIN_CLIP", tmp_path / "demo" / "clip")
-    with pytest.raises(UserError, match="later version"):
-        load_image_text_encoder("builtin", "cpu")
-    shutil.copytree(clip_folder, tmp_path / "demo" / "clip")
-    assert load_image_text_encoder("builtin", "cpu").identity == clip.identity
+def test_the_builtin_models_say_once_what_they_know(capsys):
+    encoders._say_what_builtin_knows.cache_clear()
+    encoder = load_image_text_encoder("builtin", "cpu")
+    assert encoder.encode_texts(["dome", "rose windows"]).shape == (2, encoder.dim)
+    assert load_dense_encoder("builtin", "cpu", tokens=8).encode(torch.rand(30, 40, 3)).shape[:2] == (8, 8)
+    load_image_text_encoder("builtin", "cpu")
+    said = capsys.readouterr().out
+    assert said.count("knows the demo's landmarks and nothing else") == 1
+    assert "openai/clip-vit-base-patch32" in said
 
 
 def test_an_absent_model_is_an_error_that_names_it_and_the_remedy(tmp_path, monkeypatch):

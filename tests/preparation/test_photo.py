@@ -290,3 +290,28 @@ def test_the_mask_is_undistorted_with_the_photo(tmp_path):
     mask, pixels = photo.read_mask(), photo.read()[..., 0]
     assert (mask != (pixels > 0.5)).float().mean() < 0.005
     assert not torch.equal(mask, torch.from_numpy(picture > 0))
+
+
+def test_the_file_is_read_as_it_lies_there_at_most_so_large(photo):
+    distorted = replace(photo, distortion=(0.3, 0.0, 0.0, 0.0))
+    assert torch.equal(distorted.read_file(40), photo.read_uint8())
+    assert distorted.read_file(20).shape == (15, 20, 3)
+    assert distorted.read_file(1000).shape == (30, 40, 3)
+
+
+def test_labels_are_undistorted_with_the_photo_and_never_mixed(tmp_path):
+    """A dot of label 7 on the file ends up where the photo's own bright dot does."""
+    picture = np.zeros((90, 120, 3), dtype=np.uint8)
+    picture[20:26, 30:36] = 255
+    Image.fromarray(picture).save(tmp_path / "a.png")
+    photo = make_photo(tmp_path / "a.png", 120, 90, distortion=(0.4, 0.0, 0.0, 0.0))
+    labels = torch.where(torch.from_numpy(picture[..., 0]) > 0, 70_000, 3)
+    seen = photo.undistort_labels(labels)
+    assert set(seen.unique().tolist()) == {-1, 3, 70_000}
+    assert torch.equal(seen < 0, ~photo.read_mask())
+    bright = photo.read()[..., 0] > 0.5
+    assert ((seen == 70_000) != bright).float().mean() < 0.005
+    assert not torch.equal(seen == 70_000, labels == 70_000)
+    assert photo.undistort_labels(labels[::2, ::2]).shape == (45, 60)  # of any size
+    straight = replace(photo, distortion=())
+    assert torch.equal(straight.undistort_labels(labels), labels)

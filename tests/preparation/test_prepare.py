@@ -16,10 +16,12 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.preparation import prepare as module
+from lang3dxl_ns.preparation import progress
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
 from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.preparation.prepare import PreparationConfig, TargetReader, prepare
 from lang3dxl_ns.preparation.pyramid import build_clip_target
+from lang3dxl_ns.preparation.regions import FelzenszwalbRegions, FolderRegions, stored_labels
 from lang3dxl_ns.preparation.store import FeatureStore
 
 SCALES = [0.4, 0.8]  # of the photo's width
@@ -69,6 +71,7 @@ def calls(monkeypatch):
     count(module, "build_clip_target", "clip")
     count(DenseEncoder, "encode", "dense")
     count(Photo, "read", "read")
+    count(FelzenszwalbRegions, "labels", "regions")
     count(module, "load_image_text_encoder", "clip loaded")
     count(module, "load_dense_encoder", "dense loaded")
     return counts
@@ -82,8 +85,8 @@ def make_photo(folder, name, seed, size=(100, 80)):
     return Photo(name, path, None, *size, fx=90.0, fy=90.0, cx=size[0] / 2, cy=size[1] / 2)
 
 
-def run(photos, config, store, scales=SCALES, pixel_sizes=None):
-    return prepare(photos, pixel_sizes, config, scales, store, "cpu")
+def run(photos, config, store, scales=SCALES, pixel_sizes=None, regions=None):
+    return prepare(photos, pixel_sizes, config, scales, store, "cpu", regions)
 
 
 def entries(store):
@@ -215,10 +218,9 @@ def test_no_readable_photo_at_all_is_a_users_error(photos, config, store):
 def test_the_announced_size_is_that_of_the_stored_numbers(photos, config, store, capsys, monkeypatch):
     needed = []
     monkeypatch.setattr(module, "_gigabytes", lambda size: needed.append(size) or f"{size} bytes")
-    run(photos, config, store)
-    payload = [
-        tensor for name in NAMES for kind in ("clip", "dense") for tensor in store.read(kind, name).values()
-    ]
+    run(photos, config, store, regions=FelzenszwalbRegions())
+    kinds = ("clip", "dense", "regions")
+    payload = [tensor for name in NAMES for kind in kinds for tensor in store.read(kind, name).values()]
     assert needed[0] == sum(tensor.nbytes for tensor in payload)
     assert f"preparing 3 photos (0 of 3 are ready): {needed[0]} bytes" in capsys.readouterr().out
 
@@ -257,6 +259,68 @@ def test_without_dense_features_no_dense_entry_is_made_or_read(photos, config, s
     assert reader.dense_dim == 0
     assert not (store.root / "dense").exists()
     assert reader.feature_statistics().dense is None
+
+
+def test_regions_are_read_as_their_source_made_them(photos, config, store):
+    source = FelzenszwalbRegions()
+    reader = run(photos, config, store, regions=source).reader
+    for photo in photos:
+        expected = stored_labels(source.labels(photo, photo.read()))
+        assert torch.equal(reader.regions(photo.name), expected)
+        assert expected.max() > 0
+
+
+def test_without_regions_none_are_made_or_read(photos, config, store, calls, monkeypatch):
+    run(photos, config, store, regions=FelzenszwalbRegions())
+    read = []
+    original = FeatureStore.read
+    monkeypatch.setattr(FeatureStore, "read", lambda *args: read.append(args[1]) or original(*args))
+    reader = run(photos, config, store).reader  # what an earlier run made is there, and left alone
+    assert reader.regions(NAMES[0]) is None
+    assert read == []
+
+
+def test_changed_regions_make_only_regions(photos, config, store, calls, monkeypatch):
+    run(photos, config, store)
+    calls.clear()
+    run(photos, config, store, regions=FelzenszwalbRegions())
+    assert calls == {"regions": 3, "read": 3}
+    calls.clear()
+    assert run(photos, config, store, regions=FelzenszwalbRegions()).encoded == 0
+    settings = FelzenszwalbRegions.settings
+    monkeypatch.setattr(
+        FelzenszwalbRegions, "settings", lambda self, photo: {**settings(self, photo), "scale": 3}
+    )
+    run(photos, config, store, regions=FelzenszwalbRegions())
+    assert calls == {"regions": 3, "read": 3}
+
+
+def test_interrupted_regions_go_on_where_they_stopped(photos, config, store, calls, monkeypatch):
+    write = FeatureStore.write
+
+    def interrupted(self, kind, name, *rest):
+        if (kind, name) == ("regions", NAMES[1]):
+            raise KeyboardInterrupt
+        write(self, kind, name, *rest)
+
+    monkeypatch.setattr(FeatureStore, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(photos, config, store, regions=FelzenszwalbRegions())
+    monkeypatch.setattr(FeatureStore, "write", write)
+    calls.clear()
+    run(photos, config, store, regions=FelzenszwalbRegions())
+    assert (calls["clip"], calls["dense"], calls["regions"]) == (1, 1, 2)
+
+
+def test_a_photo_without_a_label_map_has_no_regions_and_is_named(photos, config, store, tmp_path, capsys):
+    folder = tmp_path / "regions" / "north"
+    folder.mkdir(parents=True)
+    for name in ("a", "b"):
+        np.save(folder / f"{name}.npy", np.arange(6).reshape(2, 3))
+    reader = run(photos, config, store, regions=FolderRegions(tmp_path / "regions")).reader
+    assert torch.equal(reader.regions(NAMES[0]), torch.arange(6).reshape(2, 3).short())
+    assert reader.regions(NAMES[2]) is None
+    assert "1 of 3 photos have no regions: south/a.png" in capsys.readouterr().out
 
 
 def test_another_clip_than_the_targets_is_refused(photos, config, store, models):
@@ -318,7 +382,7 @@ def test_the_deviation_of_a_constant_channel_is_floored(store):
 def test_a_long_run_shows_a_bar(photos, config, store, monkeypatch, capsys):
     run(photos[:1], config, store)
     assert "encoding photos" not in capsys.readouterr().out
-    monkeypatch.setattr(module, "_QUIET_S", 0.0)
+    monkeypatch.setattr(progress, "QUIET_S", 0.0)
     run(photos, config, store)
     printed = capsys.readouterr().out
     assert "checking photos" in printed

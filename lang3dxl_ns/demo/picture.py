@@ -1,0 +1,86 @@
+"""What a trained demo sees, in one picture: photos, renderings, codes, and where it finds each word."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+
+COLUMNS = 4
+"""Prompts shown per photo."""
+
+
+@dataclass
+class PictureRow:
+    """One held-out photo and what the scene makes of it; colours in 0…1."""
+
+    name: str
+    photo: Float[Array, "h w 3"]
+    rendering: Float[Array, "h w 3"]
+    codes: Float[Array, "h w 3"]
+    relevancy: Mapping[str, Float[Array, "mh mw"]]
+    """By prompt, 0…1."""
+    truth: Mapping[str, Bool[Array, "mh mw"]]
+    """By prompt; prompts without truth are not shown."""
+
+
+def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
+    """The rows that show most: taken one by one, each for the prompts that the ones before lack."""
+    chosen: list[PictureRow] = []
+    shown: set[str] = set()
+    while len(chosen) < min(count, len(rows)):
+        rest = [row for row in rows if not any(row is other for other in chosen)]
+        best = max(rest, key=lambda row: (len(set(row.truth) - shown), len(row.truth)))
+        chosen.append(best)
+        shown |= set(best.truth)
+    return chosen
+
+
+def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
+    """Write a PNG: per photo the photo, its rendering, the codes as colour, and a heat map per prompt with
+    the ground truth outlined in white."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib.figure import Figure
+
+    columns = 3 + min(COLUMNS, max(len(row.truth) for row in rows))
+    figure = Figure(figsize=(2.6 * columns, 2.15 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), columns, squeeze=False)
+    for line, row in zip(axes, rows, strict=True):
+        for axis in line:
+            axis.axis("off")
+        pictures = {"held-out photo": row.photo, "rendering": row.rendering, "3-number codes": row.codes}
+        for axis, (title, image) in zip(line, pictures.items(), strict=False):
+            axis.imshow(np.clip(image, 0, 1))
+            axis.set_title(title, fontsize=10)
+        rarest = sorted(row.truth, key=lambda prompt: row.truth[prompt].mean())[:COLUMNS]
+        for axis, prompt in zip(line[3:], rarest, strict=False):
+            _draw_prompt(axis, prompt, row)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+
+
+def _draw_prompt(axis, prompt: str, row: PictureRow) -> None:
+    height, width = row.truth[prompt].shape
+    extent = (0, width, height, 0)
+    grey = row.rendering.mean(axis=2)
+    axis.imshow(grey, cmap="gray", extent=extent, vmin=0, vmax=1)
+    score = row.relevancy[prompt]
+    high = max(float(score.max()), 0.5 + 1e-6)
+    opacity = 0.75 * np.clip((score - 0.5) / (high - 0.5), 0, 1) ** 0.5
+    axis.imshow(score, cmap="turbo", extent=extent, vmin=0.5, vmax=high, alpha=opacity)
+    axis.contour(
+        row.truth[prompt].astype(float),
+        levels=[0.5],
+        colors="white",
+        linewidths=1,
+        extent=(0, width, 0, height),
+    )
+    axis.set_xlim(0, width)
+    axis.set_ylim(height, 0)
+    axis.set_title(f"“{prompt}”", fontsize=10)

@@ -1,0 +1,23 @@
+"""The whole catalogue. A component joins it with a file of cases and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lang3dxl_ns.evaluation.numerics import (
+    decoder,
+    downsampler,
+    hash_grid,
+    losses,
+    physical_scale,
+    rasteriser,
+)
+from lang3dxl_ns.evaluation.numerics.measure import Case
+
+GROUPS = (rasteriser, hash_grid, decoder, downsampler, losses, physical_scale)
+
+
+def all_cases(quick: bool, device: str) -> Iterator[Case]:
+    """Every group's cases; `quick` takes smaller ones where the size is not the point."""
+    for group in GROUPS:
+        yield from group.cases(quick, device)

@@ -1,0 +1,226 @@
+"""`lang3dxl numerics`: error against run time of every component on its hard cases, with a verdict."""
+
+from __future__ import annotations
+
+import io
+import math
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lang3dxl_ns.evaluation.numerics.catalogue import all_cases
+from lang3dxl_ns.evaluation.numerics.measure import Case, Row, measure
+from lang3dxl_ns.evaluation.report import (
+    command_line,
+    describe_machine,
+    markdown_table,
+    progress_bar,
+    write_atomically,
+    write_report,
+)
+
+HEADER = (
+    "case",
+    "mode",
+    "output max / rms",
+    "gradient max / rms",
+    "flipped",
+    "finite",
+    "ms",
+    "bound",
+    "verdict",
+)
+
+
+@dataclass(kw_only=True)
+class Numerics:
+    """Measure the error and time of every component on stiff and extreme cases; exit 1 on any miss."""
+
+    out: Path
+    """Folder for numerics.md, numerics.json and numerics.png."""
+    quick: bool = False
+    """Smaller cases in single precision only, in about a minute: for continuous integration."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU if there is one), cpu, cuda."""
+
+    def main(self) -> None:
+        """Measure, write the report, and leave with an error if a case missed its bound."""
+        device = self.device
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # on one thread processor time is measured
+        try:
+            rows = measure_all(list(all_cases(self.quick, device)), self.quick, device)
+            machine = describe_machine(device)
+        finally:
+            torch.set_num_threads(threads)
+        missed = [row for row in rows if row.misses]
+        command = command_line("lang3dxl numerics", self)
+        data = {"command": command, "machine": machine, "rows": [_json_row(row) for row in rows]}
+        write_report(self.out, "numerics", _markdown(rows, command, machine), data)
+        write_atomically(self.out / "numerics.png", _plot(rows))
+        for row in missed:
+            print(f"MISS {row.component}, {row.case}, {row.mode}: {'; '.join(row.misses)}")
+        print(f"{len(rows) - len(missed)} of {len(rows)} rows pass; the report is in {self.out}")
+        if missed:
+            sys.exit(1)
+
+
+def measure_all(cases: Sequence[Case], quick: bool, device: str) -> list[Row]:
+    """A row for every case and mode; `quick` leaves float64 out where there is another."""
+    pairs = [
+        (case, mode)
+        for case in cases
+        for mode in case.bounds
+        if not (quick and mode == "float64" and len(case.bounds) > 1)
+    ]
+    rows = []
+    with progress_bar() as bar:
+        task = bar.add_task("numerics", total=len(pairs))
+        for case, mode in pairs:
+            rows.append(measure(case, mode, device, repeats=1 if quick else 3))
+            bar.advance(task)
+    return rows
+
+
+def _json_row(row: Row) -> dict[str, Any]:
+    """JSON has no NaN: a figure that is none becomes null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: plain(inner) for name, inner in value.items()}
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return plain(asdict(row)) | {"misses": row.misses}
+
+
+def _markdown(rows: list[Row], command: str, machine: str) -> str:
+    missed = sum(bool(row.misses) for row in rows)
+    components = list(dict.fromkeys(row.component for row in rows))
+    tables = "\n\n".join(_section([row for row in rows if row.component == name]) for name in components)
+    return f"""# Numerics: error against run time on stiff and extreme cases
+
+`{command}`
+{machine}.
+
+**{len(rows) - missed} of {len(rows)} rows pass.** Every component runs on its hard cases; the same inputs,
+rounded as it sees them, go through a reference in float64 that is written for clarity (rasteriser: every
+Gaussian against every pixel; hash grid: corner by corner; downsampler: window by window; physical scale:
+80 bits). Errors are relative to the reference's largest value (max) and root mean square (rms), the worst of
+all outputs and of the gradients to all inputs for a random upstream gradient. Where the reference is not
+finite (a NaN input's own row), the component needn't be; everywhere else "finite" says that output and
+gradient are. flipped: share of pixels in which rounding moved a pair over the rasteriser's thresholds of
+1/255 and 1e-4; they count in the output's error, not in the gradient's. bf16, fp16: mixed precision
+(autocast). ms: one forward and backward. Bounds are in the order of the error columns.
+
+{_summary(rows, components)}
+
+![Error against time](numerics.png)
+
+{tables}
+"""
+
+
+def _summary(rows: list[Row], components: Iterable[str]) -> str:
+    table = []
+    for name in components:
+        own = [row for row in rows if row.component == name]
+        single = [row for row in own if row.mode in ("float32", "float64")]
+        best = [row for row in single if row.mode == "float32"] or single
+        table.append(
+            [
+                name,
+                len(own),
+                sum(not row.misses for row in own),
+                _figure(_median(row.output_rms for row in best)),
+                _figure(_median(row.gradient_rms for row in best if row.gradient_rms is not None)),
+                f"{_median(row.ms for row in best):.2g}",
+            ]
+        )
+    header = ["component", "rows", "pass", "median output rms", "median gradient rms", "median ms"]
+    return markdown_table(header, table)
+
+
+def _median(values: Iterable[float]) -> float:
+    finite = sorted(value for value in values if math.isfinite(value))
+    return finite[len(finite) // 2] if finite else math.nan
+
+
+def _section(rows: list[Row]) -> str:
+    notes = dict.fromkeys(f"{row.case}: {row.note}." for row in rows if row.note)
+    listed = "".join(f"\n- {note}" for note in notes)
+    table = markdown_table(HEADER, [_cells(row) for row in rows])
+    return f"## {rows[0].component[0].upper()}{rows[0].component[1:]}\n\n{table}" + (listed and f"\n{listed}")
+
+
+def _cells(row: Row) -> list[str | None]:
+    b = row.bounds
+    bound = f"{b.output_max:.0e} / {b.output_rms:.0e}"
+    has_gradient = row.gradient_max is not None
+    if has_gradient:
+        bound += f" · {b.gradient_max:.0e} / {b.gradient_rms:.0e}"
+    return [
+        row.case,
+        row.mode,
+        f"{_figure(row.output_max)} / {_figure(row.output_rms)}",
+        f"{_figure(row.gradient_max)} / {_figure(row.gradient_rms)}" if has_gradient else None,
+        f"{row.flipped:.1%}" if row.flipped else None,
+        "yes" if row.finite else "**no**",
+        f"{row.ms:.2g}",
+        bound,
+        "pass" if not row.misses else f"**miss**: {'; '.join(row.misses)}",
+    ]
+
+
+def _figure(value: float | None) -> str:
+    return "–" if value is None else "0" if value == 0 else f"{value:.0e}"
+
+
+def _plot(rows: list[Row]) -> bytes:
+    """PNG: error against time, outputs and gradients, a colour for each component, a marker for each mode."""
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    components = list(dict.fromkeys(row.component for row in rows))
+    palette = (
+        "#0b2545",
+        "#c0392b",
+        "#2471a3",
+        "#1e8449",
+        "#b9770e",
+        "#6c3483",
+        "#7f8c8d",
+        "#d98880",
+        "#117864",
+    )
+    colours = {name: palette[i % len(palette)] for i, name in enumerate(components)}
+    markers = {"float32": "o", "float64": "s", "bf16": "^", "fp16": "v", "tf32": "D"}
+    smallest = 1e-18
+    errors: dict[str, Callable[[Row], float | None]] = {
+        "output": lambda row: row.output_rms,
+        "gradient": lambda row: row.gradient_rms,
+    }
+    for panel, (title, error) in zip(panels, errors.items(), strict=True):
+        for row in rows:
+            value = error(row)
+            if value is not None and math.isfinite(value):
+                style = {"color": colours[row.component], "marker": markers[row.mode]}
+                panel.plot(row.ms, max(value, smallest), markersize=4.5, alpha=0.7, linestyle="none", **style)
+        panel.set(xscale="log", yscale="log", xlabel="forward + backward, ms", title=title)
+        panel.grid(which="major", alpha=0.25)
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("relative RMS error (0 drawn at 1e-18)")
+    used = [mode for mode in markers if any(row.mode == mode for row in rows)]
+    keys = [Line2D([], [], color=colours[name], linewidth=3, label=name) for name in components]
+    keys += [Line2D([], [], color="0.35", marker=markers[m], linestyle="none", label=m) for m in used]
+    figure.legend(handles=keys, loc="outside lower center", ncols=6, frameon=False)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=130)
+    return file.getvalue()

@@ -1,0 +1,191 @@
+"""Segments of a photo whose features should agree: label maps from SAM, from colours, or from a folder."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from PIL import Image
+from torch import Tensor
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.companions import companion, named_folder
+from lang3dxl_ns.preparation.encoders import ModelFiles
+from lang3dxl_ns.preparation.photo import Photo
+from lang3dxl_ns.preparation.segmentation import AutomaticSam, find_sam
+
+RegionLevel = Literal["small", "medium", "large"]
+
+LONGER_SIDE = 256
+"""Pixels of a stored label map: over twice what training decodes at."""
+LABEL_SUFFIXES = (".png", ".npy")
+
+_SAM_SIDE = 1024
+"""Pixels that SAM sees."""
+_FELZENSZWALB = {"scale": 100.0, "sigma": 0.8, "min_size": 20}
+"""Gives some 250 regions of a photo, half of them over 60 pixels."""
+_RULE = 1
+"""Raised when label maps are made in another way: those made before are then made again."""
+
+
+class RegionSource(Protocol):
+    """Where the label maps of a scene come from."""
+
+    def settings(self, photo: Photo) -> dict[str, Any] | None:
+        """Everything besides the photo that decides its labels; None for a photo without regions."""
+
+    def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
+        """Labels over the photo as `photo.read()` gives it (`image`), at any size; negative for no region."""
+
+
+def region_source(
+    choice: str, level: RegionLevel, sam: str, data: Path, device: torch.device | str
+) -> RegionSource | None:
+    """The source that an option names: none, felzenszwalb, sam, a folder (relative to `data`), or auto, the
+    folder regions/ where `data` has one.
+
+    Raises UserError when there is no such folder, or SAM can't be found or downloaded.
+    """
+    if choice == "auto":
+        folder = data / "regions"
+        return FolderRegions(folder) if folder.is_dir() else None
+    if choice == "none":
+        return None
+    if choice == "felzenszwalb":
+        return FelzenszwalbRegions()
+    if choice == "sam":
+        return SamRegions(find_sam(sam), level, device)
+    return FolderRegions(named_folder(choice, data, "regions"))
+
+
+class FelzenszwalbRegions:
+    """Regions of like colour (Felzenszwalb and Huttenlocher 2004): no weights, a fraction of a second."""
+
+    def settings(self, photo: Photo) -> dict[str, Any]:
+        """As `RegionSource.settings`."""
+        return {"regions": "felzenszwalb", **_FELZENSZWALB, "rule": _RULE}
+
+    def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
+        """As `RegionSource.labels`."""
+        from skimage.segmentation import felzenszwalb
+
+        return torch.from_numpy(felzenszwalb(_shrunk(image, LONGER_SIDE).numpy(), **_FELZENSZWALB))
+
+
+class SamRegions:
+    """Regions from SAM's automatic masks; the network is loaded when the first photo needs it."""
+
+    def __init__(self, files: ModelFiles, level: RegionLevel, device: torch.device | str) -> None:
+        self._files, self._level, self._device = files, level, device
+
+    def settings(self, photo: Photo) -> dict[str, Any]:
+        """As `RegionSource.settings`."""
+        return {"regions": "sam", "model": self._files.identity, "level": self._level, "rule": _RULE}
+
+    def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
+        """As `RegionSource.labels`."""
+        small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
+        masks = [_nearest(mask, label_size(*mask.shape)) for mask in self._sam.masks(small)]
+        if not masks:
+            return torch.full(label_size(*small.shape[:2]), -1)
+        return label_map(torch.stack(masks), self._level)
+
+    @cached_property
+    def _sam(self) -> AutomaticSam:
+        return AutomaticSam(self._files, self._device)
+
+
+class FolderRegions:
+    """Label maps that somebody made: on the photos as they lie on disk, at any size, named like them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def settings(self, photo: Photo) -> dict[str, Any] | None:
+        """As `RegionSource.settings`."""
+        path = companion(self._folder, photo.name, LABEL_SUFFIXES)
+        if path is None:
+            return None
+        digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+        return {"regions": "folder", "file": digest, "rule": _RULE}
+
+    def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
+        """As `RegionSource.labels`. Raises UserError for a file that holds no label map."""
+        path = companion(self._folder, photo.name, LABEL_SUFFIXES)
+        assert path is not None, "settings() found it"
+        return photo.undistort_labels(_numbered(_read_labels(path, photo.name)))
+
+
+def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "h w"]:
+    """One label per pixel from masks that overlap: the smallest mask that a pixel lies in, the largest, or
+    the one in the middle of them by area; −1 in no mask."""
+    masks = masks[masks.sum(dim=(1, 2)).argsort(stable=True)]
+    rank = masks.cumsum(dim=0, dtype=torch.int32)  # of a pixel's masks, the smallest is number 1
+    count = rank[-1]
+    wanted = {"small": torch.ones_like(count), "medium": (count + 1) // 2, "large": count}[level]
+    chosen = (masks & (rank == wanted)).to(torch.uint8).argmax(dim=0)
+    return torch.where(count > 0, chosen, -1)
+
+
+def stored_labels(labels: Int[Tensor, "hl wl"]) -> Int[Tensor, "h w"]:
+    """A label map as it is kept: `label_size` (nearest), numbered from 0, −1 for none, on the CPU."""
+    small = _numbered(_nearest(labels, label_size(*labels.shape)).cpu())
+    return small.to(torch.int16 if small.max() < 2**15 else torch.int32)
+
+
+def label_size(height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of a stored label map: at most 256 on the longer side."""
+    shrink = min(LONGER_SIDE / max(height, width), 1.0)
+    return max(round(height * shrink), 1), max(round(width * shrink), 1)
+
+
+def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
+    """A file's labels: whole numbers, negative for no region (in a picture, which has no sign, 0)."""
+    try:
+        if path.suffix == ".npy":
+            labels, first = np.load(path, allow_pickle=False), 0
+        else:
+            with Image.open(path) as picture:
+                labels, first = np.asarray(picture), 1
+    except (OSError, SyntaxError, ValueError) as error:
+        raise UserError(
+            f"regions of {name}: can't read {path} ({error}): make it again, or remove it"
+        ) from error
+    if labels.ndim != 2 or labels.dtype.kind not in "iu":
+        raise UserError(
+            f"regions of {name}: {path} holds {labels.dtype} numbers of shape {labels.shape}, not one whole "
+            "number per pixel: save a grey 16-bit PNG, or a .npy of integers [height, width]"
+        )
+    return torch.from_numpy(labels.astype(np.int64)) - first
+
+
+def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
+    """The same regions, numbered without gaps from 0; −1 for none."""
+    regions, numbers = labels.clamp(min=-1).unique(return_inverse=True)
+    return numbers - int(regions[0] < 0)
+
+
+def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
+    """Whole numbers at another size: every pixel takes the one under its middle."""
+    rows, columns = (
+        ((torch.arange(n, device=values.device) + 0.5) * length / n).long()
+        for n, length in zip(size, values.shape, strict=True)
+    )
+    return values[rows[:, None], columns]
+
+
+def _shrunk(image: Float[Tensor, "h w 3"], longer_side: int) -> Float[Tensor, "hs ws 3"]:
+    """The image on the CPU, averaged down to at most `longer_side` pixels."""
+    height, width = image.shape[:2]
+    shrink = longer_side / max(height, width)
+    if shrink >= 1:
+        return image.cpu()
+    size = max(round(height * shrink), 1), max(round(width * shrink), 1)
+    planes = F.interpolate(image.permute(2, 0, 1)[None], size, mode="bilinear", antialias=True)
+    return planes[0].permute(1, 2, 0).contiguous().clamp(0, 1).cpu()

@@ -1,0 +1,189 @@
+"""Networks that cut photos into masks: from words CLIPSeg, or GroundingDINO with SAM; unasked SAM alone.
+
+All are read from a local folder or by Hugging Face name, like the encoders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.encoders import ModelFiles, find_model, load_weights, model_type
+
+TEXT_OPTION = "--pipeline.datamanager.foreground-model"
+SAM_OPTION = "--pipeline.datamanager.sam"
+
+_BOX_THRESHOLD = 0.3
+"""Confidence from which a box counts (LangSAM's)."""
+# Published for language fields: LangSplat's settings of SAM's automatic masks. Its extra round over crops of
+# the photo is left out: it costs five times the time and finds masks smaller than the label maps show.
+_AUTOMATIC = {
+    "points_per_crop": 32,
+    "pred_iou_thresh": 0.7,
+    "stability_score_thresh": 0.85,
+    "crops_nms_thresh": 0.7,
+}
+
+
+class TextSegmenter(Protocol):
+    """Finds what words name in a picture."""
+
+    def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
+        """Where any of the prompts is seen, at the size of the image, on the CPU."""
+
+
+@dataclass(frozen=True)
+class SegmenterFiles:
+    """The networks of a text segmenter on this disk."""
+
+    words: ModelFiles
+    sam: ModelFiles | None
+    """Fills the boxes of a detector; None where `words` makes masks itself."""
+
+    @property
+    def identity(self) -> str:
+        """Of both networks' weights."""
+        return self.words.identity if self.sam is None else f"{self.words.identity}+{self.sam.identity}"
+
+
+def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
+    """A text segmenter's files: a CLIPSeg alone, or a GroundingDINO with a SAM.
+
+    Raises UserError when one can't be found or downloaded, or is another kind of model.
+    """
+    words = find_model(name_or_dir, TEXT_OPTION)
+    kind = model_type(words)
+    if kind not in ("clipseg", "grounding-dino"):
+        raise UserError(
+            f"{words.name} is a {kind} model: {TEXT_OPTION} takes a GroundingDINO, such as "
+            "IDEA-Research/grounding-dino-tiny, or a CLIPSeg, such as CIDAS/clipseg-rd64-refined"
+        )
+    return SegmenterFiles(words, find_sam(sam) if kind == "grounding-dino" else None)
+
+
+def find_sam(name_or_dir: str) -> ModelFiles:
+    """SAM's files. Raises UserError when they can't be found or downloaded, or are another kind of model."""
+    files = find_model(name_or_dir, SAM_OPTION)
+    kind = model_type(files)
+    if kind != "sam":
+        raise UserError(f"{files.name} is a {kind} model: {SAM_OPTION} takes a SAM: facebook/sam-vit-base")
+    return files
+
+
+def load_text_segmenter(files: SegmenterFiles, device: torch.device | str) -> TextSegmenter:
+    """The networks on `device`. Raises UserError when one is incomplete."""
+    return ClipSeg(files.words, device) if files.sam is None else BoxesAndSam(files.words, files.sam, device)
+
+
+class ClipSeg:
+    """CLIPSeg (Lüddecke and Ecker 2022): a probability per pixel and prompt; a mask from 0.5."""
+
+    def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
+        from transformers import CLIPSegForImageSegmentation, CLIPSegProcessor
+
+        self._model = load_weights(CLIPSegForImageSegmentation, files, device)
+        self._processor = _load_processor(CLIPSegProcessor, files)
+        self._context: int = self._model.config.text_config.max_position_embeddings
+
+    @torch.no_grad()
+    def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
+        """As `TextSegmenter.segment`."""
+        inputs = self._processor(
+            text=list(prompts),
+            images=[_picture(image)] * len(prompts),
+            padding=True,
+            truncation=True,
+            max_length=self._context,
+            return_tensors="pt",
+        ).to(self._model.device)
+        logits = self._model(**inputs).logits.cpu()
+        logits = logits.reshape(len(prompts), 1, *logits.shape[-2:])  # of one prompt it comes without an axis
+        logits = F.interpolate(logits, tuple(image.shape[:2]), mode="bilinear")
+        return (logits >= 0).any(dim=0)[0]
+
+
+class BoxesAndSam:
+    """GroundingDINO (Liu et al. 2023) puts boxes around what a prompt names, SAM (Kirillov et al. 2023) finds
+    the thing in each box."""
+
+    def __init__(self, words: ModelFiles, sam: ModelFiles, device: torch.device | str) -> None:
+        from transformers import (
+            GroundingDinoForObjectDetection,
+            GroundingDinoProcessor,
+            SamModel,
+            SamProcessor,
+        )
+
+        self._detector = load_weights(GroundingDinoForObjectDetection, words, device)
+        self._detector_processor = _load_processor(GroundingDinoProcessor, words)
+        self._sam = load_weights(SamModel, sam, device)
+        self._sam_processor = _load_processor(SamProcessor, sam)
+
+    @torch.no_grad()
+    def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
+        """As `TextSegmenter.segment`. A pass per prompt, so that no prompt hides what another finds."""
+        boxes = torch.cat([self.boxes(image, prompt) for prompt in prompts])
+        if not len(boxes):
+            return torch.zeros(image.shape[:2], dtype=torch.bool)
+        inputs = self._sam_processor(
+            images=_picture(image), input_boxes=[boxes.tolist()], return_tensors="pt"
+        ).to(self._sam.device, torch.float32)
+        output = self._sam(**inputs, multimask_output=False)
+        masks = self._sam_processor.post_process_masks(
+            output.pred_masks.cpu(),
+            inputs["original_sizes"].cpu(),
+            reshaped_input_sizes=inputs["reshaped_input_sizes"].cpu(),
+        )
+        return masks[0].any(dim=(0, 1))
+
+    @torch.no_grad()
+    def boxes(self, image: UInt8[Tensor, "h w 3"], prompt: str) -> Float[Tensor, "n 4"]:
+        """Left, top, right and bottom of what the prompt names, in pixels."""
+        caption = prompt.strip().lower().rstrip(".") + "."  # the form that the detector was trained with
+        inputs = self._detector_processor(images=_picture(image), text=caption, return_tensors="pt")
+        output = self._detector(**inputs.to(self._detector.device))
+        scores = output.logits[0].sigmoid().amax(dim=-1)
+        centres, sizes = output.pred_boxes[0][scores >= _BOX_THRESHOLD].cpu().chunk(2, dim=-1)
+        height, width = image.shape[:2]
+        corners = torch.cat([centres - sizes / 2, centres + sizes / 2], dim=-1).clamp(0, 1)
+        return corners * torch.tensor([width, height, width, height])
+
+
+class AutomaticSam:
+    """SAM asked at a grid of points: masks of everything, which overlap."""
+
+    def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
+        from transformers import SamModel, SamProcessor, pipeline
+
+        model = load_weights(SamModel, files, device)
+        processor = _load_processor(SamProcessor, files).image_processor
+        self._generate = pipeline("mask-generation", model=model, image_processor=processor, device=device)
+
+    def masks(self, image: UInt8[Tensor, "h w 3"]) -> list[Bool[Tensor, "h w"]]:
+        """Masks at the size of the image, on the CPU; none where nothing is found."""
+        return [
+            torch.as_tensor(mask).cpu() for mask in self._generate(_picture(image), **_AUTOMATIC)["masks"]
+        ]
+
+
+def _load_processor(processor_class: Any, files: ModelFiles) -> Any:
+    """What turns pictures and words into a network's input. Raises UserError where its files are missing."""
+    try:
+        return processor_class.from_pretrained(files.folder, local_files_only=True)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise UserError(
+            f"{files.folder} lacks files that prepare the input of {files.name} ({error}): copy its "
+            "preprocessor_config.json and tokenizer files there, or download the model again"
+        ) from error
+
+
+def _picture(image: UInt8[Tensor, "h w 3"]) -> Image.Image:
+    return Image.fromarray(image.numpy())

@@ -1,0 +1,200 @@
+"""Label maps: from colours, from masks that overlap, from files; small, and numbered without gaps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny_models import make_tiny_sam
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation import segmentation
+from lang3dxl_ns.preparation.photo import Photo
+from lang3dxl_ns.preparation.regions import (
+    FelzenszwalbRegions,
+    FolderRegions,
+    SamRegions,
+    label_map,
+    label_size,
+    region_source,
+    stored_labels,
+)
+
+PHOTO = Photo("north/a.jpg", None, None, 40, 30, 40.0, 40.0, 20.0, 15.0)
+IMAGE = torch.zeros(30, 40, 3)
+
+
+def disc(radius, size=64):
+    rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    return (rows - size // 2) ** 2 + (columns - size // 2) ** 2 < radius**2
+
+
+# ------------------------------------------------------------------ from masks that overlap
+
+
+def test_nested_masks_give_the_smallest_the_middle_or_the_largest():
+    discs = torch.stack([disc(20), disc(5), disc(30), disc(10)])
+    by_size = [1, 3, 0, 2]  # positions of the masks, smallest first
+    found = {level: label_map(discs, level) for level in ("small", "medium", "large")}
+    for level, labels in found.items():
+        assert torch.equal(labels >= 0, discs.any(dim=0))
+        for row in range(64):
+            inside = [rank for rank, mask in enumerate(by_size) if discs[mask, row, 32]]
+            middle = len(inside) and inside[(len(inside) - 1) // 2]
+            expected = {"small": inside[:1], "medium": [middle], "large": inside[-1:]}[level]
+            assert int(labels[row, 32]) == (expected[0] if inside else -1)
+    assert not torch.equal(found["small"], found["large"])
+
+
+def test_the_order_of_masks_means_nothing():
+    masks = torch.rand(7, 20, 30, generator=torch.manual_seed(0)) > torch.linspace(0.2, 0.9, 7)[:, None, None]
+    shuffled = masks[torch.randperm(7, generator=torch.manual_seed(1))]
+    for level in ("small", "medium", "large"):
+        assert torch.equal(label_map(masks, level), label_map(shuffled, level))
+
+
+# ------------------------------------------------------------------ as stored
+
+
+def test_stored_labels_are_small_numbered_and_nearest():
+    coarse = torch.tensor([[5, 5, 900_000_000_000], [-7, 2, 900_000_000_000]])
+    large = coarse.repeat_interleave(300, 0).repeat_interleave(300, 1)
+    found = stored_labels(large)
+    assert found.shape == label_size(600, 900) == (171, 256)
+    assert found.dtype == torch.int16
+    assert set(found.unique().tolist()) == {-1, 0, 1, 2}
+    middles = found[[[42], [128]], [42, 128, 213]]
+    assert middles.tolist() == [[1, 1, 2], [-1, 0, 2]]
+    assert torch.equal(stored_labels(coarse), torch.tensor([[1, 1, 2], [-1, 0, 2]], dtype=torch.int16))
+
+
+def test_a_map_without_any_region_stays_so_and_many_regions_keep_their_numbers():
+    assert torch.equal(stored_labels(torch.full((5, 6), -3)), torch.full((5, 6), -1, dtype=torch.int16))
+    many = torch.arange(200 * 250).view(200, 250)
+    assert torch.equal(stored_labels(many), many.int())
+
+
+# ------------------------------------------------------------------ from colours
+
+
+def test_felzenszwalb_separates_colours_and_shrinks_the_photo_first():
+    image = torch.full((600, 900, 3), 0.2)
+    image[:, 450:] = 0.9
+    labels = FelzenszwalbRegions().labels(PHOTO, image)
+    assert labels.shape == (171, 256)
+    assert labels[0, 0] != labels[0, -1]  # the border, smoothed, has a few thin regions of its own
+    assert torch.equal(labels[:, :120], labels[:1, :1].expand(171, 120))
+    assert torch.equal(labels[:, 136:], labels[:1, -1:].expand(171, 120))
+
+
+# ------------------------------------------------------------------ from SAM
+
+
+@pytest.fixture(scope="module")
+def sam(tmp_path_factory):
+    return str(make_tiny_sam(tmp_path_factory.mktemp("models") / "sam", seed=2))
+
+
+def test_sam_labels_are_made_of_its_masks(sam, monkeypatch):
+    settings = {"points_per_crop": 3, "pred_iou_thresh": -1e9, "stability_score_thresh": -1}
+    for name, value in settings.items():
+        monkeypatch.setitem(segmentation._AUTOMATIC, name, value)
+    image = torch.rand(60, 90, 3, generator=torch.manual_seed(0))
+    source = region_source("sam", "small", sam, PHOTO.path, "cpu")
+    assert isinstance(source, SamRegions)
+    masks = torch.stack(source._sam.masks((image * 255).round().byte()))
+    assert torch.equal(source.labels(PHOTO, image), label_map(masks, "small"))
+    assert source.labels(PHOTO, torch.rand(300, 512, 3)).shape == (150, 256)
+    monkeypatch.setitem(segmentation._AUTOMATIC, "pred_iou_thresh", 1e9)
+    assert torch.equal(source.labels(PHOTO, image), torch.full((60, 90), -1))
+
+
+def test_sam_settings_name_weights_and_level(sam):
+    small, large = (
+        region_source("sam", level, sam, None, "cpu").settings(PHOTO) for level in ("small", "large")
+    )
+    assert small != large
+    assert small["model"] == large["model"]
+
+
+# ------------------------------------------------------------------ from a folder
+
+
+def test_pictures_count_from_one_and_arrays_from_zero(tmp_path):
+    labels = np.array([[0, 1, 500], [40_000, 65_535, 0]])
+    (tmp_path / "north").mkdir()
+    Image.fromarray(labels.astype(np.uint16)).save(tmp_path / "north" / "a.png")
+    source = FolderRegions(tmp_path)
+    expected = torch.tensor([[-1, 0, 1], [2, 3, -1]])
+    assert torch.equal(source.labels(PHOTO, IMAGE), expected)
+    (tmp_path / "north" / "a.png").unlink()
+    np.save(tmp_path / "north" / "a.jpg.npy", labels.astype(np.int64) - 1)
+    assert torch.equal(source.labels(PHOTO, IMAGE), expected)
+    np.save(tmp_path / "north" / "a.jpg.npy", labels.astype(np.uint16))  # no negative number: all are regions
+    assert source.labels(PHOTO, IMAGE).min() == 0
+
+
+def test_label_maps_lie_on_the_file_and_are_undistorted_with_it(tmp_path):
+    labels = np.tile(np.arange(40), (30, 1))
+    (tmp_path / "north").mkdir()
+    np.save(tmp_path / "north" / "a.npy", labels)
+    distorted = replace(PHOTO, distortion=(0.4, 0.0, 0.0, 0.0))
+    found = FolderRegions(tmp_path).labels(distorted, IMAGE)
+    assert found.min() == -1
+    assert torch.equal(found, distorted.undistort_labels(torch.from_numpy(labels)))
+
+
+def test_a_folders_settings_follow_the_file_and_are_none_without_one(tmp_path):
+    source = FolderRegions(tmp_path)
+    assert source.settings(PHOTO) is None
+    (tmp_path / "north").mkdir()
+    np.save(tmp_path / "north" / "a.npy", np.zeros((3, 4), int))
+    first = source.settings(PHOTO)
+    np.save(tmp_path / "north" / "a.npy", np.ones((3, 4), int))
+    assert source.settings(PHOTO) != first
+    json.dumps(first)
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("a.npy", np.zeros((3, 4))),  # not whole numbers
+        ("a.npy", np.zeros((4, 3, 4), int)),
+        ("a.npy", np.array([{"pickled": 1}], dtype=object)),
+        ("a.png", np.zeros((3, 4, 3), np.uint8)),  # colours
+        ("a.png", None),
+    ],
+)
+def test_a_file_that_is_no_label_map_is_a_users_error(tmp_path, file, content):
+    path = tmp_path / "north" / file
+    path.parent.mkdir()
+    if content is None:
+        path.write_bytes(b"not a picture")
+    elif path.suffix == ".npy":
+        np.save(path, content)
+    else:
+        Image.fromarray(content).save(path)
+    with pytest.raises(UserError, match=r"regions of north/a\.jpg: .*a\.(png|npy)"):
+        FolderRegions(tmp_path).labels(PHOTO, IMAGE)
+
+
+# ------------------------------------------------------------------ which source
+
+
+def test_the_option_names_the_source(tmp_path):
+    def kind(choice):
+        return type(region_source(choice, "small", "no/such-sam", tmp_path, "cpu"))
+
+    assert kind("none") is kind("auto") is type(None)
+    assert kind("felzenszwalb") is FelzenszwalbRegions
+    (tmp_path / "regions").mkdir()
+    assert kind("auto") is kind("regions") is kind(str(tmp_path / "regions")) is FolderRegions
+    assert kind("none") is type(None)
+    with pytest.raises(UserError, match=r"regions elsewhere: there is no folder"):
+        kind("elsewhere")
+    with pytest.raises(UserError, match=r"hf download no/such-sam"):
+        kind("sam")

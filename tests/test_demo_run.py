@@ -1,0 +1,88 @@
+"""The demo: its report says what it should, no work is done twice, and a stop keeps what is there."""
+
+import json
+import signal
+
+import pytest
+
+from lang3dxl_ns.demo_run import Demo
+from lang3dxl_ns.errors import UserError
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def demo(tiny_clip, tiny_dense, tmp_path_factory):
+    out = tmp_path_factory.mktemp("demo")
+    settings = Demo(
+        out=out, photos=8, steps=6, quick=True, wild=False, clip=str(tiny_clip), dense=str(tiny_dense)
+    )
+    settings.main()
+    return settings
+
+
+@pytest.fixture
+def run(demo):
+    return demo.out / "run" / "lang3dxl" / "demo"
+
+
+def test_the_report_holds_precision_quality_time_and_memory(run):
+    report = json.loads((run / "report.json").read_text())
+    for who in ("field", "teacher"):
+        values = report[who]["AP"].values()
+        assert all(0 <= value <= 1 for value in values)
+        assert report[who]["mAP"] == pytest.approx(sum(values) / len(values))
+    assert report["field"]["psnr"] > 5
+    assert set(report["seconds"]) == set(report["peak_mb"]) == {"scene", "prepare", "train", "evaluate"}
+    assert report["features"]["clip_l1"] > 0
+    assert "2-D teacher" in (run / "report.md").read_text()
+    assert (run / "report.png").stat().st_size > 10_000
+
+
+def test_the_same_command_does_nothing_twice_but_goes_on_when_asked_for_more(demo, run):
+    checkpoint = run / "nerfstudio_models" / "step-000000005.ckpt"
+    written = checkpoint.stat().st_mtime_ns
+    photo = (demo.out / "scene" / "images" / "0001.jpg").stat().st_mtime_ns
+    demo.main()
+    assert checkpoint.stat().st_mtime_ns == written
+    demo.steps = 8
+    demo.main()
+    assert (run / "nerfstudio_models" / "step-000000007.ckpt").exists()
+    assert (demo.out / "scene" / "images" / "0001.jpg").stat().st_mtime_ns == photo
+
+
+def test_another_scene_in_the_same_folder_is_refused(demo):
+    with pytest.raises(UserError, match="seed 2, and 3 was asked for"):
+        Demo(out=demo.out, seed=3, photos=8, wild=False).main()
+
+
+def test_flags_of_training_reach_it(demo, tmp_path):
+    (tmp_path / "scene").symlink_to(demo.out / "scene")
+    settings = Demo(out=tmp_path, photos=8, steps=2, quick=True, wild=False, clip="none", dense="none")
+    settings.ns_train = "--pipeline.model.sky-gaussians 0"
+    settings.main()
+    report = json.loads((tmp_path / "run" / "lang3dxl" / "demo" / "report.json").read_text())
+    assert set(report["field"]) == {"psnr", "ssim"}
+    assert "features" not in report
+
+
+def test_ctrl_c_while_training_keeps_the_run(demo, tmp_path, monkeypatch):
+    from lang3dxl_ns.model import Lang3DXLModel
+
+    (tmp_path / "scene").symlink_to(demo.out / "scene")
+    original = Lang3DXLModel.get_loss_dict
+
+    def interrupted(self, *args):
+        if self.step == 3:
+            signal.raise_signal(signal.SIGINT)
+        return original(self, *args)
+
+    monkeypatch.setattr(Lang3DXLModel, "get_loss_dict", interrupted)
+    settings = Demo(out=tmp_path, photos=8, steps=6, quick=True, wild=False, clip=demo.clip, dense=demo.dense)
+    with pytest.raises(SystemExit, match="same command goes on"):
+        settings.main()
+    checkpoints = tmp_path / "run" / "lang3dxl" / "demo" / "nerfstudio_models"
+    assert [path.name for path in checkpoints.glob("*")] == ["step-000000003.ckpt"]
+    monkeypatch.undo()
+    settings.main()
+    assert [path.name for path in checkpoints.glob("*")] == ["step-000000005.ckpt"]

@@ -1,0 +1,131 @@
+"""The world's frame is a convention: turned, moved and scaled it gives the same picture and crops."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scenes import write_scene
+
+from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.evaluation.numerics.physical_scale import in_world
+from lang3dxl_ns.evaluation.numerics.rasteriser import Scene
+from lang3dxl_ns.geometry import view_matrix
+from lang3dxl_ns.preparation.physical_scale import (
+    crop_sides,
+    physical_scales,
+    pixel_sizes,
+    propose_scale_range,
+    read_reconstruction,
+)
+from lang3dxl_ns.rendering import Camera, Gaussians, rasterize
+
+WORLDS = [(1.0, 0.0), (1e3, 0.0), (1e-3, 0.0), (1.0, 1e5), (1e3, 1e5), (1e-3, 1e5)]
+
+
+def render(scene: Scene, dtype: torch.dtype) -> torch.Tensor:
+    leaves = {name: value.to(dtype) for name, value in scene.leaves.items()}
+    (fx, fy), (cx, cy) = scene.focal, scene.centre
+    intrinsics = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=dtype)
+    return rasterize(
+        Gaussians(leaves["means"], leaves["quats"], leaves["log_scales"].exp(), leaves["logits"].sigmoid()),
+        Camera(scene.leaves["view_matrix"], intrinsics, scene.width, scene.height),
+        leaves["channels"],
+        near=scene.near,
+    ).image
+
+
+@pytest.mark.parametrize(("scale", "offset"), WORLDS)
+def test_the_image_is_the_same_in_every_world(scale, offset):
+    # In units of the scene an offset of 1e5 leaves float64 about eleven digits, in a world of 1e-3 eight.
+    expected = render(Scene(), torch.float64)
+    found = render(Scene().in_world(scale, offset), torch.float64)
+    assert float((found - expected).abs().max()) < 1e-13 * max(1, offset / scale)
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e-3])
+def test_the_image_is_the_same_at_every_scale_in_single_precision(scale):
+    found, expected = (render(scene, torch.float32) for scene in (Scene().in_world(scale), Scene()))
+    assert float((found - expected).abs().max()) < 1e-5
+
+
+@pytest.fixture(scope="module")
+def reconstruction(tmp_path_factory):
+    folder = write_scene(tmp_path_factory.mktemp("invariance"), photos=6, mixed=True)
+    return read_reconstruction(folder / "sparse" / "0")
+
+
+@pytest.mark.parametrize(("scale", "offset"), WORLDS)
+def test_the_crops_are_the_same_in_every_world_with_the_range_scaled_along(reconstruction, scale, offset):
+    photos = {name: in_world(photo, scale, offset) for name, photo in reconstruction.photos.items()}
+    origin = in_world(_point_photo(reconstruction), scale, offset).points
+    moved = type(reconstruction)(photos, origin, reconstruction.colours)
+    before, after = pixel_sizes(reconstruction)[0], pixel_sizes(moved)[0]
+    for name, photo in photos.items():
+        # Metres from cameras that are 1e5 · 4.6 away: ten digits, in a world of 1e-3 seven.
+        assert after[name] == pytest.approx(scale * before[name], rel=1e-14 * max(1e2, 1e2 * offset / scale))
+        crops = [
+            crop_sides(physical_scales(0.2 * unit, 2.0 * unit), sizes[name], photo.width)[0]
+            for unit, sizes in ((1.0, before), (scale, after))
+        ]
+        assert crops[0] == crops[1]
+    first, second = propose_scale_range(reconstruction, before), propose_scale_range(moved, after)
+    assert second.smallest == pytest.approx(scale * first.smallest, rel=1e-5)
+    assert second.largest == pytest.approx(scale * first.largest, rel=1e-5)
+
+
+def _point_photo(reconstruction):
+    """A photo that carries all points along."""
+    return replace(next(iter(reconstruction.photos.values())), points=reconstruction.points)
+
+
+@pytest.mark.parametrize("offset", [1e5, 1e6])
+def test_map_coordinates_reach_the_scene_without_loss(tmp_path, offset):
+    """Cameras and seed points of a model far from the origin show the same pixels as those of one at it."""
+    folder = write_scene(tmp_path, photos=6, points=100)
+    near = parse(folder)
+    far = parse(folder, offset * np.array([0.48, 4.6, 0.1]))
+    assert max(float(points.abs().max()) for _, points, _ in (near, far)) < 100
+    pixels = [
+        [project(cameras, i, points) for i in range(len(cameras.width))] for cameras, points, _ in (near, far)
+    ]
+    for first, second in zip(*pixels, strict=True):
+        assert float((first - second).abs().max()) < 1e-3
+    # And the transform that is saved still takes the model's own coordinates to the scene's.
+    _, points, outputs = far
+    original = outputs.metadata["original_points"]
+    rotation, shift = outputs.dataparser_transform.double().split([3, 1], dim=1)
+    again = outputs.dataparser_scale * (original @ rotation.T + shift[:, 0])
+    assert float((again - points).abs().max()) < 1e-6 * offset
+
+
+def parse(folder, offset=None):
+    """Cameras and seed points as the trainer gets them, of the model or of a copy moved by an offset."""
+    parser = PhotoCollectionDataParserConfig(data=folder, load_3D_points=True).setup()
+    if offset is not None:
+        parser._read_collection()
+        model = parser.reconstruction
+        photos = {
+            name: replace(
+                photo,
+                points=photo.points + offset,
+                camera_from_world=np.column_stack(
+                    [
+                        photo.camera_from_world[:, :3],
+                        photo.camera_from_world[:, 3] - photo.camera_from_world[:, :3] @ offset,
+                    ]
+                ),
+            )
+            for name, photo in model.photos.items()
+        }
+        parser.reconstruction = replace(model, photos=photos, points=model.points + offset)
+    outputs = parser.get_dataparser_outputs(split="train")
+    outputs.metadata["original_points"] = torch.from_numpy(parser.reconstruction.points)
+    return outputs.cameras, outputs.metadata["points3D_xyz"], outputs
+
+
+def project(cameras, index: int, points: torch.Tensor) -> torch.Tensor:
+    view = view_matrix(cameras.camera_to_worlds[index])
+    camera = points @ view[:3, :3].T + view[:3, 3]
+    focal = torch.stack([cameras.fx[index, 0], cameras.fy[index, 0]])
+    return focal * camera[:, :2] / camera[:, 2:]
