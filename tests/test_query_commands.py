@@ -129,7 +129,7 @@ def truth(tmp_path):
 
 
 def test_the_benchmark_compares_tables_with_the_exact_path(run, tmp_path, truth):
-    words = ("benchmark", "lookup", "--load-config", "c", "--out", tmp_path, "--sizes", 8, 64)
+    words = ("benchmark", "lookup", "--load-config", "c", "--out", tmp_path, "--sizes", 2, 64)
     run(*words, "--ground-truth", truth, "--repeats", 1, "--frame", 64, 48)
     results = json.loads((tmp_path / "lookup.json").read_text())
     coarse, fine = results["tables"]
