@@ -97,7 +97,7 @@ def test_mistakes_end_in_a_sentence(run, tmp_path, words, message):
 
 def test_settings_are_flags(run, tmp_path):
     words = ("query", "--load-config", "c", "--text", "dome", "--image", "0002", "--out", tmp_path)
-    run(*words, "--threshold", 0.999, "--synonyms", "off", "--sizes", 8)
+    run(*words, "--threshold", 0.9999, "--synonyms", "off", "--sizes", 8)
     assert not np.asarray(Image.open(tmp_path / "dome" / "right_0002.mask.png")).any()
 
 
@@ -129,7 +129,7 @@ def truth(tmp_path):
 
 
 def test_the_benchmark_compares_tables_with_the_exact_path(run, tmp_path, truth):
-    words = ("benchmark", "lookup", "--load-config", "c", "--out", tmp_path, "--sizes", 8, 64)
+    words = ("benchmark", "lookup", "--load-config", "c", "--out", tmp_path, "--sizes", 2, 64)
     run(*words, "--ground-truth", truth, "--repeats", 1, "--frame", 64, 48)
     results = json.loads((tmp_path / "lookup.json").read_text())
     coarse, fine = results["tables"]

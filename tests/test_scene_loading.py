@@ -20,7 +20,7 @@ def trainer(tmp_path_factory, tiny_clip, tiny_dense):
     """A run whose photos are gone."""
     root = tmp_path_factory.mktemp("run")
     data = write_scene(root / "scene", photos=6, points=200, mixed=True)
-    trainer = make_trainer(data, tiny_clip, tiny_dense, root, iterations=30)
+    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=30)
     trainer.setup()
     trainer.train()
     data.rename(root / "moved")
