@@ -62,9 +62,9 @@ class StepGuard:
         if self._in_a_row >= self.most_in_a_row:
             raise UserError(
                 f"{self._in_a_row} steps in a row had no finite loss or gradient (the last, step {step}, "
-                f"photo {photo}: {what}). Nothing broken has reached the parameters: look at the photos named "
-                f"above and their masks and targets, lower the learning rate of the parameters named here, "
-                f"or allow more with --max-skipped-steps"
+                f"photo {photo}: {what}). Nothing broken has reached the parameters: look at the photos "
+                f"named above and their masks and targets, lower the learning rate of the parameters named "
+                f"here, or allow more with --max-skipped-steps"
             )
 
     def summary(self) -> str | None:
