@@ -127,7 +127,8 @@ def pixel_size(
 ) -> float | None:
     """World units that a pixel of the photo shows at the distance of its tracked points.
 
-    distance: "median" is the camera's distance to the points' per-axis median, robust against outliers;
+    distance: "median" is the camera's distance to the points' median (per axis of the camera), robust
+    against outliers;
     "mean" to their mean; "mean-inner" to the mean without the points near the photo's edges (the paper).
     angle: "half" is 2 d tan(θ/2) with θ the full field of view over the pixels, which the published scale
     ranges belong to; "paper" is the paper's text, 2 d tan θ with θ = arctan(W / f) / W; "exact" the pinhole's
@@ -232,10 +233,12 @@ def _extent(points: Float[Array, "m 3"]) -> float:
 def _subject_distance(photo: PhotoGeometry, rule: DistanceRule) -> float | None:
     """Distance from the camera to the middle of its tracked points; None without a usable one.
 
-    A point behind the camera can't be seen: its track is wrong, and it doesn't count.
+    In the camera's frame: the per-axis median of a world that is turned would be another point. What is
+    behind the camera can't be seen: such a track is wrong, and doesn't count.
     """
-    in_front = photo.points @ photo.camera_from_world[2, :3] + photo.camera_from_world[2, 3] > 0
-    points = photo.points[in_front]
+    points = (photo.points - photo.centre) @ photo.camera_from_world[:, :3].T
+    in_front = points[:, 2] > 0
+    points = points[in_front]
     if rule == "mean-inner":
         size = np.array([photo.width, photo.height])
         inner = (np.abs(photo.pixels[in_front] / size - 0.5) < 0.5 - EDGE_MARGIN).all(axis=1)
@@ -243,7 +246,7 @@ def _subject_distance(photo: PhotoGeometry, rule: DistanceRule) -> float | None:
     if not len(points):
         return None
     middle = np.median(points, axis=0) if rule == "median" else points.mean(axis=0)
-    d = float(np.linalg.norm(middle - photo.centre))
+    d = float(np.linalg.norm(middle))
     return d if 0 < d < math.inf else None
 
 

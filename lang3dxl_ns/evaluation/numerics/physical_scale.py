@@ -116,7 +116,8 @@ def _sizes(photo: PhotoGeometry) -> Callable[[], Problem]:
 def pixel_size_reference(photo: PhotoGeometry, distance: DistanceRule, angle: AngleRule) -> float:
     """Lang3D-XL's pixel size in 80-bit arithmetic; −1 where there is nothing to measure by."""
     pose, points = photo.camera_from_world.astype(LONG), photo.points.astype(LONG)
-    in_front = points @ pose[2, :3] + pose[2, 3] > 0
+    points = points @ pose[:, :3].T + pose[:, 3]
+    in_front = points[:, 2] > 0
     points, pixels = points[in_front], photo.pixels[in_front]
     if distance == "mean-inner":
         inner = (np.abs(pixels / [photo.width, photo.height] - 0.5) < 0.4).all(axis=1)
@@ -124,7 +125,7 @@ def pixel_size_reference(photo: PhotoGeometry, distance: DistanceRule, angle: An
     if not len(points):
         return -1.0
     middle = _median(points) if distance == "median" else points.sum(axis=0) / len(points)
-    d = np.sqrt(((pose[:, :3] @ middle + pose[:, 3]) ** 2).sum())
+    d = np.sqrt((middle**2).sum())
     sizes = []
     for length, focal in ((photo.width, photo.fx), (photo.height, photo.fy)):
         ratio = LONG(length) / LONG(focal)
