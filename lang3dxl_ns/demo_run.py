@@ -160,7 +160,7 @@ class Demo:
             "machine": describe_machine(trainer.device),
             "held_out": len(photos),
             "gaussians": trainer.pipeline.model.num_points,
-            "field": {"psnr": means["psnr"], "ssim": means["ssim"]},
+            "field": {name: means[name] for name in ("psnr", "cc_psnr", "ssim")},
         }
         for name, prefix in (("field", ""), ("teacher", "teacher_")):
             precision = {c: means[f"{prefix}ap_{c}"] for c in CATEGORIES if f"{prefix}ap_{c}" in means}
@@ -185,7 +185,11 @@ class Demo:
         unblurred = report["field"].get("mAP_without_blur")
         unblurred = "" if unblurred is None else f"; without, the field's mAP is {unblurred:.3f}"
         features = report.get("features", {})
-        quality = [["PSNR (dB)", f"{report['field']['psnr']:.2f}", ""]] + [
+        quality = [
+            ["PSNR (dB)", f"{report['field']['psnr']:.2f}", ""],
+            ["PSNR with matched colours (dB)", f"{report['field']['cc_psnr']:.2f}", ""],
+        ]
+        quality += [
             [label, f"{features[name]:.4g}", f"{features[f'{name}_of_mean']:.4g}"]
             for name, label in FEATURES.items()
             if name in features

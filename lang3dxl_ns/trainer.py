@@ -20,7 +20,7 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
-from torch.amp.grad_scaler import GradScaler
+from torch.cuda.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -131,8 +131,10 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             if isinstance(group["scheduler"], RunScheduleConfig):
                 group["scheduler"].total_steps = iterations
         self.load_dir, self.load_checkpoint = _absolute(self.load_dir), _absolute(self.load_checkpoint)
-        if self.load_dir or self.load_checkpoint:
-            self._follow(self.load_dir.parent if self.load_dir else self.load_checkpoint.parents[1])
+        if self.load_dir is not None:
+            self._follow(self.load_dir.parent)
+        elif self.load_checkpoint is not None:
+            self._follow(self.load_checkpoint.parents[1])
         self.pipeline.model.fit_to_run(iterations)
         self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
         datamanager = self.pipeline.datamanager

@@ -62,7 +62,7 @@ def test_flags_of_training_reach_it(demo, tmp_path):
     settings.ns_train = "--pipeline.model.sky-gaussians 0"
     settings.main()
     report = json.loads((tmp_path / "run" / "lang3dxl" / "demo" / "report.json").read_text())
-    assert set(report["field"]) == {"psnr", "ssim"}
+    assert set(report["field"]) == {"psnr", "cc_psnr", "ssim"}
     assert "features" not in report
 
 

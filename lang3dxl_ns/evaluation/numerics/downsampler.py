@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +21,7 @@ HALF = {"bf16": Bounds(2e-2, 1e-2, 3e-2, 2e-2), "fp16": Bounds(3e-3, 2e-3, 5e-3,
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
     """Logits of any size by the path for free logits and, where it differs, the one for bounded ones."""
-    shapes = {
+    shapes: dict[str, dict[str, Any]] = {
         "usual": {},
         "size that doesn't divide": {"grid": (5, 7)},
         "map smaller than the grid": {"size": (5, 6), "grid": (9, 11)},

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -37,8 +37,8 @@ class Bounds:
 
     def times(self, factor: float) -> Bounds:
         """The same, all errors wider by a factor."""
-        errors = (self.output_max, self.output_rms, self.gradient_max, self.gradient_rms)
-        return Bounds(*(factor * error for error in errors), flipped=self.flipped)
+        names = ("output_max", "output_rms", "gradient_max", "gradient_rms")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
 
 
 EXACT = Bounds(1e-9, 1e-9, 1e-7, 1e-7)
