@@ -66,7 +66,7 @@ class Demo:
     dense: str = "builtin"
     """Dense encoder: the same choices."""
     ns_train: str = ""
-    """More flags of `ns-train lang3dxl`, in one string, such as "--pipeline.model.dense-weight 0.5"."""
+    """More flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.dense-weight 0.5"."""
 
     def main(self) -> None:
         out = self.out.expanduser().absolute()

@@ -22,8 +22,9 @@ from lang3dxl_ns.preparation.physical_scale import Reconstruction, crop_sides
 LIGHT = 0.3
 """Spread of the photos' exposures, in natural logarithms of light: under half a stop a camera's own metering
 explains it, and a scene of one colour per surface absorbs it."""
-SHEEN = 0.25
-"""Share of the residual colours that the viewing direction explains."""
+SHEEN = 0.4
+"""Share of the residual colours that the viewing direction explains: 0.1 to 0.3 on matte landmarks, whose
+haze and noise mimic it, 0.5 and more on real ones."""
 REPROJECTION = 2.0
 """Pixels: COLMAP's bundle adjustment usually ends below one."""
 SPREAD_OF_SCALE = "physical widths of the photos, 95th over 5th percentile"

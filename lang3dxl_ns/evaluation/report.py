@@ -65,7 +65,10 @@ def command_line(command: str, settings: Any) -> str:
 def _flag(name: str, value: Any) -> list[str]:
     if isinstance(value, bool):
         return [f"--{name}" if value else f"--no-{name}"]
-    return [f"--{name}", *(shlex.quote(str(item)) for item in _flatten(value))]
+    words = [shlex.quote(str(item)) for item in _flatten(value)]
+    if isinstance(value, str) and value.startswith("-"):  # would be taken for a flag of its own
+        return [f"--{name}={words[0]}"]
+    return [f"--{name}", *words]
 
 
 def _flatten(value: Any) -> Iterable[Any]:
