@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,12 +18,15 @@ from lang3dxl_ns.query.lookup import CodeTable, Lookup, TableCheck, TableError
 from lang3dxl_ns.rendering import Camera
 
 
-def fingerprint(tensors: Mapping[str, Tensor], settings: object) -> str:
-    """16 hex digits over tensors and settings (anything that JSON or `str` can spell)."""
+def fingerprint(state: Mapping[str, Any], settings: object) -> str:
+    """16 hex digits over a state (tensors, or anything that `str` can spell) and settings (as JSON)."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
-    for name, tensor in sorted(tensors.items()):
-        digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
-        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    for name, value in sorted(state.items()):
+        if not isinstance(value, Tensor):
+            digest.update(f"{name} {value}".encode())
+            continue
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()[:16]
 
 
