@@ -220,7 +220,8 @@ def test_nearest_takes_the_camera_that_stands_and_looks_alike(scale):
     field = learned_field("nearest", scale)
     views = {"a.jpg": (0.0, 1.0), "b.jpg": (1.0, -1.0), "c.jpg": (9.0, 1.0)}
     views_between = {"a.jpg": (0.9, 1.0), "b.jpg": (0.1, -1.0)}
-    for expected in (views, views_between):
+    views_outside = {"a.jpg": (-2.0, 1.0), "c.jpg": (14.0, -1.0)}
+    for expected in (views, views_between, views_outside):
         for name, (x, z) in expected.items():
             view = torch.tensor([x, 0.0, 0.0]) * scale, torch.tensor([0.0, 0.0, z])
             assert torch.equal(field.vector_of_view(*view), field.vector(name)), (name, x, z)
