@@ -55,7 +55,7 @@ class Demo:
     photos: int | None = None
     """How many photos; 48, or 24 with --quick."""
     steps: int | None = None
-    """Training iterations; 1,200, or 200 with --quick."""
+    """Training iterations; 1,200, or 250 with --quick."""
     wild: bool = True
     """Photos as from the Internet: other sizes, lenses, weather, exposures and passers-by in each.
     --no-wild: one camera, one sun, nobody there."""
@@ -134,7 +134,7 @@ class Demo:
 
         from lang3dxl_ns.methods import run_config
 
-        steps = self.steps or (200 if self.quick else 1_200)
+        steps = self.steps or (250 if self.quick else 1_200)
         config = run_config(scene, out, str(RUN.parts[0]), steps, self.clip, self.dense)
         config.timestamp = RUN.name
         config.pipeline.datamanager.foreground = "none"  # every pixel counts, sky and people too
