@@ -49,6 +49,13 @@ def centre_and_radius(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"],
     return centre, float((points - centre).norm(dim=1).quantile(0.9))
 
 
+def fitted_size(codes: Float[Tensor, "H W 3"], longer_side: int) -> tuple[int, int]:
+    """Rows and columns of a map of at most `longer_side` pixels."""
+    height, width = codes.shape[:2]
+    scale = min(longer_side / max(height, width), 1.0)
+    return max(round(height * scale), 1), max(round(width * scale), 1)
+
+
 def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "count 3"]:
     """Evenly spread points (a Fibonacci lattice) on a sphere of ten times the scene's radius."""
     centre, radius = centre_and_radius(points)

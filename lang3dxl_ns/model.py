@@ -27,7 +27,8 @@ from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
-from lang3dxl_ns.geometry import centre_and_radius, in_view, view_matrix
+from lang3dxl_ns.geometry import centre_and_radius, fitted_size, in_view, view_matrix
+from lang3dxl_ns.hash_levels import HashLevels
 from lang3dxl_ns.initial_gaussians import initial_gaussians, seed_positions
 from lang3dxl_ns.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.preparation.prepare import FeatureStatistics
@@ -69,6 +70,7 @@ class Lang3DXLModel(SplatfactoModel):
                 clip.std if dense is None else torch.cat([clip.std, dense.std]),
             )
         self.look = None
+        self.hash_levels = HashLevels()
         self.appearance = None
         if self._wants("appearance", self.config.appearance.use):
             self.appearance = self._make_appearance()
@@ -135,6 +137,8 @@ class Lang3DXLModel(SplatfactoModel):
         super().step_cb(optimizers, step)
         if self.semantic_field is not None:
             self.semantic_field.set_progress(step / self.config.total_steps)
+            if step == self.config.total_steps // 2:
+                self.hash_levels.decide(self.semantic_field, self.optimizers)
         if self.config.freeze_geometry_after_warm_up and self._warm_up_is_over:
             for name, parameter in self.gauss_params.items():
                 # Densification wraps tensors anew, so this is said before every iteration.
@@ -298,7 +302,10 @@ class Lang3DXLModel(SplatfactoModel):
         c = self.config
         assert c.dense_weight is not None
         ramp = schedules.semantic_ramp(self.step / c.total_steps)
-        clip, dense, small_mask = self._decode_small(codes, mask, self._random_size())
+        size = fitted_size(codes, self._random_size())
+        if c.hash_levels == "auto" and 0.4 <= self.step / c.total_steps < 0.5 and self.semantic_field:
+            self.hash_levels.watch(self.semantic_field, _resize(codes, size))
+        clip, dense, small_mask = self._decode_small(codes, mask, size)
         with part("downsample"):
             predicted, weight = self._downsample(clip, batch, small_mask)
         with part("losses"):
@@ -313,11 +320,8 @@ class Lang3DXLModel(SplatfactoModel):
                 loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
         return loss
 
-    def _decode_small(self, codes: Float[Tensor, "H W 3"], mask: Tensor | None, longer_side: int):
-        """Decode a map resized (nearest) to a given longer side → clip [h, w, C], dense, mask [h, w]."""
-        height, width = codes.shape[:2]
-        scale = min(longer_side / max(height, width), 1.0)
-        size = max(round(height * scale), 1), max(round(width * scale), 1)
+    def _decode_small(self, codes: Float[Tensor, "H W 3"], mask: Tensor | None, size: tuple[int, int]):
+        """Decode a map resized (nearest) to a given size → clip [h, w, C], dense, mask [h, w]."""
         small_mask = None if mask is None else _resize(mask[..., None].float(), size)[..., 0]
         assert self.semantic_field is not None
         with part("decode"):
@@ -375,7 +379,8 @@ class Lang3DXLModel(SplatfactoModel):
         """Agreement with the held-out photo's targets, beside that of the mean feature of training."""
         assert self.semantic_field is not None and self.config.decode_size is not None
         mask = batch["mask"][..., 0] if "mask" in batch else None
-        clip, dense, small_mask = self._decode_small(self.rendered_codes, mask, self.config.decode_size[1])
+        size = fitted_size(self.rendered_codes, self.config.decode_size[1])
+        clip, dense, small_mask = self._decode_small(self.rendered_codes, mask, size)
         predicted, weight = self._downsample(clip, batch, small_mask)
         metrics = feature_metrics("clip", predicted, batch["clip_target"], self.clip_mean, weight)
         if dense is not None and "dense_target" in batch:
@@ -422,6 +427,10 @@ class Lang3DXLModel(SplatfactoModel):
         if self.semantic_field is None:
             self._add_semantics(*saved.values())
             self.to(self.device)
+        assert self.semantic_field is not None
+        kept = self.semantic_field.grid.levels_in(len(state["semantic_field.grid.table"]))
+        if kept is not None and kept < self.semantic_field.grid.levels:
+            self.semantic_field.keep_levels(kept)
         for kind, mean, prepared in zip(
             saved, saved.values(), (self.clip_mean, self.dense_mean), strict=True
         ):

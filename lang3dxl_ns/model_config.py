@@ -46,6 +46,9 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     view_dependence: Literal["auto", "on", "off"] = "auto"
     """Colours that change with the viewing direction (spherical harmonics of `sh_degree`); off leaves one
     colour per Gaussian and a quarter of its numbers. `auto`: as the scene's measured needs say."""
+    hash_levels: Literal["auto", "on"] = "on"
+    """`on`: keep all levels of the field's grid. `auto`: halfway through the run, drop those that are finer
+    than the step of the code from one decoded pixel to the next, which could only learn noise."""
     camera_optimisation: Literal["auto", "on", "off"] = "auto"
     """Refine the cameras while training. `auto`: where the COLMAP model's reprojection error is large."""
     sky_gaussians: int = 2_000

@@ -253,6 +253,8 @@ class Lang3DXLTrainer(Trainer):
                 super().train()
         finally:
             self.config.max_num_iterations = total
+            if found := self.pipeline.model.hash_levels.verdict:
+                write_needs([*self.pipeline.datamanager.needs, found], self.base_dir)
             if summary := self.guard.summary():
                 CONSOLE.log(f"[yellow]{summary}")
 

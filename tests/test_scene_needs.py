@@ -168,3 +168,34 @@ def test_a_resumed_run_keeps_what_auto_meant(train, scene, tiny_clip, tiny_dense
     ).config.pipeline.model
     assert longer.semantic_field.preset == "short"
     assert longer.appearance.use == ("on" if needs["appearance"]["needed"] else "off")
+
+
+def test_hash_levels_that_codes_cannot_resolve_are_dropped_with_their_moments(train, scene):
+    trainer = train(scene, iterations=24, pipeline__model__hash_levels="auto")
+    model, verdict = trainer.pipeline.model, trainer.pipeline.model.hash_levels.verdict
+    grid, settings = model.semantic_field.grid, model.semantic_field.settings
+    assert verdict is not None and verdict.component in read_needs(trainer.base_dir)
+    assert grid.levels == grid.resolved_levels(verdict.value) or grid.levels == settings.levels
+    for name in ("field_encoding", "field_decoder"):
+        for parameter, state in trainer.optimizers.optimizers[name].state.items():
+            assert state["exp_avg"].shape == parameter.shape
+
+
+@pytest.mark.parametrize("choice", ["auto", "on"])
+def test_few_levels_suffice_for_coarse_codes_and_a_checkpoint_remembers(train, scene, monkeypatch, choice):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    from lang3dxl_ns import hash_levels
+
+    monkeypatch.setattr(hash_levels, "median", lambda steps: 1 / 40)  # finer cells than this: 51 and more
+    trainer = train(scene, iterations=24, pipeline__model__hash_levels=choice)
+    grid = trainer.pipeline.model.semantic_field.grid
+    assert grid.levels == (3 if choice == "auto" else 8)
+    assert len(grid.table) == grid.entries
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="test")
+    codes = torch.randn(50, 3)
+    expected, loaded = (
+        t.pipeline.model.semantic_field if t is trainer else t.model.semantic_field
+        for t in (trainer, pipeline)
+    )
+    assert torch.equal(expected.decode_clip(codes), loaded.decode_clip(codes))

@@ -66,6 +66,7 @@ class HashGrid(nn.Module):
         capacity = 2**log2_table_size
         sizes = [min(_round_up(r**input_dim, 8), capacity) for r in resolutions]
         self.entries = sum(sizes)
+        self._ends = [sum(sizes[: level + 1]) for level in range(levels)]
         self.dense_levels = sum(r**input_dim <= capacity for r in resolutions)
         self.hash_mask = capacity - 1
 
@@ -96,6 +97,28 @@ class HashGrid(nn.Module):
         lower = position.floor()
         index = self._vertex_entries(lower.long())
         return _Interpolate.apply(x, self.table, index, position - lower, self.cells, level_weights)
+
+    def keep_levels(self, count: int) -> None:
+        """Drop all but the `count` coarsest levels, their entries too: the table becomes a new parameter.
+
+        Raises ValueError for fewer than one or more than there are.
+        """
+        if not 1 <= count <= self.levels:
+            raise ValueError(f"the grid has {self.levels} levels, {count} can't be kept")
+        self.levels, self.output_dim = count, count * self.features_per_level
+        self._ends, self.entries = self._ends[:count], self._ends[count - 1]
+        self.dense_levels = min(self.dense_levels, count)
+        self.table = nn.Parameter(self.table.detach()[: self.entries].clone())
+        self.cells, self.offsets = self.cells[:count], self.offsets[:count]
+        self.dense_resolutions = self.dense_resolutions[: self.dense_levels]
+
+    def levels_in(self, entries: int) -> int | None:
+        """How many of the coarsest levels make a table of this many entries; None for none of them."""
+        return self._ends.index(entries) + 1 if entries in self._ends else None
+
+    def resolved_levels(self, distance: float) -> int:
+        """Number of levels whose cells are not finer than a distance in the unit cube; at least one."""
+        return max(int((1 / self.cells >= distance).sum()), 1)
 
     def coarse_to_fine(self, fraction: float) -> Float[Tensor, " levels"]:
         """Level weights that open the coarsest level at fraction 0 and all at 1; the newest one fades in."""

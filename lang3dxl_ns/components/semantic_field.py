@@ -6,8 +6,9 @@ CLIP features and, through the same hidden layers, dense (DINO) features.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -188,6 +189,14 @@ class SemanticFieldConfig:
         return settings
 
 
+class ShrunkParameter(NamedTuple):
+    """A parameter, what replaced it, and how to cut anything of the old shape to the new one."""
+
+    old: Tensor
+    new: Tensor
+    cut: Callable[[Tensor], Tensor]
+
+
 class SemanticField(nn.Module):
     """Decodes rendered codes to raw (not unit length) CLIP features and, if asked for, dense features.
 
@@ -263,6 +272,26 @@ class SemanticField(nn.Module):
         """Tell how much of the run is done (0 to 1): opens the grid's levels; saved with the checkpoint."""
         if self.level_weights is not None:
             self.level_weights.copy_(self.grid.coarse_to_fine(fraction / self.settings.coarse_to_fine))
+
+    def keep_levels(self, count: int) -> list[ShrunkParameter]:
+        """Drop all but the grid's `count` coarsest levels, and what the decoder's first layer reads of them.
+
+        Returns the parameters that were replaced, for the optimiser to follow.
+        """
+        first = self.hidden[0]
+        assert isinstance(first, nn.Linear) and not self.settings.indexed
+        columns = first.in_features - (self.grid.levels - count) * self.grid.features_per_level
+        table, weight = self.grid.table, first.weight
+        self.grid.keep_levels(count)
+        entries = self.grid.entries
+        first.weight = nn.Parameter(weight.detach()[:, :columns].clone())
+        first.in_features = columns
+        if self.level_weights is not None:
+            self.level_weights = self.level_weights[:count]
+        return [
+            ShrunkParameter(table, self.grid.table, lambda moment: moment[:entries].clone()),
+            ShrunkParameter(weight, first.weight, lambda moment: moment[:, :columns].clone()),
+        ]
 
     def forward(
         self, codes: Float[Tensor, "*batch code"]

@@ -51,6 +51,11 @@ def plan_crops(
     Crops have one size in the world, unless the scene has no 3D points to measure with, or its photos agree
     in scale so well (`SCALE_RATIO`) that under "auto" one size in the photo does the same.
     """
+    if config.scale_mode == "physical" and not len(reconstruction.points):
+        raise UserError(
+            "crops of physical size need 3D points, and the scene has none: reconstruct it with COLMAP, or "
+            "pass --pipeline.datamanager.scale-mode auto"
+        )
     if config.scale_mode == "relative" or not len(reconstruction.points):
         scales = relative_scales() if config.scale_range is None else relative_scales(7, *config.scale_range)
         reasons = [f"crops of {_listed(scales)} of the photo's width"]

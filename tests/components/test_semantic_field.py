@@ -316,3 +316,30 @@ def test_short_preset_learns_a_labelled_scene_in_300_steps():
         schedule.step()
     error = (torch.cat(field(codes), 1) - targets).abs().mean()
     assert error < 0.15 * (targets - targets.mean(0)).abs().mean()
+
+
+def test_dropping_levels_is_the_same_as_closing_them():
+    """What is left decodes as if the dropped levels had held zeros."""
+    field = SemanticField(
+        SemanticFieldConfig(preset="short"), 16, 8, generator=torch.Generator().manual_seed(0)
+    )
+    codes = torch.randn(40, 3)
+    with torch.no_grad():
+        field.grid.table.uniform_(-1, 1)
+        kept = field.grid._ends[2]
+        field.grid.table[kept:] = 0
+    expected = field.decode_clip(codes)
+    for shrunk in field.keep_levels(3):
+        assert torch.equal(shrunk.cut(shrunk.old), shrunk.new)
+    assert field.grid.entries == kept == len(field.grid.table)
+    torch.testing.assert_close(field.decode_clip(codes), expected)
+    field.decode_clip(codes).sum().backward()
+    assert field.grid.table.grad.shape == field.grid.table.shape
+
+
+def test_a_grid_keeps_at_least_one_level_and_not_more_than_it_has():
+    grid = SemanticField(SemanticFieldConfig(preset="short"), 16).grid
+    assert grid.resolved_levels(1.0) == 1 and grid.resolved_levels(0.0) == 8
+    assert grid.levels_in(len(grid.table)) == 8 and grid.levels_in(3) is None
+    with pytest.raises(ValueError, match="8 levels"):
+        grid.keep_levels(9)
