@@ -67,8 +67,9 @@ class Query:
                 for folder, match in zip(folders, matches, strict=True):
                     write_match(match, folder / name, self.settings.threshold)
                 views.append(_view_report(name, matches))
-        report = {"threshold": self.settings.threshold, "exact": self.exact or scene.lookup.table is None}
-        report |= {
+        report = {
+            "threshold": self.settings.threshold,
+            "exact": self.exact or scene.lookup.table is None,
             "texts": [_text_report(m, f) for m, f in zip(matches, folders, strict=True)],
             "views": views,
         }

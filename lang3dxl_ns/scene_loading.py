@@ -47,8 +47,12 @@ def _photos(dataset: PhotoDataset, split) -> list[ScenePhoto]:
             photo.name,
             split,
             cameras.camera_to_worlds[i].tolist(),
-            *(float(values[i]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)),
-            *(int(values[i]) for values in (cameras.width, cameras.height)),
+            fx=float(cameras.fx[i]),
+            fy=float(cameras.fy[i]),
+            cx=float(cameras.cx[i]),
+            cy=float(cameras.cy[i]),
+            width=int(cameras.width[i]),
+            height=int(cameras.height[i]),
         )
         for i, photo in enumerate(dataset.photos)
     ]

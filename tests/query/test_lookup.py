@@ -149,7 +149,7 @@ def test_where_the_decoder_bends_sharply_codes_are_decoded(queries):
     plain, careful = (build_table(kinked, codes, 64, True) for _ in range(2))
     careful.leave_out_rough_cells(kinked, queries, tolerance=0.03)
     errors = [table_error(exact, CodeScorer(kinked, t).relevancy(codes, queries)) for t in (plain, careful)]
-    assert errors[0].p999 > 0.1 and errors[1].p999 < 0.03
+    assert errors[0].p999 > 0.05 and errors[1].p999 < 0.03
     assert 0 < (~careful.locate(codes)[2]).float().mean() < 0.1
     torch.testing.assert_close(careful.locate(torch.tensor([[0.001, 0.0, 0.0]]))[2], torch.tensor([False]))
 
