@@ -88,17 +88,20 @@ def measure(scene: Scene, settings: LookupBenchmark) -> dict[str, Any]:
     truth = _ground_truth(scene, settings)
     prompts = truth.categories if truth else list(PROBES)
     queries = scene.text.plain_queries(prompts).to(scene.device)
-    codes = scene.rendered_codes()
+    codes, probes = scene.rendered_codes(), scene.text.plain_queries(PROBES).to(scene.device)
     clock = (
         time.process_time
         if scene.device.type == "cpu" and torch.get_num_threads() == 1
         else time.perf_counter
     )
     wall = clock is time.perf_counter
-    tables, built = {}, {}
+    tables: dict[str, CodeTable] = {}
+    built: dict[str, float] = {}
     for size in settings.sizes:
         start = clock()
-        tables[str(size)] = tabulate(scene.decode, mark_cells(codes, size, scene.bounded))
+        table = tabulate(scene.decode, mark_cells(codes, size, scene.bounded))
+        table.leave_out_rough_cells(scene.decode, probes, scene.config.lookup.tolerance)
+        tables[str(size)] = table
         built[str(size)] = clock() - start
     exact = scene.scorer(exact=True)
     scorers = {EXACT: exact} | {
@@ -136,6 +139,7 @@ def measure(scene: Scene, settings: LookupBenchmark) -> dict[str, Any]:
         "gaussians": len(scene.gaussians["means"]),
         "channels": queries.vectors.shape[1],
         "codes": len(codes),
+        "tolerance": scene.config.lookup.tolerance,
         "seen": float((view.alpha >= scene.config.min_alpha).float().mean()),
         "render_ms": milliseconds["render"],
         "exact_ms": milliseconds[EXACT],
@@ -241,9 +245,9 @@ prompts {", ".join(results["prompts"])}. {results["machine"]}. Times are {result
 {table}
 
 Errors are of relevancy, 0…1, over the pixels that show something. "Decoded exactly" is the share of those
-that lie outside the table. A frame has {width}×{height} pixels ({results["seen"]:.0%} show something) and is
-answered for one prompt, rendering ({results["render_ms"]:.0f} ms) aside; "new text" is what a frame costs
-more when the prompt changes.
+that lie where the table knows nothing, or would be off by more than {results["tolerance"]}. A frame has
+{width}×{height} pixels ({results["seen"]:.0%} show something) and is answered for one prompt, rendering
+({results["render_ms"]:.0f} ms) aside; "new text" is what a frame costs more when the prompt changes.
 
 ![Error against time](lookup.png)
 """

@@ -33,7 +33,10 @@ class LookupConfig:
     sizes: tuple[int, ...] = (64, 128)
     """Cells per axis, tried in turn until a table is good enough; none left: every code is decoded."""
     tolerance: float = 0.03
-    """Largest error of relevancy (99.9th percentile, against exact decodes) of a table that is used."""
+    """Largest error of relevancy: of a table that is used (99.9th percentile, against exact decodes), and in
+    the middle of a cell, or the codes of that cell are decoded."""
+    most_decoded: float = 0.1
+    """A table that leaves more of the codes than this to be decoded is too coarse."""
     max_mb: float = 512.0
     """A table that would need more memory is not built."""
 
@@ -58,7 +61,10 @@ class TableCheck:
     megabytes: float
     seconds: float
     """To build it."""
+    decoded: float
+    """Share of the codes that lie in cells which it leaves to be decoded."""
     error: TableError
+    """With those decoded."""
 
 
 class CodeTable:
@@ -97,6 +103,22 @@ class CodeTable:
         parts = [part.to(vectors.dtype) @ vectors.T for part in self.features.split(_ROWS_AT_ONCE)]
         self._last = vectors.clone(), torch.cat(parts)
         return self._last[1]
+
+    @torch.no_grad()
+    def leave_out_rough_cells(
+        self, decode: Decode, probes: Queries, tolerance: float, temperature: float = TEMPERATURE
+    ) -> None:
+        """Forget the cells in whose middle the relevancy to any of the probes is off by more than
+        `tolerance`: where the decoder bends too sharply, its codes are decoded."""
+        cells = (self.cell_of >= 0).nonzero()
+        middles = self.low + (cells // self._strides % self.size + 0.5) * (self.extent / self.size)
+        if self.bounded:
+            middles = middles.clamp(_EDGE, 1 - _EDGE).logit()
+        cosines = self.cosines(probes.vectors)
+        for part, codes in zip(cells[:, 0].split(_ROWS_AT_ONCE), middles.split(_ROWS_AT_ONCE), strict=True):
+            exact = probes.relevancy_of_cosines(cosines_of_codes(decode, codes, probes), temperature)
+            read = probes.relevancy_of_cosines(self.read(codes, cosines)[0], temperature)
+            self.cell_of[part[(exact - read).abs().amax(0) > tolerance]] = -1
 
     def locate(
         self, codes: Float[Tensor, "n d"]
@@ -241,11 +263,12 @@ class Lookup:
             if len(grid.vertices) * probes.vectors.shape[1] * 2 / 2**20 > config.max_mb:
                 break
             table = tabulate(decode, grid)
+            table.leave_out_rough_cells(decode, probes, config.tolerance, temperature)
             seconds = time.perf_counter() - start
-            read, _ = table.read(sample, table.cosines(probes.vectors))
-            error = table_error(exact, probes.relevancy_of_cosines(read, temperature))
-            checks.append(TableCheck(size, len(table.features), table.megabytes, seconds, error))
-            if error.p999 <= config.tolerance:
+            decoded = 1 - float(table.locate(sample)[2].float().mean())
+            error = table_error(exact, CodeScorer(decode, table, temperature).relevancy(sample, probes))
+            checks.append(TableCheck(size, len(table.features), table.megabytes, seconds, decoded, error))
+            if error.p999 <= config.tolerance and decoded <= config.most_decoded:
                 return cls(table, checks)
         return cls(None, checks)
 
@@ -253,7 +276,7 @@ class Lookup:
         lines = [
             f"{c.size} cells per axis, {c.vertices} vertices, {c.megabytes:.0f} MB, {c.seconds:.1f} s; "
             f"error of relevancy {c.error.mean:.4f} on average, {c.error.p999:.4f} at the 99.9th percentile, "
-            f"{c.error.flips:.2%} across 0.5"
+            f"{c.error.flips:.2%} across 0.5, {c.decoded:.2%} left to be decoded"
             for c in self.checks
         ]
         return "; ".join(lines if self.table else [*lines, "no table is good enough: every code is decoded"])

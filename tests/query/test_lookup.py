@@ -131,10 +131,27 @@ def test_the_coarsest_table_that_is_good_enough_is_chosen(queries):
 
     generous, strict, impossible, small = choose(1.0), choose(0.03), choose(1e-9), choose(1.0, max_mb=1e-3)
     assert generous.table.size == 4
-    assert strict.table.size > 4 and strict.checks[-1].error.p999 <= 0.03 < strict.checks[0].error.p999
+    assert strict.table.size > 4 and strict.checks[-1].error.p999 <= 0.03
+    assert strict.checks[-1].decoded <= 0.1 < strict.checks[0].decoded
     assert impossible.table is None and len(impossible.checks) == 3
     assert "every code is decoded" in str(impossible)
     assert small.table is None and small.checks == []  # told before anything is decoded
+
+
+def test_where_the_decoder_bends_sharply_codes_are_decoded(queries):
+    def kinked(codes):
+        """Smooth, but for a wall at 0 that a few codes are near to."""
+        return smooth(codes) + 2 * torch.tanh(200 * codes[:, :1]) * queries.vectors[4]
+
+    codes = some_codes()
+    codes[:, 0] += 0.4
+    exact = relevancy_of_codes(kinked, codes, queries)
+    plain, careful = (build_table(kinked, codes, 64, True) for _ in range(2))
+    careful.leave_out_rough_cells(kinked, queries, tolerance=0.03)
+    errors = [table_error(exact, CodeScorer(kinked, t).relevancy(codes, queries)) for t in (plain, careful)]
+    assert errors[0].p999 > 0.05 and errors[1].p999 < 0.03
+    assert 0 < (~careful.locate(codes)[2]).float().mean() < 0.1
+    torch.testing.assert_close(careful.locate(torch.tensor([[0.001, 0.0, 0.0]]))[2], torch.tensor([False]))
 
 
 def test_a_scene_that_shows_nothing_has_no_table(queries):
