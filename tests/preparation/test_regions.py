@@ -67,7 +67,7 @@ def test_stored_labels_are_small_numbered_and_nearest():
     assert found.shape == label_size(600, 900) == (171, 256)
     assert found.dtype == torch.int16
     assert set(found.unique().tolist()) == {-1, 0, 1, 2}
-    middles = found[[[42], [128]], [42, 128, 213]]
+    middles = found[[[84], [85]], [42, 128, 213]]  # the border is at 300 / 600 * 171 = 85.5, row 85's middle
     assert middles.tolist() == [[1, 1, 2], [-1, 0, 2]]
     assert torch.equal(stored_labels(coarse), torch.tensor([[1, 1, 2], [-1, 0, 2]], dtype=torch.int16))
 
