@@ -15,6 +15,7 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
 from torch.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
@@ -143,10 +144,17 @@ class GuardedOptimizers(Optimizers):
         if self._allowed(grad_scaler):
             super().optimizer_scaler_step_some(grad_scaler, param_groups)
             return
-        for name, optimizer in self.optimizers.items():
-            if any(parameter.grad is not None for parameter in self.parameters[name]):
-                grad_scaler.unscale_(optimizer)  # tells it what overflowed, so that it lowers the scale
+        for name, parameters in self.live_parameters().items():
+            if any(parameter.grad is not None for parameter in parameters):
+                grad_scaler.unscale_(self.optimizers[name])  # tells it what overflowed: it lowers the scale
         self.zero_grad_all()
+
+    def live_parameters(self) -> dict[str, list[Tensor]]:
+        """What each optimiser holds now. (`parameters` is what it began with, before densification.)"""
+        return {
+            name: [parameter for group in optimizer.param_groups for parameter in group["params"]]
+            for name, optimizer in self.optimizers.items()
+        }
 
 
 class Lang3DXLTrainer(Trainer):
@@ -155,6 +163,7 @@ class Lang3DXLTrainer(Trainer):
 
     config: Lang3DXLTrainerConfig
     pipeline: Lang3DXLPipeline
+    optimizers: GuardedOptimizers
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up, then seed: what had to be prepared has no say in the run's randomness."""
@@ -172,7 +181,7 @@ class Lang3DXLTrainer(Trainer):
             self.step,
             self.pipeline.datamanager.photo_in_hand,
             self.pipeline.last_losses,
-            self.optimizers.parameters,
+            self.optimizers.live_parameters(),
             grad_scaler.get_scale(),
         )
         # Densification collects the gradients of the screen positions, which are as broken.

@@ -108,6 +108,25 @@ def test_a_skipped_step_changes_no_parameter_no_moment_and_no_strategy(train, sc
     assert not list(trainer.checkpoint_dir.glob("*.ckpt"))
 
 
+def test_a_broken_gradient_of_a_finite_loss_is_kept_out_after_densification_too(train, scene, monkeypatch):
+    from lang3dxl_ns import model
+
+    right, calls = model.losses.rgb_loss, []
+
+    def breaking(prediction, *rest):
+        calls.append(prediction.requires_grad)
+        if len(calls) % 3 == 0 and prediction.requires_grad:
+            prediction.register_hook(lambda gradient: gradient * math.nan)
+        return right(prediction, *rest)
+
+    monkeypatch.setattr(model.losses, "rgb_loss", breaking)
+    changes = {"pipeline__model__densify_grad_thresh": 1e-7, "steps_per_eval_image": 0}
+    trainer = train(scene, iterations=30, semantics=False, **changes)
+    assert trainer.guard.skipped == 10
+    assert trainer.pipeline.model.num_points > 2400  # the seed points and the sky's
+    assert all_finite(dict(trainer.pipeline.model.state_dict()))
+
+
 @pytest.mark.slow
 def test_learning_rates_a_million_apart_end_in_finite_parameters(train, scene):
     trainer = train(scene, iterations=1, steps_per_eval_image=0)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lang3dxl_ns.components.losses import clip_loss, dense_loss, region_variance_loss, rgb_loss
-from lang3dxl_ns.evaluation.numerics.measure import EXACT, Bounds, Case, Maps, Problem
+from lang3dxl_ns.evaluation.numerics.measure import EXACT, Bounds, Case, Maps, Problem, narrowed
 
 BOUNDS = {"float32": Bounds(2e-6, 2e-6, 1e-4, 1e-5), "float64": EXACT}
 SSIM_BOUNDS = {"float32": Bounds(1e-4, 1e-4, 5e-3, 1e-3), "float64": Bounds(1e-5, 1e-5, 1e-4, 1e-4)}
@@ -65,20 +65,15 @@ def _colour(
 ) -> Callable[[], Problem]:
     def compute(leaves: Maps) -> Maps:
         used = None if mask is None else mask.to(leaves["prediction"].device)
-        image = _narrowed(leaves["prediction"]) if narrow else leaves["prediction"]
-        return {"loss": rgb_loss(image, target.to(leaves["prediction"]), used)}
+        image = narrowed(leaves["prediction"]) if narrow else leaves["prediction"]
+        return {"loss": rgb_loss(image, leaves["target"], used)}
 
     def reference(leaves: Maps) -> Maps:
-        return {"loss": colour_reference(leaves["prediction"], target.to(leaves["prediction"]), mask)}
+        return {"loss": colour_reference(leaves["prediction"], leaves["target"], mask)}
 
-    leaves = {"prediction": prediction.clone()}
-    return lambda: Problem(leaves, compute, reference, output_scale=0.1, gradient_scale=1e-4)
-
-
-def _narrowed(values: Tensor) -> Tensor:
-    """In autocast's number type, as a layer under autocast would give it."""
-    device = values.device.type
-    return values.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else values
+    leaves = {"prediction": prediction.clone(), "target": target.clone()}
+    fixed = frozenset({"target"})
+    return lambda: Problem(leaves, compute, reference, constants=fixed, output_scale=0.1, gradient_scale=1e-4)
 
 
 def colour_reference(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
@@ -121,7 +116,7 @@ def _feature_cases() -> Iterator[Case]:
     for name, weight in weights.items():
         yield Case("loss: CLIP", name, _feature("clip", usual, target, weight), BOUNDS)
         yield Case("loss: dense", name, _feature("dense", usual, target, weight), BOUNDS)
-    far = (1e4 + 1e-3 * target).float().double()
+    far = 1e4 + 1e-3 * target
     yield Case(
         "loss: CLIP", "mean 1e4, deviation 1e-3", _feature("clip", close, far, weights["usual"]), BOUNDS
     )
@@ -143,19 +138,19 @@ def _feature(
     loss = clip_loss if kind == "clip" else dense_loss
 
     def compute(given: Maps) -> Maps:
-        prediction = _narrowed(given["prediction"]) if narrow else given["prediction"]
-        return {"loss": loss(prediction, target.to(given["prediction"]), weight.to(given["prediction"]))}
+        prediction = narrowed(given["prediction"]) if narrow else given["prediction"]
+        return {"loss": loss(prediction, given["target"], given["weight"])}
 
     def reference(given: Maps) -> Maps:
-        prediction, wanted, weights = given["prediction"], target.to(given["prediction"]), weight[..., None]
-        weights = weights.to(given["prediction"])
+        prediction, wanted, weights = given["prediction"], given["target"], given["weight"][..., None]
         if kind == "dense":
             grid = prediction.shape[:2] if prediction.numel() <= 2 * wanted.numel() else wanted.shape[:2]
             prediction, wanted, weights = (_resized(v, grid) for v in (prediction, wanted, weights))
         total = weights.sum() * wanted.shape[2]
         return {"loss": ((prediction - wanted).abs() * weights).sum() / (total if total > 0 else 1)}
 
-    return lambda: Problem({name: value.clone() for name, value in leaves.items()}, compute, reference)
+    given = {name: value.clone() for name, value in leaves.items()} | {"target": target, "weight": weight}
+    return lambda: Problem(given, compute, reference, constants=frozenset({"target", "weight"}))
 
 
 def _resized(values: Tensor, grid: torch.Size) -> Tensor:
@@ -201,7 +196,7 @@ def _region(
     features: Tensor, labels: Tensor, smooth: bool = False, narrow: bool = False
 ) -> Callable[[], Problem]:
     def compute(leaves: Maps) -> Maps:
-        values = _narrowed(leaves["features"]) if narrow else leaves["features"]
+        values = narrowed(leaves["features"]) if narrow else leaves["features"]
         return {"loss": region_variance_loss(values, labels.to(values.device))}
 
     def reference(leaves: Maps) -> Maps:
