@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig, separable_kernel
-from lang3dxl_ns.evaluation.numerics.measure import EXACT, Bounds, Case, Maps, Problem
+from lang3dxl_ns.evaluation.numerics.measure import EXACT, Bounds, Case, Maps, Problem, narrowed
 
 CHANNELS = 12
 SIZE, GRID, SIDES = (18, 24), (6, 8), (0.15, 0.4)
@@ -106,9 +106,7 @@ def _problem(
 
     def compute(given: Maps) -> Maps:
         module.network = _Given(given["logits"])  # type: ignore[assignment]
-        values = given["features"]
-        if narrow and torch.is_autocast_enabled("cpu"):
-            values = values.to(torch.get_autocast_dtype("cpu"))
+        values = narrowed(given["features"]) if narrow else given["features"]
         used = None if chosen is None else chosen.to(values.device)
         out, share = module(values, grid, sides, used)
         return {"out": out, "share": share}
@@ -129,8 +127,8 @@ def downsample_reference(
     """Σ K m exp(w) f / Σ K m exp(w) window by window, each with its own largest logit subtracted."""
     h, w, _ = features.shape
     rows, columns = separable_kernel("pyramid", (h, w), grid, sides, torch.float64, features.device)
-    out = torch.zeros(*grid, features.shape[2], dtype=torch.float64)
-    share = torch.zeros(grid, dtype=torch.float64)
+    out = features.new_zeros(*grid, features.shape[2])
+    share = features.new_zeros(grid)
     for i in range(grid[0]):
         for k in range(grid[1]):
             kernel = mask * (rows[:, i, :, None] * columns[:, k, None, :]).sum(0)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lang3dxl_ns.components.losses import clip_loss, dense_loss, region_variance_loss, rgb_loss
-from lang3dxl_ns.evaluation.numerics.measure import EXACT, Bounds, Case, Maps, Problem
+from lang3dxl_ns.evaluation.numerics.measure import EXACT, Bounds, Case, Maps, Problem, narrowed
 
 BOUNDS = {"float32": Bounds(2e-6, 2e-6, 1e-4, 1e-5), "float64": EXACT}
 SSIM_BOUNDS = {"float32": Bounds(1e-4, 1e-4, 5e-3, 1e-3), "float64": Bounds(1e-5, 1e-5, 1e-4, 1e-4)}
@@ -65,7 +65,7 @@ def _colour(
 ) -> Callable[[], Problem]:
     def compute(leaves: Maps) -> Maps:
         used = None if mask is None else mask.to(leaves["prediction"].device)
-        image = _narrowed(leaves["prediction"]) if narrow else leaves["prediction"]
+        image = narrowed(leaves["prediction"]) if narrow else leaves["prediction"]
         return {"loss": rgb_loss(image, leaves["target"], used)}
 
     def reference(leaves: Maps) -> Maps:
@@ -74,12 +74,6 @@ def _colour(
     leaves = {"prediction": prediction.clone(), "target": target.clone()}
     fixed = frozenset({"target"})
     return lambda: Problem(leaves, compute, reference, constants=fixed, output_scale=0.1, gradient_scale=1e-4)
-
-
-def _narrowed(values: Tensor) -> Tensor:
-    """In autocast's number type, as a layer under autocast would give it."""
-    device = values.device.type
-    return values.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else values
 
 
 def colour_reference(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
@@ -144,7 +138,7 @@ def _feature(
     loss = clip_loss if kind == "clip" else dense_loss
 
     def compute(given: Maps) -> Maps:
-        prediction = _narrowed(given["prediction"]) if narrow else given["prediction"]
+        prediction = narrowed(given["prediction"]) if narrow else given["prediction"]
         return {"loss": loss(prediction, given["target"], given["weight"])}
 
     def reference(given: Maps) -> Maps:
@@ -202,7 +196,7 @@ def _region(
     features: Tensor, labels: Tensor, smooth: bool = False, narrow: bool = False
 ) -> Callable[[], Problem]:
     def compute(leaves: Maps) -> Maps:
-        values = _narrowed(leaves["features"]) if narrow else leaves["features"]
+        values = narrowed(leaves["features"]) if narrow else leaves["features"]
         return {"loss": region_variance_loss(values, labels.to(values.device))}
 
     def reference(leaves: Maps) -> Maps:

@@ -170,7 +170,7 @@ def _errors(found: Tensor, expected: Tensor, scale: float = 0.0) -> _Error:
     if found.shape != expected.shape:
         raise ValueError(f"the component gives {tuple(found.shape)}, the reference {tuple(expected.shape)}")
     keep = expected.detach().isfinite()
-    true, ours = expected.detach()[keep], found.detach()[keep].double()
+    true, ours = expected.detach()[keep], found.detach().to(expected.device)[keep].double()
     if not true.numel():
         return _Error(0.0, 0.0, True)
     difference = ours - true
@@ -263,6 +263,12 @@ def _finite_difference(problem: Problem, leaves: Maps, upstream: Maps, gradients
 
     slope = float(sum((gradients[name] * direction).sum() for name, direction in along.items()))
     return abs((value(_STEP) - value(-_STEP)) / (2 * _STEP) - slope) / max(abs(slope), 1e-12)
+
+
+def narrowed(values: Tensor) -> Tensor:
+    """In autocast's number type, as a layer under autocast would hand it on; unchanged without autocast."""
+    device = values.device.type
+    return values.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else values
 
 
 def _precision(mode: str, device: torch.device | str) -> AbstractContextManager[Any]:
