@@ -57,13 +57,13 @@ class Query:
         scene = load_scene(self.load_config, settings=self.settings)
         prompts = scene.prompts(self.text)
         folders = [self.out / slug for slug in slugs([prompt.text for prompt in prompts])]
-        cameras = dict(self._cameras(scene))
+        places = dict(self._places(scene))
         if not self.exact:
             print(f"lookup table: {scene.lookup}")
         views = []
         with progress_bar() as bar:
-            for name, camera in bar.track(cameras.items(), description="rendering"):
-                matches = scene.match(prompts, scene.render(camera), self.exact)
+            for name, place in bar.track(places.items(), description="rendering"):
+                matches = scene.match(prompts, scene.view(place), self.exact)
                 for folder, match in zip(folders, matches, strict=True):
                     write_match(match, folder / name, self.settings.threshold)
                 views.append(_view_report(name, matches))
@@ -80,15 +80,15 @@ class Query:
             where = f"at pixel {found['peak'][0]}, {found['peak'][1]} of {best['view']}"
             print(f"{prompt.text}: {found['score']:.2f} {where}; {folders[i]}")
 
-    def _cameras(self, scene: Scene) -> Iterator[tuple[str, Camera]]:
-        """File name (no suffix) and camera of every view that is asked for."""
+    def _places(self, scene: Scene) -> Iterator[tuple[str, Camera | str]]:
+        """File name (no suffix) of every view that is asked for, and its camera or photo."""
         if self.camera_path is not None:
             yield from ((f"{i:05d}", c) for i, c in enumerate(read_camera_path(self.camera_path)))
         elif self.all:
-            yield from ((_file_name(photo.name), photo.camera) for photo in scene.file.photos)
+            yield from ((_file_name(photo.name), photo.name) for photo in scene.file.photos)
         else:
             name = scene.file.photo(self.image).name if self.image else _best_view(scene, self.text)
-            yield _file_name(name), scene.camera(name)
+            yield _file_name(name), name
 
 
 def _best_view(scene: Scene, texts: list[str]) -> str:

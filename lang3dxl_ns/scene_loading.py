@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 import yaml
@@ -15,7 +16,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from lang3dxl_ns.datamanager import Lang3DXLDataManager, PhotoDataset
+from lang3dxl_ns.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.geometry import camera_to_world
 from lang3dxl_ns.model import Lang3DXLModel
@@ -31,7 +32,7 @@ def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
     known = None if clip == "none" else find_model(clip, CLIP_OPTION)
     local = Path(clip).expanduser()
     return SceneFile(
-        photos=_photos(datamanager.train_dataset, "train") + _photos(datamanager.eval_dataset, "eval"),
+        photos=[*_photos(datamanager, "train"), *_photos(datamanager, "eval")],
         clip=None if known is None else str(local.absolute()) if local.is_dir() else clip,
         clip_identity=None if known is None else known.identity,
         scale=float(outputs.dataparser_scale),
@@ -40,8 +41,10 @@ def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
     )
 
 
-def _photos(dataset: PhotoDataset, split) -> list[ScenePhoto]:
-    cameras = dataset.cameras
+def _photos(datamanager: Lang3DXLDataManager, split: Literal["train", "eval"]) -> list[ScenePhoto]:
+    masked = datamanager.photos
+    dataset = datamanager.train_dataset if split == "train" else datamanager.eval_dataset
+    cameras, photos = dataset.cameras, [masked[photo.name] for photo in dataset.photos]
     return [
         ScenePhoto(
             name=photo.name,
@@ -53,8 +56,11 @@ def _photos(dataset: PhotoDataset, split) -> list[ScenePhoto]:
             cy=float(cameras.cy[i]),
             width=int(cameras.width[i]),
             height=int(cameras.height[i]),
+            mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
+            distortion=list(photo.distortion),
+            fisheye=photo.fisheye,
         )
-        for i, photo in enumerate(dataset.photos)
+        for i, photo in enumerate(photos)
     ]
 
 

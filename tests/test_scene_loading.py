@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from conftest import make_trainer
+from PIL import Image
 from scenes import write_scene
 
 import lang3dxl_ns
@@ -20,6 +21,8 @@ def trainer(tmp_path_factory, tiny_clip, tiny_dense):
     """A run whose photos are gone."""
     root = tmp_path_factory.mktemp("run")
     data = write_scene(root / "scene", photos=6, points=200, mixed=True)
+    (data / "masks").mkdir()
+    Image.new("L", (8, 6), 255).save(data / "masks" / "photo_001.png")
     trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=30)
     trainer.setup()
     trainer.train()
@@ -128,3 +131,11 @@ def test_another_clip_is_refused(trainer):
     file = SceneFile.read(trainer.base_dir / SCENE_FILE)
     with pytest.raises(UserError, match="not the one that this run learned from"):
         scene_of_model(trainer.pipeline.model, SceneFile(**{**vars(file), "clip_identity": "another"}))
+
+
+def test_a_run_remembers_its_foreground_masks(trainer, scene):
+    photos = trainer.pipeline.datamanager.photos
+    assert {photo.name for photo in scene.file.photos if photo.mask} == {"photo_001.jpg"}
+    photo = scene.file.photo("photo_001")
+    assert photo.mask == str(photos["photo_001.jpg"].mask_path)
+    assert photo.foreground() is None  # its file has moved with the data

@@ -96,6 +96,8 @@ class SmallView:
     """Half precision."""
     alpha: Float[Tensor, "h w"]
     depth: Float[Tensor, "h w"]
+    counts: Bool[Tensor, "h w"]
+    """The photo's foreground; codes elsewhere occur too, but nothing is found there."""
 
     def seen(self, min_alpha: float) -> Bool[Tensor, "h w"]:
         """Pixels that show something."""
@@ -108,6 +110,7 @@ def save_small_views(path: Path, views: list[SmallView], key: str) -> None:
         "codes": torch.cat([view.codes.flatten(0, 1) for view in views]),
         "alpha": torch.cat([view.alpha.flatten() for view in views]),
         "depth": torch.cat([view.depth.flatten() for view in views]),
+        "counts": torch.cat([view.counts.flatten() for view in views]),
     }
     save_tensors(path, maps, key, None)
 
@@ -120,7 +123,7 @@ def load_small_views(
     if found is None:
         return None
     sizes = [camera.width * camera.height for camera in cameras.values()]
-    parts = [found[0][name].to(device).split(sizes) for name in ("codes", "alpha", "depth")]
+    parts = [found[0][name].to(device).split(sizes) for name in ("codes", "alpha", "depth", "counts")]
     return [
         SmallView(
             name, c, codes.unflatten(0, (c.height, c.width)), *(m.view(c.height, c.width) for m in maps)

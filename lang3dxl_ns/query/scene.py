@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -60,6 +61,9 @@ class QueryConfig:
     """Relevancy above which a pixel matches."""
     min_alpha: float = 0.3
     """Coverage below which a pixel shows nothing that could match."""
+    foreground: str = ""
+    """Only what this prompt finds can match, such as `building`; for views that have no mask. The view of a
+    photo with a foreground mask is always restricted to it."""
     exact_mb: float = 256.0
     """Memory for decoded features on the exact path."""
     views: int = 100
@@ -82,6 +86,8 @@ class View:
     """Along the camera's axis, units of the model's frame."""
     seconds: float = 0.0
     """To render it."""
+    counts: Bool[Tensor, "h w"] | None = None
+    """Foreground of the photo whose view it is; None: all of it."""
 
 
 @dataclass
@@ -181,6 +187,14 @@ class Scene:
             return self.file.photo(place).camera
         return posed(place, like=self.file.photos[0].camera)
 
+    def view(self, place: Camera | str | Float[Tensor, "rows 4"]) -> View:
+        """What a camera sees; the view of a photo, by name, knows the photo's foreground."""
+        view = self.render(self.camera(place))
+        if isinstance(place, str):
+            counts = self.file.photo(place).foreground()
+            view.counts = None if counts is None else counts.to(view.alpha.device)
+        return view
+
     def query(
         self, texts: str | Sequence[str], place: Camera | str | Float[Tensor, "rows 4"], exact: bool = False
     ) -> list[Match]:
@@ -191,7 +205,7 @@ class Scene:
         unknown photo.
         """
         prompts = self.prompts(texts)  # a mistake in them is told before anything is rendered
-        return self.match(prompts, self.render(self.camera(place)), exact)
+        return self.match(prompts, self.view(place), exact)
 
     def prompts(self, texts: str | Sequence[str]) -> list[Prompt]:
         """What is typed, as prompts. Raises UserError where nothing is asked for."""
@@ -204,7 +218,9 @@ class Scene:
         queries = self.queries(prompts)
         scorer = self.scorer(exact)
         start = time.perf_counter()
-        maps = scorer.relevancy(view.codes, queries, keep=view.alpha >= self.config.min_alpha)
+        keep = view.alpha >= self.config.min_alpha
+        keep = self._foreground(scorer, view.codes, keep if view.counts is None else keep & view.counts)
+        maps = scorer.relevancy(view.codes, queries, keep)
         peaks = maps.flatten(1).max(dim=1)
         scores, places = peaks.values.tolist(), peaks.indices.tolist()
         seconds = time.perf_counter() - start
@@ -241,9 +257,20 @@ class Scene:
         """Where in the scene each prompt is found: the training views that show it best, and a box."""
         prompts = self.prompts(text)
         queries = self.queries(prompts)
-        c, scorer = self.config, self.scorer()
-        maps = [scorer.relevancy(v.codes.float(), queries, v.seen(c.min_alpha)) for v in self.small_views]
+        scorer, maps = self.scorer(), []
+        for view in self.small_views:
+            codes, keep = view.codes.float(), view.seen(self.config.min_alpha) & view.counts
+            maps.append(scorer.relevancy(codes, queries, self._foreground(scorer, codes, keep)))
         return [self._found(p, [of_view[i] for of_view in maps], most) for i, p in enumerate(prompts)]
+
+    def _foreground(
+        self, scorer: CodeScorer, codes: Float[Tensor, "h w d"], keep: Bool[Tensor, "h w"]
+    ) -> Bool[Tensor, "h w"]:
+        """Those pixels of `keep` that the foreground's prompt finds, where there is one."""
+        if not self.config.foreground:
+            return keep
+        queries = self.queries(self.prompts(self.config.foreground))
+        return keep & (scorer.relevancy(codes, queries, keep).amax(dim=0) > 0.5)
 
     def _found(self, prompt: Prompt, maps: Sequence[Float[Tensor, "h w"]], most: int) -> Found:
         viewpoints, points, weights = [], [], []
@@ -313,8 +340,12 @@ class Scene:
         return torch.cat(seen).float()
 
     def _small_view(self, name: str, camera: Camera) -> SmallView:
-        view = self.render(camera)
-        return SmallView(name, camera, view.codes.half(), view.alpha.half(), view.depth.half())
+        view, counts = self.render(camera), self.file.photo(name).foreground()
+        if counts is None:
+            counts = torch.ones_like(view.alpha, dtype=torch.bool)
+        small = F.interpolate(counts[None, None].float(), view.alpha.shape, mode="nearest-exact")[0, 0] > 0
+        codes, alpha, depth = view.codes.half(), view.alpha.half(), view.depth.half()
+        return SmallView(name, camera, codes, alpha, depth, small.to(alpha.device))
 
     @cached_property
     def _small_cameras(self) -> dict[str, Camera]:

@@ -8,18 +8,19 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.report import write_atomically
 from lang3dxl_ns.geometry import view_matrix
+from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.rendering import Camera
 
 SCENE_FILE = "lang3dxl_scene.json"
@@ -41,6 +42,11 @@ class ScenePhoto:
     cy: float
     width: int
     height: int
+    mask: str | None = None
+    """File of the photo's foreground mask."""
+    distortion: list[float] = field(default_factory=list)
+    """The lens's, as `Photo` has it: masks are drawn on the file, and views are undistorted."""
+    fisheye: bool = False
 
     @property
     def camera(self) -> Camera:
@@ -51,6 +57,24 @@ class ScenePhoto:
             self.width,
             self.height,
         )
+
+    def foreground(self) -> Bool[Tensor, "h w"] | None:
+        """Where the photo counts; None where all of it does, as where its mask is no longer there."""
+        path = None if self.mask is None else Path(self.mask)
+        photo = Photo(
+            name=self.name,
+            path=Path(),
+            mask_path=path if path is not None and path.is_file() else None,
+            width=self.width,
+            height=self.height,
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx,
+            cy=self.cy,
+            distortion=tuple(self.distortion),
+            fisheye=self.fisheye,
+        )
+        return photo.read_mask()
 
 
 @dataclass(frozen=True)

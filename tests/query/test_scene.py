@@ -1,8 +1,11 @@
 """A scene's answers, on one whose answers are known."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from painted_scene import CODES, DISTANCE, DOME, WINDOWS, decode, painted_scene, render, word_at
+from PIL import Image
 
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.geometry import camera_to_world
@@ -162,3 +165,29 @@ def test_views_are_evenly_spread_when_there_are_more_than_asked():
 
 def test_the_painting_is_what_the_tests_take_it_for():
     assert word_at(torch.tensor([[1.5, 1.5], [-0.8, -0.8], [0.0, 0.0]])).tolist() == [1, 2, 0]
+
+
+def test_nothing_is_found_outside_a_photos_mask(tmp_path):
+    mask = torch.zeros(24, 24, dtype=torch.uint8)  # masks have any size
+    mask[:, 12:] = 255
+    Image.fromarray(mask.numpy()).save(tmp_path / "mask.png")
+    scene, free = painted_scene(), painted_scene()
+    masked = replace(scene.file.photo("0003"), mask=str(tmp_path / "mask.png"))
+    scene.file.photos[scene.file.photos.index(free.file.photo("0003"))] = masked
+    whole = free.query("window", "0003")[0]
+    cut = scene.query("window", "0003")[0]
+    assert whole.mask[:, :48].any() and not whole.mask[:, 48:].any()  # both windows are on the left
+    assert not cut.mask.any()
+    assert scene.query("dome", "0003")[0].mask.any()
+    assert "all/0003.jpg" in [v.name for v in free.find("window")[0].viewpoints]
+    assert "all/0003.jpg" not in [v.name for v in scene.find("window")[0].viewpoints]
+    # A free camera has no mask, nor has a photo whose mask is gone.
+    assert scene.query("window", masked.camera)[0].mask.any()
+    (tmp_path / "mask.png").unlink()
+    assert torch.equal(scene.query("window", "0003")[0].mask, whole.mask)
+
+
+def test_a_prompted_foreground_leaves_only_what_it_finds(scene):
+    only = painted_scene(config=QueryConfig(foreground="dome"))
+    assert not only.query("window", "0003")[0].mask.any() and only.find("window")[0].box is None
+    assert torch.equal(only.query("dome", "0003")[0].mask, scene.query("dome", "0003")[0].mask)
