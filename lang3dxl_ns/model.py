@@ -236,7 +236,8 @@ class Lang3DXLModel(SplatfactoModel):
             vector = self._light(camera, pose[0].to(self.device))
             visible = in_view(view, gaussians.means, gaussians.scales).nonzero().squeeze(1)
             seed = self.step if self.training else None
-            colours, in_photo = self.appearance(gaussians, colours, vector, visible, seed)
+            with part("appearance"):
+                colours, in_photo = self.appearance(gaussians, colours, vector, visible, seed)
         settings: dict[str, Any] = {
             "antialiased": self.config.rasterize_mode == "antialiased",
             "absgrad": self.strategy.absgrad and self.training,

@@ -12,7 +12,8 @@ from typing import Any
 
 from lang3dxl_ns.evaluation.report import command_line, describe_machine, markdown_table, write_report
 
-PARTS = ("data", "render", "decode", "downsample", "losses", "backward", "optimiser")
+PARTS = ("data", "render", "appearance", "decode", "downsample", "losses", "backward", "optimiser")
+"""Of a step; the appearance is a part of the rendering."""
 
 
 @dataclass
@@ -147,7 +148,7 @@ def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:
 
 ## Cost of a step
 
-Mean milliseconds by part; the median step beside them.
+Mean milliseconds by part, the appearance being within `render`; the median step beside them.
 
 {cost}
 """
