@@ -28,9 +28,9 @@ from lang3dxl_ns.evaluation.report import (
     interleaved_times,
     markdown_table,
     progress_bar,
-    write_atomically,
     write_report,
 )
+from lang3dxl_ns.files import write_atomically
 from lang3dxl_ns.query.lookup import CodeScorer, CodeTable, mark_cells, table_error, tabulate
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.scene import PROBES, Scene, View

@@ -1,0 +1,36 @@
+"""Files and folders that commands write: never half a file, never a name that a file system refuses."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write a file under a temporary name beside it and rename, so that no reader ever sees a part of it.
+
+    A process that is killed meanwhile leaves a file that ends in .tmp, and the old content.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())  # else a crash may leave the new name with no content
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def slugs(texts: Sequence[str]) -> list[str]:
+    """A folder name for each text, no two the same, whatever the texts are."""
+    found: list[str] = []
+    for i, text in enumerate(texts):
+        slug = re.sub(r"[^\w]+", "-", text.lower()).strip("-")[:40] or f"text-{i + 1}"
+        found.append(f"{slug}-{i + 1}" if slug in found else slug)
+    return found
