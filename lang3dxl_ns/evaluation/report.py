@@ -109,14 +109,15 @@ def interleaved_times(
 
 
 def _seconds(work: Callable[[], object], clock: Callable[[], float]) -> float:
-    _synchronize()
+    synchronize()
     start = clock()
     work()
-    _synchronize()
+    synchronize()
     return clock() - start
 
 
-def _synchronize() -> None:
+def synchronize() -> None:
+    """Wait until a GPU has done what it was asked, where one is in use."""
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
 
