@@ -111,6 +111,8 @@ class EvaluatePool:
     """Folder for the report."""
 
     def main(self) -> None:
+        if not self.reports:
+            raise UserError("there is nothing to put together: name the scenes' reports after --reports")
         scenes: dict[str, dict[str, Any]] = {}
         for path in self.reports:
             name, results = _read_results(path)
@@ -121,6 +123,8 @@ class EvaluatePool:
         for key in ("layout", "scored_at"):
             if len({protocol.get(key) for protocol in protocols.values()}) > 1:
                 raise UserError(f"the scenes differ in {key}: {', '.join(scenes)} can't be put together")
+        if not any("map" in results for results in scenes.values()):
+            raise UserError(f"no word was scored in {', '.join(scenes)}: there is nothing to put together")
         pooled = pool({name: list(results["photos"].values()) for name, results in scenes.items()})
         write_report(self.out, REPORT, _pooled_table(pooled), pooled | {"protocols": protocols})
         print(f"Wrote {self.out / REPORT}.md")
@@ -167,9 +171,8 @@ def _read_results(path: Path) -> tuple[str, dict[str, Any]]:
         for figures in results["photos"].values():
             if not all(isinstance(value, int | float) for value in figures.values()):
                 raise ValueError("its photos have figures that are no numbers")
-        return str(content.get("scene") or content["experiment_name"]), dict(
-            results, protocol=dict(results["protocol"])
-        )
+        results["protocol"].keys()
+        return str(content.get("scene") or content["experiment_name"]), results
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path} is no report of `lang3dxl evaluate` or `ns-eval` ({error!r}): make it again"
@@ -196,9 +199,7 @@ def _scene_table(scene: str, results: Mapping[str, Any]) -> str:
     words = markdown_table(["average precision", "photos", *(WHOSE[prefix] for prefix in whose)], rows)
     totals = [[name, f"{results[name]:.3f}"] for name in _TOTALS if name in results]
     others = [[name, _mean_std(results, name)] for name in _OTHERS if name in results]
-    protocol = "\n".join(
-        f"- {name.replace('_', ' ')}: {value}" for name, value in results["protocol"].items()
-    )
+    protocol = "\n".join(f"- {name.replace('_', ' ')}: {v}" for name, v in results["protocol"].items())
     figures = markdown_table(["", "mean"], totals + others)
     return f"# {scene}\n\n{words if categories else ''}\n\n{figures}\n\n{protocol}\n"
 

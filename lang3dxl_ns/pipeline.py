@@ -126,9 +126,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         if self.config.evaluated_photos == "held-out":
             return self.datamanager.fixed_indices_eval_dataloader
         if self.scorer is None:
-            raise UserError(
-                "photos that training saw are evaluated by words: that takes ground truth and CLIP"
-            )
+            raise UserError("photos that training saw are evaluated where there is ground truth, and CLIP")
         seen = self.datamanager.train_dataset
         labelled = [photo.name for photo in seen.photos if self.scorer.truth.key(photo.name) is not None]
         if not labelled:

@@ -54,8 +54,8 @@ class PredictedMaps:
         found = next((path for path in paths if path.is_file()), None)
         if found is None:
             raise UserError(
-                f"there is no map of {category!r} for the photo {photo}: {paths[0]} (or a picture) is missing; "
-                f"make it, or name the photos to score with --photos"
+                f"there is no map of {category!r} for the photo {photo}: make {paths[0]} (or a picture), or "
+                f"name the photos to score with --photos"
             )
         return found
 
