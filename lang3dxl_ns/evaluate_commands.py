@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +14,9 @@ import tyro
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.aggregate import PREFIXES, average, mean_average_precision, pool
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
-from lang3dxl_ns.evaluation.predictions import read_names, score_predictions
+from lang3dxl_ns.evaluation.predictions import score_predictions
 from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, write_report
-from lang3dxl_ns.files import write_atomically
+from lang3dxl_ns.files import read_names, write_atomically
 
 REPORT = "scores"
 """Name of the report's files, without suffix."""
@@ -169,9 +170,10 @@ def _read_results(path: Path) -> tuple[str, dict[str, Any]]:
         content = json.loads(path.read_text())
         results = content["results"]
         for figures in results["photos"].values():
-            if not all(isinstance(value, int | float) for value in figures.values()):
-                raise ValueError("its photos have figures that are no numbers")
-        results["protocol"].keys()
+            if not all(math.isfinite(value) for value in figures.values()):
+                raise ValueError("a photo has a figure that is no number")
+        if not isinstance(results["protocol"], dict):
+            raise ValueError("it does not say what was scored")
         return str(content.get("scene") or content["experiment_name"]), results
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(

@@ -1,4 +1,4 @@
-"""Files and folders that commands write: never half a file, never a name that a file system refuses."""
+"""Files and folders: never written half, never named so that a file system refuses; and lists of names."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import re
 import secrets
 from collections.abc import Sequence
 from pathlib import Path
+
+from lang3dxl_ns.errors import UserError
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -34,3 +36,18 @@ def slugs(texts: Sequence[str]) -> list[str]:
         slug = re.sub(r"[^\w]+", "-", text.lower()).strip("-")[:40] or f"text-{i + 1}"
         found.append(f"{slug}-{i + 1}" if slug in found else slug)
     return found
+
+
+def read_names(path: Path) -> list[str]:
+    """Names of photos from a text file, one per line; empty lines and what follows a # are left out.
+
+    Raises UserError for a file that can't be read, or names none.
+    """
+    try:
+        lines = path.expanduser().read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError) as error:
+        raise UserError(f"the list of photos {path} can't be read ({error})") from error
+    names = [name for line in lines if (name := line.partition("#")[0].strip())]
+    if not names:
+        raise UserError(f"the list of photos {path} is empty: write a name on each line")
+    return names

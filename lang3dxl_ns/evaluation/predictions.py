@@ -119,18 +119,3 @@ def _read_mask(folder: Path, photo: str) -> Bool[Tensor, "h w"] | None:
     if path is None:
         raise UserError(f"{folder} holds no mask of the photo {photo}: add it, white = keep")
     return torch.from_numpy(np.asarray(read_grey(path, "mask")) >= 128)
-
-
-def read_names(path: Path) -> list[str]:
-    """Names of photos from a text file, one per line; empty lines and what follows a # are left out.
-
-    Raises UserError for a file that can't be read, or names none.
-    """
-    try:
-        lines = path.expanduser().read_text(encoding="utf-8").splitlines()
-    except (OSError, ValueError) as error:
-        raise UserError(f"the list of photos {path} can't be read ({error})") from error
-    names = [name for line in lines if (name := line.partition("#")[0].strip())]
-    if not names:
-        raise UserError(f"the list of photos {path} is empty: write a name on each line")
-    return names
