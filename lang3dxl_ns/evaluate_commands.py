@@ -191,7 +191,7 @@ def _write(folder: Path, scene: str, results: dict[str, Any]) -> None:
 
 def _scene_table(scene: str, results: Mapping[str, Any]) -> str:
     """The report for people: average precision by category, then totals, then the protocol."""
-    categories = [name.removeprefix("ap_").removesuffix("_photos") for name in results if _counts(name)]
+    categories = sorted(name.removeprefix("ap_").removesuffix("_photos") for name in results if _counts(name))
     whose = [prefix for prefix in PREFIXES if f"{prefix}map" in results]
     rows = [
         [c, results[f"ap_{c}_photos"], *(_mean_std(results, f"{prefix}ap_{c}") for prefix in whose)]

@@ -124,7 +124,7 @@ def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
 
 def as_published(maps: Maps) -> Maps:
     """Every (masked) map as Lang3D-XL makes its predictions: 0 where it is at most 0.5, the rest stretched
-    to 0…1 by the photo's largest, then blurred. Ties all that is rejected, which costs average precision."""
+    to 0…1 by the photo's largest, then blurred. All that is rejected is tied, but for what the blur adds."""
 
     def process(score: Float[Array, "h w"]) -> Float[Array, "h w"]:
         floor = max(float(score.min()), THRESHOLD)
