@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.aggregate import PREFIXES, average, mean_average_precision, pool
+from lang3dxl_ns.evaluation.aggregate import PREFIXES, TOTALS, average, mean_average_precision, pool
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
 from lang3dxl_ns.evaluation.predictions import score_predictions
 from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, write_report
@@ -94,9 +94,10 @@ class EvaluateRun:
         pipeline.config.evaluated_photos = self.split
         if self.ground_truth is not None:
             pipeline.config.ground_truth = self.ground_truth
+        if self.ground_truth is not None or self.layout != "auto":
             pipeline.config.ground_truth_layout = self.layout
         results = pipeline.get_average_eval_image_metrics(get_std=True)
-        _write(self.out, self.scene or pipeline.datamanager.data_folder.name, results)
+        _write(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
 
 @dataclass(kw_only=True)
@@ -127,8 +128,14 @@ class EvaluatePool:
         if not any("map" in results for results in scenes.values()):
             raise UserError(f"no word was scored in {', '.join(scenes)}: there is nothing to put together")
         pooled = pool({name: list(results["photos"].values()) for name, results in scenes.items()})
-        write_report(self.out, REPORT, _pooled_table(pooled), pooled | {"protocols": protocols})
-        print(f"Wrote {self.out / REPORT}.md")
+        notes = [
+            f"- {name}: {p.get('evaluated_photos')} photos, {p.get('seen_in_training', 'unknown')} of them "
+            f"seen in training; foreground: {p.get('foreground')}"
+            for name, p in protocols.items()
+        ]
+        table = "\n".join([_pooled_table(pooled), "", *notes])
+        write_report(self.out, REPORT, table, pooled | {"protocols": protocols})
+        print(f"{table}\n\nWrote {self.out / REPORT}.md")
 
 
 @dataclass(kw_only=True)
@@ -181,8 +188,8 @@ def _read_results(path: Path) -> tuple[str, dict[str, Any]]:
         ) from error
 
 
-def _write(folder: Path, scene: str, results: dict[str, Any]) -> None:
-    report = {"scene": scene, "machine": describe_machine(), "results": results}
+def _write(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu") -> None:
+    report = {"scene": scene, "machine": describe_machine(device), "results": results}
     table = _scene_table(scene, results)
     write_report(folder, REPORT, table, report)
     print(table)
@@ -198,22 +205,15 @@ def _scene_table(scene: str, results: Mapping[str, Any]) -> str:
         for c in categories
     ]
     rows.append(["**mAP**", "", *(f"**{results[f'{prefix}map']:.3f}**" for prefix in whose)])
-    words = markdown_table(["average precision", "photos", *(WHOSE[prefix] for prefix in whose)], rows)
-    totals = [[name, f"{results[name]:.3f}"] for name in _TOTALS if name in results]
+    heads = WHOSE | ({"": "as they are"} if results["protocol"].get("layout") == "lerf_ovs" else {})
+    words = markdown_table(["average precision", "photos", *(heads[prefix] for prefix in whose)], rows)
+    totals = [[name, f"{results[name]:.3f}"] for name in TOTALS.values() if name in results]
     others = [[name, _mean_std(results, name)] for name in _OTHERS if name in results]
     protocol = "\n".join(f"- {name.replace('_', ' ')}: {v}" for name, v in results["protocol"].items())
     figures = markdown_table(["", "mean"], totals + others)
     return f"# {scene}\n\n{words if categories else ''}\n\n{figures}\n\n{protocol}\n"
 
 
-_TOTALS = (
-    "localisation_accuracy",
-    "miou",
-    "mean_f1",
-    "mean_balanced_accuracy",
-    "smooth_localisation_accuracy",
-    "smooth_miou",
-)
 _OTHERS = (
     "psnr",
     "cc_psnr",

@@ -189,7 +189,14 @@ class Lang3DXLPipeline(VanillaPipeline):
         seen, masked = (sum(p.name in trained for p in evaluated), sum(p.masked for p in evaluated))
         photos = {"evaluated_photos": len(evaluated), "seen_in_training": seen}
         mask = f"predictions are 0 outside the foreground masks of {masked} of {len(evaluated)} photos"
-        words = {} if self.scorer is None else self.scorer.protocol(mask if masked else "none")
+        if self.scorer is None:
+            return photos
+        words = self.scorer.protocol(mask if masked else "none")
+        if words["prompts_without_photos"]:
+            CONSOLE.log(
+                f"[yellow]no evaluated photo shows {', '.join(words['prompts_without_photos'])}; `lang3dxl "
+                f"evaluate run --split seen` looks at the labelled photos that training saw"
+            )
         return photos | words
 
     def get_train_loss_dict(self, step: int):

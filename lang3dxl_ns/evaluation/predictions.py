@@ -40,7 +40,8 @@ class PredictedMaps:
         score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_grey(path, "map")) / 255
         if score.ndim == 3:
             score = strongest_level(score)
-        check_shape(path, score.shape, size)
+        height, width = score.shape
+        check_shape(path, (height, width), size)
         return resize_map(torch.from_numpy(score.astype(np.float32))[None], size)[0]
 
     def _find(self, category: str, photo: str) -> Path:

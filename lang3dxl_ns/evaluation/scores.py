@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -172,6 +173,7 @@ class MapScorer:
         self.truth = truth
         self.without: dict[str, set[str]] = {}
         """By category, the scored photos that have a label of it but nothing to find; they are left out."""
+        self._scored: set[str] = set()
 
     def variants(
         self, maps: Maps, keep: Bool[Tensor, "H W"] | None = None, temperature: float = 1.0
@@ -197,11 +199,13 @@ class MapScorer:
         if truths is None:
             truths = self.truth.truths(photo, map_size(maps))
         for category, truth in truths.items():
-            if not truth.mask.any():
+            if truth.mask.any():
+                self._scored.add(category)
+            else:
                 self.without.setdefault(category, set()).add(photo)
         return score_maps(maps, truths, prefix, smooth=self.truth.layout == "lerf_ovs")
 
-    def protocol(self, mask: str) -> dict[str, object]:
+    def protocol(self, mask: str) -> dict[str, Any]:
         """What the figures mean, for a report. mask: what was done about the foreground."""
         truth = self.truth
         size = "the labels'" if truth.layout == "lerf_ovs" else "half the photo's"
@@ -211,5 +215,6 @@ class MapScorer:
             "prompts": truth.categories,
             "scored_at": f"{size} size",
             "foreground": mask,
+            "prompts_without_photos": [c for c in truth.categories if c not in self._scored],
             "photos_without_positives": {category: len(photos) for category, photos in self.without.items()},
         }

@@ -51,6 +51,7 @@ def test_every_photo_has_its_figures_and_the_protocol_says_what_was_done(scene, 
     random = np.load(maps / "rose window" / "0002.npy").astype(np.float32)
     assert photos["0002"]["raw_ap_rose window"] == pytest.approx(average_precision(random, mask[::2, ::2]))
     assert protocol["photos_without_positives"] == {"spires": 1}
+    assert protocol["prompts_without_photos"] == ["spires"]
     assert protocol["layout"] == "plain" and "none" in protocol["foreground"]
 
 
