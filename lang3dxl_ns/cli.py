@@ -13,10 +13,12 @@ import tyro
 from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.demo_run import Demo
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.evaluate_commands import Evaluate
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
 from lang3dxl_ns.evaluation.numerics.command import Numerics
 from lang3dxl_ns.lookup_benchmark import LookupBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
+from lang3dxl_ns.presets import Preset
 from lang3dxl_ns.query_commands import Export, Query
 from lang3dxl_ns.training_benchmark import TrainingBenchmark
 
@@ -93,6 +95,8 @@ Command = (
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate", description="Score words against ground truth.")]
+    | Annotated[Preset, tyro.conf.subcommand("preset")]
     | Annotated[Numerics, tyro.conf.subcommand("numerics")]
     | Annotated[
         Benchmark,

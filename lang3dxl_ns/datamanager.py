@@ -6,7 +6,7 @@ Photos come through a bounded cache with read-ahead, targets straight from the m
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -305,20 +305,34 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
 
 class EvalPhotos:
-    """The held-out photos as (camera, batch) pairs, one photo in memory at a time; damaged ones are left
-    out, with a line in the log."""
+    """Photos to evaluate as (camera, batch) pairs, one photo in memory at a time; damaged ones are left out,
+    with a line in the log.
 
-    def __init__(self, datamanager: Lang3DXLDataManager):
+    Args:
+        dataset: the held-out photos without it.
+        names: of its photos that are wanted; all without it.
+    """
+
+    def __init__(
+        self,
+        datamanager: Lang3DXLDataManager,
+        dataset: PhotoDataset | None = None,
+        names: Collection[str] | None = None,
+    ):
         self._datamanager = datamanager
+        self.dataset = dataset or datamanager.eval_dataset
+        photos = enumerate(self.dataset.photos)
+        self._wanted = [index for index, photo in photos if names is None or photo.name in names]
 
     def __len__(self) -> int:
-        return len(self._datamanager.eval_dataset)
+        return len(self._wanted)
 
     def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
-        dataset = self._datamanager.eval_dataset
+        dataset = self.dataset
         _ = self._datamanager.targets  # what goes wrong in preparing them is no single photo's fault
         usable = False
-        for index, photo in enumerate(dataset.photos):
+        for index in self._wanted:
+            photo = dataset.photos[index]
             try:
                 item = self._datamanager._batch(dataset, index, dataset.read(index))
             except UserError as reason:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.files import read_names
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, read_reconstruction
@@ -34,6 +35,9 @@ class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
     masks_path: Path | None = Path("masks")
     """Foreground masks, white = keep, named like the photos (.png or .jpg); a photo without one is used
     whole. --pipeline.datamanager.foreground has other sources."""
+    held_out: Path | None = None
+    """Text file that names the photos to hold out of training, one per line, with or without suffix; instead
+    of every eighth. `lang3dxl evaluate split` makes one from ground truth."""
     downscale_factor: int | None = 1
     """Left at 1: photos are resized as they are read (--pipeline.datamanager.camera-res-scale-factor)."""
 
@@ -74,12 +78,33 @@ class PhotoCollectionDataParser(ColmapDataParser):
         return outputs
 
     def _get_image_indices(self, image_filenames, split):
-        indices = super()._get_image_indices(image_filenames, split)
+        if self.config.held_out is not None:
+            held_out = self._held_out([self._name(path) for path in image_filenames])
+            everything = np.arange(len(image_filenames))
+            wanted = np.isin(everything, held_out, invert=split == "train")
+            indices = everything[wanted]
+        else:
+            indices = super()._get_image_indices(image_filenames, split)
         if len(indices) == 0:
             raise UserError(
                 f"the {split} split of {self.config.data} has no photo (of {len(image_filenames)} in all): "
                 f"add photos, or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
             )
+        return indices
+
+    def _held_out(self, photos: list[str]) -> list[int]:
+        """Indices of the photos that the list names. Raises UserError where one of them isn't there."""
+        assert self.config.held_out is not None
+        indices = []
+        for name in read_names(self.config.held_out):
+            forms = [(p, str(PurePosixPath(p).with_suffix("")), PurePosixPath(p).stem) for p in photos]
+            found = [i for i, known in enumerate(forms) if name in known]
+            if len(found) != 1:
+                raise UserError(
+                    f"{self.config.held_out} names {name}, as {len(found)} photos of the scene are called: "
+                    f"correct the list"
+                )
+            indices += found
         return indices
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict:
@@ -131,6 +156,9 @@ class PhotoCollectionDataParser(ColmapDataParser):
 
     def _image_path(self, name: str) -> Path:
         return self.config.data / self.config.images_path / name
+
+    def _name(self, path: Path) -> str:
+        return Path(path).relative_to(self.config.data / self.config.images_path).as_posix()
 
     def _read_collection(self) -> None:
         """The model's photos that can be used; says which are left out, and why."""

@@ -23,9 +23,9 @@ from lang3dxl_ns.evaluation.report import (
     describe_machine,
     host_peak,
     markdown_table,
-    write_atomically,
     write_report,
 )
+from lang3dxl_ns.files import write_atomically
 
 if TYPE_CHECKING:
     from lang3dxl_ns.demo.picture import PictureRow

@@ -14,23 +14,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.evaluation.aggregate import mean_average_precision
 from lang3dxl_ns.evaluation.average_precision import mean_over_photos
-from lang3dxl_ns.evaluation.holyscenes import (
-    GroundTruth,
-    mean_average_precision,
-    resize_map,
-    score_maps,
-    scoring_size,
-)
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth, scoring_size
 from lang3dxl_ns.evaluation.report import (
     command_line,
     describe_machine,
     interleaved_times,
     markdown_table,
     progress_bar,
-    write_atomically,
     write_report,
 )
+from lang3dxl_ns.evaluation.scores import resize_map, score_maps
+from lang3dxl_ns.files import write_atomically
 from lang3dxl_ns.query.lookup import CodeScorer, CodeTable, mark_cells, table_error, tabulate
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.scene import PROBES, Scene, View
@@ -61,7 +57,7 @@ class LookupBenchmark:
     repeats: int = 5
     """Timed runs of each candidate; their median counts."""
     ground_truth: Path | None = None
-    """Folder of ground truth in HolyScenes' layout (default: ground_truth/ in the run's data folder)."""
+    """Folder of ground truth (default: what lies with the run's data)."""
 
     def main(self) -> None:
         from lang3dxl_ns.scene_loading import load_scene
@@ -149,8 +145,8 @@ def measure(scene: Scene, settings: LookupBenchmark) -> dict[str, Any]:
 
 
 def _ground_truth(scene: Scene, settings: LookupBenchmark) -> GroundTruth | None:
-    folder = settings.ground_truth or Path(scene.file.data) / "ground_truth"
-    return GroundTruth(folder) if settings.ground_truth or folder.is_dir() else None
+    folder = settings.ground_truth or find_ground_truth(Path(scene.file.data))
+    return GroundTruth(folder) if folder else None
 
 
 def _frame(camera: Camera, width: int, height: int) -> Camera:
@@ -170,14 +166,14 @@ def _compare(
     view = scene.render(photo.camera)
     keep = view.alpha >= scene.config.min_alpha
     size = scoring_size(photo.height, photo.width)
-    masks = truth.masks(photo.name, size) if truth else {}
+    truths = truth.truths(photo.name, size) if truth else {}
     pixels = keep.flatten().nonzero()[:, 0]
     order = torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0)).to(pixels.device)
     pixels = pixels[order[:_PIXELS_PER_PHOTO]]
     for found in compared.values():
         maps = found.scorer.relevancy(view.codes, queries, keep)
         found.sampled.append(maps.flatten(1)[:, pixels])
-        found.scores.append(score_maps(dict(zip(prompts, resize_map(maps, size), strict=True)), masks))
+        found.scores.append(score_maps(dict(zip(prompts, resize_map(maps, size), strict=True)), truths))
         if found.scorer.table is not None:
             known = found.scorer.table.locate(view.codes[keep])[2]
             found.decoded.append(1 - float(known.float().mean()))

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -17,14 +17,18 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
 from torch import Tensor
 
-from lang3dxl_ns.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
+from lang3dxl_ns.datamanager import EvalPhotos, Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.average_precision import deviation_over_photos, mean_over_photos
-from lang3dxl_ns.evaluation.holyscenes import GroundTruth, mean_average_precision, scoring_size
-from lang3dxl_ns.evaluation.language import LanguageScorer, Maps, blurred, inside, open_scorer
-from lang3dxl_ns.evaluation.report import progress_bar
+from lang3dxl_ns.evaluation.aggregate import average
+from lang3dxl_ns.evaluation.annotations import Truth
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
+from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
+from lang3dxl_ns.evaluation.report import host_peak, progress_bar, synchronize
+from lang3dxl_ns.evaluation.scores import Maps, map_size
 from lang3dxl_ns.model import Lang3DXLModel
 from lang3dxl_ns.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.preparation.photo import Photo
+from lang3dxl_ns.query.relevancy import TEMPERATURE
 
 
 @dataclass
@@ -35,24 +39,33 @@ class Lang3DXLPipelineConfig(VanillaPipelineConfig):
     datamanager: Lang3DXLDataManagerConfig = field(default_factory=Lang3DXLDataManagerConfig)
     model: Lang3DXLModelConfig = field(default_factory=Lang3DXLModelConfig)
     ground_truth: Path | None = None
-    """Folder of ground truth in HolyScenes' layout, <category>/NNNN-gt.jpg, object black: `ns-eval` then
-    reports the average precision of each category. Default: ground_truth/ in the data folder, if there."""
+    """Folder of ground truth, in any of the layouts of docs/evaluation.md: `ns-eval` then reports how well
+    words find their pixels. Default: ground_truth/ or label/ in the data folder, or label/<scene> beside it,
+    if there."""
+    ground_truth_layout: Layout | Literal["auto"] = "auto"
+    """HolyScenes' masks, LERF-OVS' and PT-OVS' labels, or plain masks; "auto" looks."""
+    evaluated_photos: Literal["held-out", "seen"] = "held-out"
+    """Which photos `ns-eval` looks at: those held out of training, or those of the training photos that have
+    ground truth (the main tables of HolyScenes are of photos that training saw)."""
 
 
 @dataclass
 class EvaluatedPhoto:
-    """A held-out photo: its figures, and the pictures behind them."""
+    """A photo that was evaluated: its figures, and the pictures behind them."""
 
     name: str
     metrics: dict[str, float]
-    """PSNR … and, with ground truth, `ap_{category}`, `raw_ap_{category}` (before the blur) and
-    `teacher_ap_{category}`."""
+    """psnr …, `render_seconds`, and with ground truth `query_seconds` and the figures of
+    `evaluation.aggregate.average`: `ap_{category}` …, with the prefixes raw_, authors_ and teacher_."""
     images: dict[str, Tensor]
     """`img` (photo beside rendering, [H, 2W, 3]) and, with semantics, `semantics`."""
     field_maps: Maps
-    """Relevancy by category at half the photo's size, blurred as published; empty without ground truth."""
+    """Relevancy by category as scored without prefix: blurred, at half the photo's size; empty without
+    ground truth."""
     teacher_maps: Maps
     """The same of the photo's own CLIP target."""
+    masked: bool = False
+    """Whether the maps are cut by a foreground mask."""
 
 
 class Lang3DXLPipeline(VanillaPipeline):
@@ -73,62 +86,118 @@ class Lang3DXLPipeline(VanillaPipeline):
     @cached_property
     def scorer(self) -> LanguageScorer | None:
         """Scores words where the scene has ground truth and the run has semantics."""
-        folder = self.config.ground_truth
-        if folder is None:
-            folder = self.datamanager.data_folder / "ground_truth"
-            if not folder.is_dir():
-                return None
-        if self.model.semantic_field is None:
+        folder = self.config.ground_truth or find_ground_truth(self.datamanager.data_folder)
+        if folder is None or self.model.semantic_field is None:
             return None
-        return open_scorer(GroundTruth(folder), self.datamanager.config.clip, self.device)
+        truth = GroundTruth(folder, self.config.ground_truth_layout)
+        self._check_labels(truth)
+        return open_scorer(truth, self.datamanager.config.clip, self.device)
+
+    def _check_labels(self, truth: GroundTruth) -> None:
+        """Labels must belong to photos of the scene, each to one; says which photos the scene lacks."""
+        named: dict[str, str] = {}
+        for name in self.datamanager.photos:
+            key = truth.key(name)
+            if key is not None and named.setdefault(key, name) != name:
+                raise UserError(
+                    f"the label {key} in {truth.folder} fits both {named[key]} and {name}: name labels with "
+                    f"the folders of their photos"
+                )
+        absent = [photo for photo in truth.labelled if photo not in named]
+        if not named:
+            raise UserError(
+                f"no label in {truth.folder} belongs to a photo of the scene: labels are named like photos, "
+                f"and the first are {absent[0]} and {next(iter(self.datamanager.photos))}"
+            )
+        if absent:
+            CONSOLE.log(f"[yellow]the scene has no photo for the labels {', '.join(absent)}")
 
     @torch.no_grad()
     def evaluate(self) -> Iterator[EvaluatedPhoto]:
-        """Render every held-out photo and compare, one at a time, with a progress bar."""
+        """Render the photos to evaluate and compare, one at a time, with a progress bar."""
         self.eval()
-        photos = self.datamanager.fixed_indices_eval_dataloader
+        photos = self._evaluated_photos()
         with progress_bar() as bar:
             for camera, batch in bar.track(photos, total=len(photos), description="evaluating"):
-                yield self._evaluate_photo(camera, batch)
+                yield self._evaluate_photo(camera, batch, photos.dataset.photos[batch["image_idx"]])
         self.train()
 
-    def _evaluate_photo(self, camera, batch: dict) -> EvaluatedPhoto:
+    def _evaluated_photos(self) -> EvalPhotos:
+        if self.config.evaluated_photos == "held-out":
+            return self.datamanager.fixed_indices_eval_dataloader
+        if self.scorer is None:
+            raise UserError("photos that training saw are evaluated where there is ground truth, and CLIP")
+        seen = self.datamanager.train_dataset
+        labelled = [photo.name for photo in seen.photos if self.scorer.truth.key(photo.name) is not None]
+        if not labelled:
+            raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
+        return EvalPhotos(self.datamanager, seen, labelled)
+
+    def _evaluate_photo(self, camera, batch: dict, photo: Photo) -> EvaluatedPhoto:
         start = perf_counter()
         outputs = self.model.get_outputs_for_camera(camera)
+        synchronize()
         seconds = perf_counter() - start
         metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
-        metrics["fps"] = 1 / seconds
-        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, {})
+        metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, {}, "mask" in batch)
         if self.scorer is not None:
-            self._score_words(evaluated, batch)
+            self._score_words(evaluated, batch, photo)
         return evaluated
 
-    def _score_words(self, evaluated: EvaluatedPhoto, batch: dict) -> None:
+    def _score_words(self, evaluated: EvaluatedPhoto, batch: dict, photo: Photo) -> None:
         scorer, field_ = self.scorer, self.model.semantic_field
         assert scorer is not None and field_ is not None
-        photo = self.datamanager.eval_dataset.photos[batch["image_idx"]]
-        size = scoring_size(photo.height, photo.width)
+        size = scorer.truth.scoring_size(photo.height, photo.width)
         keep = batch["mask"][..., 0] if "mask" in batch else None
-        raw = inside(scorer.field_maps(field_.decode_clip, self.model.rendered_codes, size), keep)
-        evaluated.field_maps = inside(blurred(raw), keep)
-        evaluated.teacher_maps = inside(blurred(scorer.teacher_maps(batch["clip_target"], size)), keep)
-        scored = {"": evaluated.field_maps, "raw_": raw, "teacher_": evaluated.teacher_maps}
-        for prefix, maps in scored.items():
-            evaluated.metrics |= scorer.scores(photo.name, maps, prefix)
+        start = perf_counter()
+        raw = scorer.field_maps(field_.decode_clip, self.model.rendered_codes, size)
+        synchronize()
+        evaluated.metrics["query_seconds"] = perf_counter() - start
+        variants = scorer.variants(raw, keep, TEMPERATURE)
+        teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
+        evaluated.field_maps, evaluated.teacher_maps = variants[""], teacher
+        truths = _truths(scorer.truth, photo, map_size(raw))
+        for prefix, maps in (variants | {"teacher_": teacher}).items():
+            evaluated.metrics |= scorer.scores(photo.name, maps, prefix, truths)
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Means over the held-out photos, for `ns-eval` and the trainer; see `average`.
+        """Means and totals over the evaluated photos, and `peak_memory_mb` of the process (of the GPU, where
+        one is used), for `ns-eval` and the trainer; see `evaluation.aggregate.average`.
 
         output_path: folder for a picture of every photo, if wanted.
+        get_std: as `ns-eval` asks; then also standard deviations, `protocol` (what was scored, and how) and
+            `photos` (the figures of each).
         """
-        photos = []
-        for evaluated in self.evaluate():
-            photos.append(evaluated.metrics)
+        evaluated = []
+        for photo in self.evaluate():
             if output_path is not None:
-                _write_pictures(evaluated, output_path)
-        return average(photos, get_std)
+                _write_pictures(photo, output_path)
+            photo.images, photo.field_maps, photo.teacher_maps = {}, {}, {}  # all photos' would not fit
+            evaluated.append(photo)
+        results = average([photo.metrics for photo in evaluated], get_std)
+        results["peak_memory_mb"] = _peak_memory(self.device) / 2**20
+        if get_std:
+            results["protocol"] = self._protocol(evaluated)
+            results["photos"] = {photo.name: photo.metrics for photo in evaluated}
+        return results
+
+    def _protocol(self, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
+        trained = {photo.name for photo in self.datamanager.train_dataset.photos}
+        seen, masked = (sum(p.name in trained for p in evaluated), sum(p.masked for p in evaluated))
+        photos = {"evaluated_photos": len(evaluated), "seen_in_training": seen}
+        mask = f"predictions are 0 outside the foreground masks of {masked} of {len(evaluated)} photos"
+        if self.scorer is None:
+            return photos
+        words = self.scorer.protocol(mask if masked else "none")
+        if words["prompts_without_photos"]:
+            CONSOLE.log(
+                f"[yellow]no evaluated photo shows {', '.join(words['prompts_without_photos'])}; `lang3dxl "
+                f"evaluate run --split seen` looks at the labelled photos that training saw"
+            )
+        return photos | words
 
     def get_train_loss_dict(self, step: int):
         """Outputs, losses and metrics of the next photo."""
@@ -154,21 +223,18 @@ def _write_pictures(evaluated: EvaluatedPhoto, folder: Path) -> None:
         Image.fromarray(pixels).save(folder / f"{evaluated.name.replace('/', '_')}.{name}.jpg")
 
 
-def average(photos: list[dict[str, float]], with_deviation: bool = False) -> dict[str, Any]:
-    """Means over photos of every figure; `map`, `raw_map` and `teacher_map`, unweighted means over the
-    categories of `ap_…`, `raw_ap_…` and `teacher_ap_…`; `ap_…_photos`, how many photos that is."""
-    means: dict[str, Any] = mean_over_photos(photos)
-    totals = {f"{who}map": mean_average_precision(means, who) for who in ("", "raw_", "teacher_")}
-    counts = {
-        f"{name}_photos": sum(name in photo for photo in photos) for name in means if name.startswith("ap_")
-    }
-    if with_deviation:
-        deviations = deviation_over_photos(photos)
-        means = {
-            key: v for name in means for key, v in ((name, means[name]), (f"{name}_std", deviations[name]))
-        }
-    means |= {name: value for name, value in totals.items() if value is not None}
-    return means | counts
+def _truths(truth: GroundTruth, photo: Photo, size: tuple[int, int]) -> dict[str, Truth]:
+    """The photo's labels as it is rendered: drawn on the file, they are undistorted with it. (Boxes no longer
+    fit then, and the mask takes their place.)"""
+    truths = truth.truths(photo.name, size)
+    if not (photo.fisheye or any(photo.distortion)):
+        return truths
+    masks = {category: torch.from_numpy(found.mask).int() for category, found in truths.items()}
+    return {category: Truth(photo.undistort_labels(mask).numpy() == 1) for category, mask in masks.items()}
+
+
+def _peak_memory(device: torch.device | str) -> int:
+    return torch.cuda.max_memory_allocated() if torch.device(device).type == "cuda" else host_peak()
 
 
 _previous_hook = sys.excepthook

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 import yaml
 
 from lang3dxl_ns.errors import UserError
@@ -23,3 +26,29 @@ def load_preset(name: str) -> dict[str, Any]:
     if name not in known:
         raise UserError(f"there is no preset {name!r}: choose one of {', '.join(known)}")
     return yaml.safe_load((FOLDER / f"{name}.yaml").read_text())
+
+
+def train_flags(name: str) -> list[str]:
+    """Flags of `ns-train lang3dxl` that train a scene as published: crop range, iterations, schedule.
+
+    Raises UserError for a preset that isn't a scene's.
+    """
+    settings = load_preset(name)
+    if "train" not in settings:
+        raise UserError(f"{name} is no preset of a scene: choose another, such as holyscenes/milano")
+    flags = {"pipeline.datamanager.scale-preset": name} | settings["train"]
+    return [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]
+
+
+@dataclass
+class Preset:
+    """Print the flags that train a benchmark's scene as published, to be used as
+
+    ns-train lang3dxl --data FOLDER $(lang3dxl preset holyscenes/milano)
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Such as holyscenes/milano."""
+
+    def main(self) -> None:
+        print(shlex.join(train_flags(self.name)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -16,7 +15,8 @@ from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.report import progress_bar, write_atomically
+from lang3dxl_ns.evaluation.report import progress_bar
+from lang3dxl_ns.files import slugs, write_atomically
 from lang3dxl_ns.query.overlay import overlay
 from lang3dxl_ns.query.scene import Match, QueryConfig, Scene
 from lang3dxl_ns.query.scene_file import read_camera_path
@@ -101,15 +101,6 @@ def _best_view(scene: Scene, texts: list[str]) -> str:
 
 def _file_name(photo: str) -> str:
     return str(PurePosixPath(photo).with_suffix("")).replace("/", "_")
-
-
-def slugs(texts: list[str]) -> list[str]:
-    """A folder name for each text, no two the same, whatever the texts are."""
-    found: list[str] = []
-    for i, text in enumerate(texts):
-        slug = re.sub(r"[^\w]+", "-", text.lower()).strip("-")[:40] or f"text-{i + 1}"
-        found.append(f"{slug}-{i + 1}" if slug in found else slug)
-    return found
 
 
 def write_match(match: Match, stem: Path, threshold: float) -> None:

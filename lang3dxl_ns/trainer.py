@@ -26,6 +26,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from lang3dxl_ns.components import schedules
+from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.query.scene_file import SCENE_FILE
@@ -141,6 +142,9 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         datamanager = self.pipeline.datamanager
         datamanager.data = _absolute(datamanager.data or self.data)
         self.data = datamanager.data
+        self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)
+        if isinstance(datamanager.dataparser, PhotoCollectionDataParserConfig):
+            datamanager.dataparser.held_out = _absolute(datamanager.dataparser.held_out)
         self.output_dir = Path(self.output_dir).expanduser().absolute()
 
     def _follow(self, run: Path) -> None:

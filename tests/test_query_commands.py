@@ -9,7 +9,7 @@ from painted_scene import CODES, painted_scene, render
 from PIL import Image
 
 from lang3dxl_ns import cli, scene_loading
-from lang3dxl_ns.query_commands import slugs
+from lang3dxl_ns.files import slugs
 
 
 @pytest.fixture

@@ -39,9 +39,9 @@ from lang3dxl_ns.evaluation.report import (
     markdown_table,
     peak_memory,
     progress_bar,
-    write_atomically,
     write_report,
 )
+from lang3dxl_ns.files import write_atomically
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.rasterize import Backend
 

@@ -31,7 +31,7 @@ class Lpips:
 
             try:
                 self._metric = LearnedPerceptualImagePatchSimilarity(normalize=True)
-            except OSError as error:
+            except (OSError, RuntimeError) as error:  # no Internet; a damaged or intercepted download
                 get_console().log(f"LPIPS is left out: its weights cannot be loaded ({error})")
                 self._available = False
         if self._metric is None:

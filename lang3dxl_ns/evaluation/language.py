@@ -5,20 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter
+from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.evaluation.holyscenes import GroundTruth, resize_map, score_maps
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map
 from lang3dxl_ns.preparation.encoders import ImageTextEncoder
 from lang3dxl_ns.query.relevancy import CANONICAL, relevancy, relevancy_of_codes
 
-Maps = dict[str, Float[Tensor, "h w"]]
-BLUR = 2.5
-"""Pixels at half the photo's size, by which the publication blurs relevancy maps."""
 
-
-class LanguageScorer:
+class LanguageScorer(MapScorer):
     """Relevancy maps of a scene's categories, of the 3D field and of its 2D teacher, by the same rules.
 
     The prompts are the categories' names. The teacher is the photo's own CLIP target: what the field learns
@@ -26,7 +22,7 @@ class LanguageScorer:
     """
 
     def __init__(self, truth: GroundTruth, encoder: ImageTextEncoder) -> None:
-        self.truth = truth
+        super().__init__(truth)
         self._queries = encoder.encode_texts(truth.categories)
         self._canonical = encoder.encode_texts(list(CANONICAL))
 
@@ -48,30 +44,8 @@ class LanguageScorer:
         maps = relevancy(features, self._queries.to(features.device), self._canonical.to(features.device))
         return self._named(maps)
 
-    def scores(self, photo: str, maps: Maps, prefix: str = "") -> dict[str, float]:
-        """`{prefix}ap_{category}` of every category that the photo shows and has a mask of."""
-        size = next(iter(maps.values())).shape
-        return score_maps(maps, self.truth.masks(photo, (size[0], size[1])), prefix)
-
     def _named(self, maps: Float[Tensor, "q h w"]) -> Maps:
         return dict(zip(self.truth.categories, maps, strict=True))
-
-
-def blurred(maps: Maps, sigma: float = BLUR) -> Maps:
-    """Every map under a Gaussian of `sigma` pixels."""
-    return {
-        name: torch.from_numpy(gaussian_filter(scores.cpu().numpy(), sigma)).to(scores.device)
-        for name, scores in maps.items()
-    }
-
-
-def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
-    """Every map, 0 outside the foreground `keep`, where there is one."""
-    if keep is None:
-        return maps
-    size = next(iter(maps.values())).shape
-    there = resize_map(keep[None].float(), (size[0], size[1]))[0] >= 0.5
-    return {name: scores * there for name, scores in maps.items()}
 
 
 def open_scorer(truth: GroundTruth, clip: str, device: torch.device | str) -> LanguageScorer:

@@ -8,7 +8,6 @@ import os
 import platform
 import shlex
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -19,6 +18,8 @@ from typing import Any
 
 import torch
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from lang3dxl_ns.files import write_atomically
 
 MEBIBYTE = 2**20
 
@@ -108,14 +109,15 @@ def interleaved_times(
 
 
 def _seconds(work: Callable[[], object], clock: Callable[[], float]) -> float:
-    _synchronize()
+    synchronize()
     start = clock()
     work()
-    _synchronize()
+    synchronize()
     return clock() - start
 
 
-def _synchronize() -> None:
+def synchronize() -> None:
+    """Wait until a GPU has done what it was asked, where one is in use."""
     if torch.cuda.is_initialized():
         torch.cuda.synchronize()
 
@@ -183,17 +185,3 @@ def write_report(folder: Path, name: str, markdown: str, data: Mapping[str, Any]
     """
     write_atomically(folder / f"{name}.json", json.dumps(data, indent=2, allow_nan=False) + "\n")
     write_atomically(folder / f"{name}.md", markdown.rstrip() + "\n")
-
-
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file under a temporary name beside it and rename, so that no reader sees half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-        os.chmod(temporary, 0o644)  # mkstemp's files are private; a report is to be read
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise

@@ -7,9 +7,7 @@ import errno
 import hashlib
 import json
 import logging
-import os
 import re
-import secrets
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +17,7 @@ import torch
 from torch import Tensor
 
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.files import write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +57,7 @@ class FeatureStore:
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
         """Writes a file of the store, atomically. Raises UserError when the disk is full."""
         try:
-            _write_atomically(path, content)
+            write_atomically(path, content)
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
@@ -140,18 +139,3 @@ def _compact(tensor: Tensor, what: str) -> Tensor:
 
 def _canonical(settings: dict[str, Any]) -> str:
     return json.dumps(settings, sort_keys=True)
-
-
-def _write_atomically(path: Path, content: bytes) -> None:
-    """Writes beside the target and renames, so that no reader ever sees a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-    try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())  # else a crash may leave the new name with no content
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise

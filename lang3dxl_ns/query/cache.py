@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lang3dxl_ns.evaluation.report import write_atomically
+from lang3dxl_ns.files import write_atomically
 from lang3dxl_ns.query.lookup import CodeTable, Lookup, TableCheck, TableError
 from lang3dxl_ns.rendering import Camera
 

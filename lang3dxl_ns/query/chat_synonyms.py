@@ -12,7 +12,7 @@ from http.client import HTTPException
 from pathlib import Path
 
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.report import write_atomically
+from lang3dxl_ns.files import write_atomically
 
 _QUESTION = (
     "You help to find parts of buildings in photos. List up to five synonyms of the given term that are at "

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.report import write_atomically
+from lang3dxl_ns.files import write_atomically
 from lang3dxl_ns.geometry import view_matrix
 from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.rendering import Camera

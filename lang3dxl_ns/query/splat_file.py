@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lang3dxl_ns.evaluation.report import write_atomically
+from lang3dxl_ns.files import write_atomically
 
 _SH_OF_GREY = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 √π): colour = 0.5 + this × coefficient."""

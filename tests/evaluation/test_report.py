@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
@@ -17,7 +16,6 @@ from lang3dxl_ns.evaluation.report import (
     interleaved_times,
     markdown_table,
     peak_memory,
-    write_atomically,
     write_report,
 )
 
@@ -93,17 +91,3 @@ def test_a_report_with_nan_is_refused_and_the_old_one_stays(tmp_path):
         write_report(tmp_path, "speed", "new", {"ratio": float("nan")})
     assert (tmp_path / "speed.md").read_text() == "old\n"
     assert json.loads((tmp_path / "speed.json").read_text()) == {"ratio": 1.0}
-
-
-def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path, monkeypatch):
-    target = tmp_path / "figure.png"
-    write_atomically(target, b"old")
-
-    def refuse(*_):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(OSError, match="disk full"):
-        write_atomically(target, b"new")
-    assert [re.sub(r"\W", "", path.name) for path in tmp_path.iterdir()] == ["figurepng"]
-    assert target.read_bytes() == b"old"

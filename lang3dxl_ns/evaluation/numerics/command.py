@@ -19,9 +19,9 @@ from lang3dxl_ns.evaluation.report import (
     describe_machine,
     markdown_table,
     progress_bar,
-    write_atomically,
     write_report,
 )
+from lang3dxl_ns.files import write_atomically
 
 HEADER = (
     "case",

@@ -1,0 +1,258 @@
+"""`lang3dxl evaluate`: scores of runs, of anyone's maps, and of several scenes together."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.evaluation.aggregate import PREFIXES, TOTALS, average, mean_average_precision, pool
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
+from lang3dxl_ns.evaluation.predictions import score_predictions
+from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, write_report
+from lang3dxl_ns.files import read_names, write_atomically
+
+REPORT = "scores"
+"""Name of the report's files, without suffix."""
+WHOSE = {
+    "": "blurred",
+    "raw_": "as they are",
+    "authors_": "as published",
+    "teacher_": "2-D teacher",
+}
+"""Heads of the report's columns."""
+
+
+@dataclass(kw_only=True)
+class EvaluateMaps:
+    """Score relevancy maps that any system made.
+
+    They lie in a folder per prompt, `<prompt>/<photo>.npy` (float) or a picture, as `lang3dxl query` writes
+    them too. Writes scores.md and scores.json.
+    """
+
+    maps: Path
+    """Folder of the maps."""
+    ground_truth: Path
+    """Folder of the scene's ground truth, in any layout of docs/evaluation.md."""
+    layout: Layout | Literal["auto"] = "auto"
+    """Which layout; "auto" looks."""
+    photos: Path | None = None
+    """Text file with the names of the photos to score, one per line (default: all that have a label)."""
+    masks: Path | None = None
+    """Folder of foreground masks, white = keep: predictions count as 0 elsewhere."""
+    scene: str | None = None
+    """Name in the report (default: the ground truth's folder)."""
+    out: Path
+    """Folder for the report."""
+
+    def main(self) -> None:
+        truth = GroundTruth(self.ground_truth, self.layout)
+        names = None if self.photos is None else read_names(self.photos)
+        photos, protocol = score_predictions(truth, self.maps, names, self.masks)
+        results = average(list(photos.values()), with_deviation=True)
+        results |= {"protocol": protocol, "photos": photos}
+        _write(self.out, self.scene or truth.folder.absolute().name, results)
+
+
+@dataclass(kw_only=True)
+class EvaluateRun:
+    """Score a trained run, as `ns-eval` does, on photos and with ground truth of your choice.
+
+    Writes scores.md and scores.json.
+    """
+
+    load_config: Path
+    """config.yml of the run."""
+    split: Literal["held-out", "seen"] = "held-out"
+    """Photos held out of training, or the training photos that have ground truth."""
+    ground_truth: Path | None = None
+    """Folder of ground truth (default: as the run was configured, else what lies with its data)."""
+    layout: Layout | Literal["auto"] = "auto"
+    """Which layout; "auto" looks."""
+    scene: str | None = None
+    """Name in the report (default: the data folder)."""
+    out: Path
+    """Folder for the report."""
+
+    def main(self) -> None:
+        from nerfstudio.utils.eval_utils import eval_setup
+
+        from lang3dxl_ns.pipeline import Lang3DXLPipeline
+
+        if not self.load_config.is_file():
+            raise UserError(f"{self.load_config} is not a file: pass the config.yml of a run")
+        _, pipeline, _, _ = eval_setup(self.load_config)
+        if not isinstance(pipeline, Lang3DXLPipeline):
+            raise UserError(f"{self.load_config} is the run of another method: use ns-eval")
+        pipeline.config.evaluated_photos = self.split
+        if self.ground_truth is not None:
+            pipeline.config.ground_truth = self.ground_truth
+        if self.ground_truth is not None or self.layout != "auto":
+            pipeline.config.ground_truth_layout = self.layout
+        results = pipeline.get_average_eval_image_metrics(get_std=True)
+        _write(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
+
+
+@dataclass(kw_only=True)
+class EvaluatePool:
+    """Put scenes together: averages over all photos, and over the means of the scenes.
+
+    Writes scores.md and scores.json.
+    """
+
+    reports: list[Path]
+    """Of each scene the scores.json of `lang3dxl evaluate`, or what `ns-eval --output-path` wrote."""
+    out: Path
+    """Folder for the report."""
+
+    def main(self) -> None:
+        if not self.reports:
+            raise UserError("there is nothing to put together: name the scenes' reports after --reports")
+        scenes: dict[str, dict[str, Any]] = {}
+        for path in self.reports:
+            name, results = _read_results(path)
+            if name in scenes:
+                raise UserError(f"{path} is a second report of the scene {name}: give one for each scene")
+            scenes[name] = results
+        protocols = {name: results["protocol"] for name, results in scenes.items()}
+        for key in ("layout", "scored_at"):
+            if len({protocol.get(key) for protocol in protocols.values()}) > 1:
+                raise UserError(f"the scenes differ in {key}: {', '.join(scenes)} can't be put together")
+        if not any("map" in results for results in scenes.values()):
+            raise UserError(f"no word was scored in {', '.join(scenes)}: there is nothing to put together")
+        pooled = pool({name: list(results["photos"].values()) for name, results in scenes.items()})
+        notes = [
+            f"- {name}: {p.get('evaluated_photos')} photos, {p.get('seen_in_training', 'unknown')} of them "
+            f"seen in training; foreground: {p.get('foreground')}"
+            for name, p in protocols.items()
+        ]
+        table = "\n".join([_pooled_table(pooled), "", *notes])
+        write_report(self.out, REPORT, table, pooled | {"protocols": protocols})
+        print(f"{table}\n\nWrote {self.out / REPORT}.md")
+
+
+@dataclass(kw_only=True)
+class EvaluateSplit:
+    """Choose labelled photos to hold out of training, up to five per category, the same at every call.
+
+    The list goes into `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`.
+    """
+
+    ground_truth: Path
+    """Folder of the scene's ground truth."""
+    out: Path
+    """The text file."""
+    per_category: int = 5
+    """Photos for each category; photos that show several count for each."""
+
+    def main(self) -> None:
+        if self.per_category < 1:
+            raise UserError(f"--per-category is {self.per_category}: give 1 or more")
+        names = held_out_photos(GroundTruth(self.ground_truth), self.per_category)
+        write_atomically(self.out, "\n".join(names) + "\n")
+        print(f"Wrote {len(names)} names to {self.out}")
+
+
+Evaluate = (
+    Annotated[EvaluateMaps, tyro.conf.subcommand("maps")]
+    | Annotated[EvaluateRun, tyro.conf.subcommand("run")]
+    | Annotated[EvaluatePool, tyro.conf.subcommand("pool")]
+    | Annotated[EvaluateSplit, tyro.conf.subcommand("split")]
+)
+
+
+# ── reports ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _read_results(path: Path) -> tuple[str, dict[str, Any]]:
+    """Scene and results of a report, of `ns-eval`'s form too."""
+    try:
+        content = json.loads(path.read_text())
+        results = content["results"]
+        for figures in results["photos"].values():
+            if not all(math.isfinite(value) for value in figures.values()):
+                raise ValueError("a photo has a figure that is no number")
+        if not isinstance(results["protocol"], dict):
+            raise ValueError("it does not say what was scored")
+        return str(content.get("scene") or content["experiment_name"]), results
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} is no report of `lang3dxl evaluate` or `ns-eval` ({error!r}): make it again"
+        ) from error
+
+
+def _write(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu") -> None:
+    report = {"scene": scene, "machine": describe_machine(device), "results": results}
+    table = _scene_table(scene, results)
+    write_report(folder, REPORT, table, report)
+    print(table)
+    print(f"\nWrote {folder / REPORT}.md")
+
+
+def _scene_table(scene: str, results: Mapping[str, Any]) -> str:
+    """The report for people: average precision by category, then totals, then the protocol."""
+    categories = sorted(name.removeprefix("ap_").removesuffix("_photos") for name in results if _counts(name))
+    whose = [prefix for prefix in PREFIXES if f"{prefix}map" in results]
+    rows = [
+        [c, results[f"ap_{c}_photos"], *(_mean_std(results, f"{prefix}ap_{c}") for prefix in whose)]
+        for c in categories
+    ]
+    rows.append(["**mAP**", "", *(f"**{results[f'{prefix}map']:.3f}**" for prefix in whose)])
+    heads = WHOSE | ({"": "as they are"} if results["protocol"].get("layout") == "lerf_ovs" else {})
+    words = markdown_table(["average precision", "photos", *(heads[prefix] for prefix in whose)], rows)
+    totals = [[name, f"{results[name]:.3f}"] for name in TOTALS.values() if name in results]
+    others = [[name, _mean_std(results, name)] for name in _OTHERS if name in results]
+    protocol = "\n".join(f"- {name.replace('_', ' ')}: {v}" for name, v in results["protocol"].items())
+    figures = markdown_table(["", "mean"], totals + others)
+    return f"# {scene}\n\n{words if categories else ''}\n\n{figures}\n\n{protocol}\n"
+
+
+_OTHERS = (
+    "psnr",
+    "cc_psnr",
+    "ssim",
+    "lpips",
+    "clip_l1",
+    "clip_psnr",
+    "clip_cosine",
+    "render_seconds",
+    "query_seconds",
+    "peak_memory_mb",
+)
+
+
+def _counts(name: str) -> bool:
+    return name.startswith("ap_") and name.endswith("_photos")
+
+
+def _mean_std(results: Mapping[str, Any], name: str) -> str:
+    deviation = results.get(f"{name}_std")
+    return f"{results[name]:.3f}" + ("" if deviation is None else f" ± {deviation:.3f}")
+
+
+def _pooled_table(pooled: Mapping[str, Mapping[str, Any]]) -> str:
+    images, scenes, each = pooled["image_pooled"], pooled["scene_mean"], pooled["per_scene"]
+    categories = [name for name in images if name.startswith("ap_") and f"{name}_photos" in images]
+    rows = [
+        [
+            name.removeprefix("ap_"),
+            images[f"{name}_photos"],
+            f"{images[name]:.3f}",
+            f"{scenes[name]:.3f}",
+            *(f"{figures[name]:.3f}" if name in figures else None for figures in each.values()),
+        ]
+        for name in categories
+    ]
+    by_scene = [mean_average_precision(figures) for figures in each.values()]
+    rows.append(
+        ["**mAP**", "", f"**{images['map']:.3f}**", f"**{scenes['map']:.3f}**"]
+        + [None if value is None else f"{value:.3f}" for value in by_scene]
+    )
+    return markdown_table(["average precision", "photos", "image-pooled", "scene mean", *each], rows)

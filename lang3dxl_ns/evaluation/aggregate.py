@@ -1,0 +1,85 @@
+"""From the figures of photos to those of a scene, and from scenes to those of a benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lang3dxl_ns.evaluation.average_precision import deviation_over_photos, mean_over_photos
+
+PREFIXES = ("", "raw_", "authors_", "teacher_")
+"""Whose maps: the field's, before the blur, processed as published, and the 2D teacher's."""
+TOTALS = {
+    "located": "localisation_accuracy",
+    "iou": "miou",
+    "f1": "mean_f1",
+    "balanced_accuracy": "mean_balanced_accuracy",
+    "smooth_located": "smooth_localisation_accuracy",
+    "smooth_iou": "smooth_miou",
+}
+"""Measures whose total is the mean over all pairs of a photo and a category, as for LERF-OVS."""
+Figures = Mapping[str, float]
+"""Of one photo: psnr …, and `{prefix}{measure}_{category}`."""
+
+
+def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str, Any]:
+    """Means over photos of every figure, and totals.
+
+    `{prefix}map`: unweighted mean over the categories of average precision. `{prefix}miou`,
+    `{prefix}localisation_accuracy` …: means over all pairs of a photo and a category. `ap_{category}_photos`:
+    how many photos that category has. with_deviation: `…_std` of every mean.
+    """
+    means: dict[str, Any] = mean_over_photos(photos)
+    counts = {
+        f"{name}_photos": sum(name in photo for photo in photos) for name in means if name.startswith("ap_")
+    }
+    totals = _totals(photos, means)
+    if with_deviation:
+        deviations = deviation_over_photos(photos)
+        means = {
+            key: v for name in means for key, v in ((name, means[name]), (f"{name}_std", deviations[name]))
+        }
+    return means | totals | counts
+
+
+def _totals(photos: Sequence[Figures], means: Figures) -> dict[str, float]:
+    totals: dict[str, float] = {}
+    for prefix in PREFIXES:
+        precision = mean_average_precision(means, prefix)
+        if precision is not None:
+            totals[f"{prefix}map"] = precision
+        for measure, total in TOTALS.items():
+            start = f"{prefix}{measure}_"
+            pairs = [v for photo in photos for name, v in photo.items() if name.startswith(start)]
+            if pairs:
+                totals[f"{prefix}{total}"] = float(np.mean(pairs))
+    return totals
+
+
+def mean_average_precision(means: Figures, prefix: str = "") -> float | None:
+    """Unweighted mean of the categories' APs in `means`, each a mean over photos; None without any."""
+    found = [value for name, value in means.items() if name.startswith(f"{prefix}ap_")]
+    return float(np.mean(found)) if found else None
+
+
+def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
+    """Several scenes together, in both ways of reading a benchmark's table.
+
+    `image_pooled`: `average` of the photos of all scenes, so that a scene counts as often as it has photos
+    (which fits the published tables of HolyScenes). `scene_mean`: each scene's mean first, then their mean,
+    so that all scenes that have a category count alike; its `map` is the mean of those over categories.
+    `per_scene`: means and totals of each scene.
+    """
+    per_scene = {name: average(photos) for name, photos in scenes.items()}
+    means = mean_over_photos(
+        {name: value for name, value in figures.items() if not name.endswith("_photos")}
+        for figures in per_scene.values()
+    )
+    for prefix in PREFIXES:
+        precision = mean_average_precision(means, prefix)
+        if precision is not None:
+            means[f"{prefix}map"] = precision
+    everything = [photo for photos in scenes.values() for photo in photos]
+    return {"image_pooled": average(everything), "scene_mean": means, "per_scene": per_scene}

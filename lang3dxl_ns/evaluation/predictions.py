@@ -1,0 +1,122 @@
+"""Maps that anyone made, scored by the code that scores runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.evaluation.annotations import PICTURES, check_shape, read_grey
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.report import progress_bar
+from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest_level
+from lang3dxl_ns.files import slugs
+from lang3dxl_ns.preparation.foreground import find_mask
+
+
+class PredictedMaps:
+    """A folder of maps, `<prompt>/<photo>.npy` (float, [h, w], or [levels, h, w] as LangSplat has them) or
+    a picture (black 0, white 1), of any size in proportion to the photo.
+
+    Prompts and photos are named as in the ground truth, or as `lang3dxl query` names its files.
+    """
+
+    def __init__(self, folder: Path, categories: Sequence[str]) -> None:
+        self.folder = Path(folder).expanduser()
+        if not self.folder.is_dir():
+            raise UserError(f"{self.folder} is no folder: pass the one that holds <prompt>/<photo>.npy")
+        self._folders = {c: (c, slug) for c, slug in zip(categories, slugs(list(categories)), strict=True)}
+
+    def read(self, category: str, photo: str, size: tuple[int, int]) -> Float[Tensor, "h w"]:
+        """A map at `size`. Raises UserError where it is missing, damaged or of another shape."""
+        path = self._find(category, photo)
+        score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_grey(path, "map")) / 255
+        if score.ndim == 3:
+            score = strongest_level(score)
+        height, width = score.shape
+        check_shape(path, (height, width), size)
+        return resize_map(torch.from_numpy(score.astype(np.float32))[None], size)[0]
+
+    def _find(self, category: str, photo: str) -> Path:
+        names = dict.fromkeys((photo, photo.replace("/", "_")))
+        paths = [
+            self.folder / folder / f"{name}{suffix}"
+            for folder in self._folders[category]
+            for name in names
+            for suffix in (".npy", *PICTURES, ".JPG", ".JPEG", ".PNG")
+        ]
+        found = next((path for path in paths if path.is_file()), None)
+        if found is None:
+            raise UserError(
+                f"there is no map of {category!r} for the photo {photo}: make {paths[0]} (or a picture), or "
+                f"name the photos to score with --photos"
+            )
+        return found
+
+
+def _read_array(path: Path) -> Float[Array, "*levels h w"]:
+    try:
+        score = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"map {path} can't be read ({error}): write it with numpy.save") from error
+    if not isinstance(score, np.ndarray) or score.ndim not in (2, 3) or 0 in score.shape:
+        shape = getattr(score, "shape", "none")
+        raise UserError(f"map {path} has shape {shape}, and [h, w] or [levels, h, w] is expected")
+    if score.dtype.kind not in "fiub":
+        raise UserError(f"map {path} holds {score.dtype}: numbers are expected")
+    score = score.astype(np.float64)
+    if not np.isfinite(score).all():
+        raise UserError(f"map {path} holds NaN or infinity: mend what made it")
+    return score
+
+
+def score_predictions(
+    truth: GroundTruth,
+    maps: Path,
+    photos: Sequence[str] | None = None,
+    masks: Path | None = None,
+) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
+    """Figures of every labelled photo, by its name, and the protocol that they go by.
+
+    photos: those to score, by the names of photos or labels; all that have a label without it. masks: folder
+    of foreground masks, white = keep; predictions are 0 elsewhere. Raises UserError for a missing map.
+    """
+    scorer, predicted = MapScorer(truth), PredictedMaps(maps, truth.categories)
+    keys = truth.labelled if photos is None else [_key(truth, photo) for photo in photos]
+    keeps = {key: None if masks is None else _read_mask(masks, key) for key in keys}
+    figures: dict[str, dict[str, float]] = {}
+    with progress_bar() as bar:
+        for key in bar.track(keys, description="scoring"):
+            size = truth.scoring_size(*truth.size(key))
+            truths = truth.truths(key, size)
+            found: Maps = {category: predicted.read(category, key, size) for category in truths}
+            figures[key] = {}
+            for prefix, variant in scorer.variants(found, keeps[key]).items():
+                figures[key] |= scorer.scores(key, variant, prefix, truths)
+    masked = sum(keep is not None for keep in keeps.values())
+    statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"
+    protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(
+        statement if masked else "none but what the maps have"
+    )
+    return figures, protocol
+
+
+def _key(truth: GroundTruth, photo: str) -> str:
+    key = truth.key(photo)
+    if key is None:
+        raise UserError(f"the photo {photo} has no label in {truth.folder}: correct the list of photos")
+    return key
+
+
+def _read_mask(folder: Path, photo: str) -> Bool[Tensor, "h w"] | None:
+    path = find_mask(folder, f"{photo}.png")
+    if path is None:
+        raise UserError(f"{folder} holds no mask of the photo {photo}: add it, white = keep")
+    return torch.from_numpy(np.asarray(read_grey(path, "mask")) >= 128)

@@ -1,0 +1,220 @@
+"""How well a map of relevancy finds an object: a photo and a category at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from numpy import ndarray as Array
+from scipy.ndimage import gaussian_filter, uniform_filter
+from torch import Tensor
+
+from lang3dxl_ns.evaluation.annotations import Truth
+from lang3dxl_ns.evaluation.average_precision import average_precision
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+
+Maps = dict[str, Float[Tensor, "h w"]]
+"""Relevancy by category, 0…1, above 0.5 where it is found."""
+BLUR = 2.5
+"""Pixels at half the photo's size, by which the publication blurs relevancy maps."""
+THRESHOLD = 0.5
+"""Relevancy above which a pixel is found."""
+SMOOTHING = 30
+"""Pixels, the side of LangSplat's mean filter."""
+SMOOTH_THRESHOLD = 0.4
+"""Of LangSplat's masks; the same for all photos."""
+_VOTERS = 7
+
+
+# ── one map ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) -> dict[str, float]:
+    """Every measure of a map; none of an object that isn't in the photo, which average precision has no
+    value for.
+
+    `ap`: average precision. `iou`, `f1`, `balanced_accuracy`: of the pixels above 0.5. `located`: 1 where
+    the highest pixel lies in a box, or on the mask where there are no boxes, else 0 (LERF's accuracy).
+    smooth: `smooth_located` and `smooth_iou` too, LangSplat's measures.
+    """
+    precision = average_precision(score, truth.mask)
+    if precision is None:
+        return {}
+    scores = {"ap": precision, **overlap(score > THRESHOLD, truth.mask), "located": located(score, truth)}
+    if smooth:
+        mean = uniform_filter(score.astype(np.float64), SMOOTHING, mode="mirror")
+        scores["smooth_located"] = located(mean, truth)
+        scores["smooth_iou"] = overlap(smooth_mask(score, mean), truth.mask)["iou"]
+    return scores
+
+
+def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, float]:
+    """Intersection over union, F1 and balanced accuracy of a mask. The truth has a positive; the balanced
+    accuracy of one without a negative is the share that was found."""
+    both, missed = np.count_nonzero(found & truth), np.count_nonzero(truth & ~found)
+    extra = np.count_nonzero(found & ~truth)
+    negatives = truth.size - both - missed
+    recalls = [both / (both + missed)] + ([1 - extra / negatives] if negatives else [])
+    return {
+        "iou": both / (both + missed + extra),
+        "f1": 2 * both / (2 * both + missed + extra),
+        "balanced_accuracy": sum(recalls) / len(recalls),
+    }
+
+
+def located(score: Float[Array, "h w"], truth: Truth) -> float:
+    """1 where any of the highest pixels lies on the object, else 0. A map without a peak locates nothing."""
+    highest = score == score.max()
+    if highest.all():
+        return 0.0
+    if truth.boxes is None:
+        return float(truth.mask[highest].any())
+    rows, columns = np.nonzero(highest)
+    left, top, right, bottom = truth.boxes[:, :, None].transpose(1, 0, 2)
+    return float(((left <= columns) & (columns <= right) & (top <= rows) & (rows <= bottom)).any())
+
+
+def smooth_mask(score: Float[Array, "h w"], mean: Float[Array, "h w"]) -> Bool[Array, "h w"]:
+    """LangSplat's mask: half the map and half its mean, stretched to −1…1, above 0.4 by majority of the
+    neighbours (Qin et al. 2024). The threshold is the same everywhere: none is chosen by the truth."""
+    mixed = (score + mean) / 2
+    lowest, highest = mixed.min(), mixed.max()
+    stretched = 2 * (mixed - lowest) / max(highest - lowest, 1e-9) - 1
+    above = (stretched > SMOOTH_THRESHOLD).astype(np.float64)
+    return uniform_filter(above, _VOTERS, mode="mirror") > 0.5
+
+
+def strongest_level(levels: Float[Array, "l h w"]) -> Float[Array, "h w"]:
+    """Of the maps of several levels (LangSplat has three), the one with the highest peak once smoothed."""
+    peaks = [uniform_filter(level.astype(np.float64), SMOOTHING, mode="mirror").max() for level in levels]
+    return levels[int(np.argmax(peaks))]
+
+
+# ── all maps of a photo ─────────────────────────────────────────────────────────────────────────────────
+
+
+def resize_map(image: Float[Tensor, "n H W"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
+    """Maps or feature channels at another size (height, width), bilinear."""
+    if tuple(image.shape[-2:]) == size:
+        return image
+    return F.interpolate(image[None].float(), size, mode="bilinear", align_corners=False)[0]
+
+
+def map_size(maps: Maps) -> tuple[int, int]:
+    """Height and width of a photo's maps."""
+    height, width = next(iter(maps.values())).shape
+    return height, width
+
+
+def blurred(maps: Maps, sigma: float = BLUR) -> Maps:
+    """Every map under a Gaussian of `sigma` pixels."""
+    return _each(maps, lambda score: gaussian_filter(score, sigma))
+
+
+def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
+    """Every map, 0 outside the foreground `keep`, where there is one."""
+    if keep is None:
+        return maps
+    there = resize_map(keep[None].float(), map_size(maps))[0] >= 0.5
+    return {name: scores * there for name, scores in maps.items()}
+
+
+def as_published(maps: Maps) -> Maps:
+    """Every (masked) map as Lang3D-XL makes its predictions: 0 where it is at most 0.5, the rest stretched
+    to 0…1 by the photo's largest, then blurred. All that is rejected is tied, but for what the blur adds."""
+
+    def process(score: Float[Array, "h w"]) -> Float[Array, "h w"]:
+        floor = max(float(score.min()), THRESHOLD)
+        stretched = (score - floor).clip(0) / max(float(score.max()) - floor, 1e-9)
+        return gaussian_filter(stretched, BLUR, truncate=8)
+
+    return _each(maps, process)
+
+
+def softened(maps: Maps, temperature: float) -> Maps:
+    """Relevancy of this temperature as it would be at temperature 1, which the publication uses."""
+    if temperature == 1:
+        return maps
+    return {
+        name: torch.sigmoid(torch.logit(scores.double(), eps=1e-9) / temperature).to(scores.dtype)
+        for name, scores in maps.items()
+    }
+
+
+def _each(maps: Maps, change: Callable[[Float[Array, "h w"]], Float[Array, "h w"]]) -> Maps:
+    return {
+        name: torch.from_numpy(change(scores.cpu().numpy())).to(scores.device)
+        for name, scores in maps.items()
+    }
+
+
+def score_maps(
+    maps: Mapping[str, Float[Tensor, "h w"]],
+    truths: Mapping[str, Truth],
+    prefix: str = "",
+    smooth: bool = False,
+) -> dict[str, float]:
+    """`{prefix}{measure}_{category}` of every category that has a truth and is in the photo."""
+    scores = {}
+    for category, truth in truths.items():
+        for measure, value in score_map(maps[category].detach().cpu().numpy(), truth, smooth).items():
+            scores[f"{prefix}{measure}_{category}"] = value
+    return scores
+
+
+class MapScorer:
+    """Scores maps against a scene's ground truth: the one way for runs and for anyone's predictions."""
+
+    def __init__(self, truth: GroundTruth) -> None:
+        self.truth = truth
+        self.without: dict[str, set[str]] = {}
+        """By category, the scored photos that have a label of it but nothing to find; they are left out."""
+        self._scored: set[str] = set()
+
+    def variants(
+        self, maps: Maps, keep: Bool[Tensor, "H W"] | None = None, temperature: float = 1.0
+    ) -> dict[str, Maps]:
+        """What is scored of a photo's maps, by the prefix of its figures.
+
+        For masks: "" blurred, "raw_" as they are, "authors_" `as_published`. For LERF-OVS, whose measures
+        smooth by themselves: "" as they are. keep: 0 outside, before and after the blur.
+        """
+        raw = inside(maps, keep)
+        if self.truth.layout == "lerf_ovs":
+            return {"": raw}
+        published = as_published(inside(softened(maps, temperature), keep))
+        return {"": inside(blurred(raw), keep), "raw_": raw, "authors_": published}
+
+    def scores(
+        self, photo: str, maps: Maps, prefix: str = "", truths: Mapping[str, Truth] | None = None
+    ) -> dict[str, float]:
+        """`{prefix}{measure}_{category}` of every category that the photo shows and has a label of.
+
+        truths: the photo's labels at the size of the maps, where they aren't as the files have them.
+        """
+        if truths is None:
+            truths = self.truth.truths(photo, map_size(maps))
+        for category, truth in truths.items():
+            if truth.mask.any():
+                self._scored.add(category)
+            else:
+                self.without.setdefault(category, set()).add(photo)
+        return score_maps(maps, truths, prefix, smooth=self.truth.layout == "lerf_ovs")
+
+    def protocol(self, mask: str) -> dict[str, Any]:
+        """What the figures mean, for a report. mask: what was done about the foreground."""
+        truth = self.truth
+        size = "the labels'" if truth.layout == "lerf_ovs" else "half the photo's"
+        return {
+            "ground_truth": str(truth.folder),
+            "layout": truth.layout,
+            "prompts": truth.categories,
+            "scored_at": f"{size} size",
+            "foreground": mask,
+            "prompts_without_photos": [c for c in truth.categories if c not in self._scored],
+            "photos_without_positives": {category: len(photos) for category, photos in self.without.items()},
+        }

@@ -1,0 +1,21 @@
+"""Files appear whole or not at all."""
+
+import os
+
+import pytest
+
+from lang3dxl_ns.files import write_atomically
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path, monkeypatch):
+    target = tmp_path / "figure.png"
+    write_atomically(target, b"old")
+
+    def refuse(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(target, b"new")
+    assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]
+    assert target.read_bytes() == b"old"
