@@ -259,11 +259,30 @@ class Lang3DXLDataManager(FullImageDatamanager):
         except UserError as reason:
             CONSOLE.log(f"[yellow]{self.train_dataset.photos[index].name} is left out of training: {reason}")
             self._left_out.add(index)
-            self.train_unseen_cameras = self.sample_train_cameras()
+            # The round goes on without it: a resumed run, which comes to know it later, has the same order.
+            rest = [i for i in self.train_unseen_cameras if i != index]
+            self.train_unseen_cameras = rest or self.sample_train_cameras()
             return self.next_train(step)
         camera.metadata = {"cam_idx": index}
         self.photo_in_hand = batch["name"]
         return camera, batch
+
+    def round_state(self) -> dict[str, Any]:
+        """Photos that are still to come in this round, and what decides on the next, for a checkpoint."""
+        names = [photo.name for photo in self.train_dataset.photos]
+        generator = getattr(self, "random_generator", None)  # "fps" sampling has none
+        return {
+            "upcoming": [names[i] for i in self.train_unseen_cameras],
+            "generator": generator and generator.getstate(),
+        }
+
+    def restore_round(self, state: dict[str, Any]) -> None:
+        """The reverse; photos that this run does not have are skipped, new ones join in the next round."""
+        index = {photo.name: i for i, photo in enumerate(self.train_dataset.photos)}
+        if state["generator"] is not None and hasattr(self, "random_generator"):
+            self.random_generator.setstate(state["generator"])
+        upcoming = [index[name] for name in state["upcoming"] if name in index]
+        self.train_unseen_cameras = upcoming or self.sample_train_cameras()
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
         """Camera and batch of a held-out photo, in turn."""

@@ -22,7 +22,8 @@ class HashLevels:
     """
 
     def __init__(self) -> None:
-        self._steps: list[float] = []
+        self.steps: list[float] = []
+        """Steps of the code seen so far."""
         self.verdict: Need | None = None
         """What was decided; None before."""
 
@@ -32,13 +33,13 @@ class HashLevels:
         # The published forms (an index coordinate, unbounded codes) are kept as they are.
         if field.settings.bounding == "sigmoid" and not field.settings.indexed:
             places = codes.sigmoid()
-            self._steps.append(float((places[:, 1:] - places[:, :-1]).norm(dim=-1).median()))
+            self.steps.append(float((places[:, 1:] - places[:, :-1]).norm(dim=-1).median()))
 
     def decide(self, field: SemanticField, optimizers: Mapping[str, Optimizer]) -> None:
         """Drop the levels from the field, and from the optimisers' moments."""
-        if not self._steps:
+        if not self.steps:
             return
-        step, levels = median(self._steps), field.grid.levels
+        step, levels = median(self.steps), field.grid.levels
         keep = field.grid.resolved_levels(step)
         measured = f"step of the code between decoded pixels, halfway through; {keep} of {levels} levels kept"
         self.verdict = Need("hash levels", keep == levels, measured, step, None)

@@ -30,6 +30,7 @@ from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.query.scene_file import SCENE_FILE
+from lang3dxl_ns.run_state import restore_run_state, run_state
 from lang3dxl_ns.scene_loading import describe_scene
 from lang3dxl_ns.scene_needs import read_needs, write_needs
 from lang3dxl_ns.step_guard import StepGuard
@@ -204,6 +205,7 @@ class Lang3DXLTrainer(Trainer):
     interrupted = False
     """Whether the training was asked to stop before its end."""
     _last_iteration = -1
+    _run_state: dict[str, Any] | None = None
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up, then seed: what had to be prepared has no say in the run's randomness. The run's folder
@@ -216,6 +218,33 @@ class Lang3DXLTrainer(Trainer):
             if test_mode == "val":
                 write_needs(self.pipeline.datamanager.needs, self.base_dir)
         torch.manual_seed(self.config.machine.seed)
+        if self._run_state is not None:
+            restore_run_state(self.pipeline, self._run_state)
+
+    def _load_checkpoint(self) -> None:
+        """As nerfstudio's, and keep the state of the run for when everything is set up."""
+        path = self._checkpoint_to_load()
+        if path is None:
+            return
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        self._start_step = state["step"] + 1
+        self.pipeline.load_pipeline(state["pipeline"], state["step"])
+        self.optimizers.load_optimizers(state["optimizers"])
+        if self.config.load_scheduler:
+            self.optimizers.load_schedulers(state["schedulers"])
+        self.grad_scaler.load_state_dict(state["scalers"])
+        self._run_state = state.get("run")  # absent from checkpoints of earlier versions
+        CONSOLE.log(f"Loaded {path}")
+
+    def _checkpoint_to_load(self) -> Path | None:
+        """Raises UserError when there is none where one was asked for."""
+        folder, path = self.config.load_dir, self.config.load_checkpoint
+        if folder is not None:
+            step = "*" if self.config.load_step is None else f"{self.config.load_step:09d}"
+            path = max(folder.glob(f"step-{step}.ckpt"), default=folder / f"step-{step}.ckpt")
+        if path is not None and not path.is_file():
+            raise UserError(f"there is no checkpoint {path}: pass the folder nerfstudio_models of a run")
+        return path
 
     @property
     def first_iteration(self) -> int:
@@ -313,6 +342,7 @@ class Lang3DXLTrainer(Trainer):
                 "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
                 "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
                 "scalers": self.grad_scaler.state_dict(),
+                "run": run_state(self.pipeline),
             },
             partial,
         )

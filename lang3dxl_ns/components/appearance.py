@@ -110,7 +110,8 @@ class AppearanceField(nn.Module):
         self.directions: Tensor
         self.learned: Tensor
         self.register_buffer("centre", centre.detach().clone())
-        self.register_buffer("radius", centre.new_tensor(radius))
+        # A scene without extent has no unit of its own: any will do.
+        self.register_buffer("radius", centre.new_tensor(radius or 1.0))
         self.register_buffer("positions", torch.zeros(len(names), 3))
         self.register_buffer("directions", torch.zeros(len(names), 3))
         self.register_buffer("learned", torch.zeros(len(names), dtype=torch.bool))
@@ -189,8 +190,10 @@ class AppearanceField(nn.Module):
         """Places as grid coordinates in [0, 1]: space contracted to a ball (Mip-NeRF 360, Barron et al.
         2022), of which the scene takes the inner half and everything as far as the sky the rest."""
         x = (means.detach() - self.centre) / self.radius
-        distance = x.norm(dim=1, keepdim=True).clamp_min(1.0)
-        return 0.5 + 0.25 * x * (2 - 1 / distance) / distance
+        largest = x.abs().amax(1, keepdim=True).clamp_min(1.0)
+        # In units of the largest part: squares of far places would be infinite, and end in the middle.
+        distance = largest * (x / largest).norm(dim=1, keepdim=True).clamp_min(1 / largest)
+        return 0.5 + 0.25 * (x / distance) * (2 - 1 / distance)
 
     def _binary_concrete(
         self, logits: Float[Tensor, " m"], visible: Int[Tensor, " m"], count: int, seed: int | None

@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 HASH_PRIMES = (1, 2654435761, 805459861, 3674653429)
 INITIAL_RANGE = 1e-4
 COORDINATE_LIMIT = 1024.0
-"""Coordinates are clamped to ± this; there, float32 still resolves a quarter of a cell 1/2048 wide."""
+"""Coordinates are clamped to ± this; there, float32 resolves an eighth of a cell 1/2048 wide."""
 
 
 class HashGrid(nn.Module):
@@ -93,9 +93,11 @@ class HashGrid(nn.Module):
         x = x.to(torch.promote_types(self.table.dtype, torch.float32)).clamp(
             -COORDINATE_LIMIT, COORDINATE_LIMIT
         )
-        position = x.detach().T[:, None] * self.cells[:, None] + 0.5
+        # Whole units apart, as integers: far from 0 a product in float32 has no digits left for a fraction.
+        whole = x.detach().floor()
+        position = (x.detach() - whole).T[:, None] * self.cells[:, None] + 0.5
         lower = position.floor()
-        index = self._vertex_entries(lower.long())
+        index = self._vertex_entries(lower.long() + whole.long().T[:, None] * self.cells[:, None])
         return _Interpolate.apply(x, self.table, index, position - lower, self.cells, level_weights)
 
     def keep_levels(self, count: int) -> None:

@@ -253,6 +253,7 @@ class Lookup:
         probes: prompts of the kind that people will ask, whose relevancies are compared.
         """
         checks: list[TableCheck] = []
+        codes = codes[codes.isfinite().all(1)]  # one that is not would leave the box without bounds
         if not len(codes):
             return cls(None, checks)
         sample = codes[_random_rows(len(codes), _CHECKED_CODES).to(codes.device)]

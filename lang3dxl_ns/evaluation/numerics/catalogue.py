@@ -5,16 +5,29 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from lang3dxl_ns.evaluation.numerics import (
+    appearance,
     decoder,
     downsampler,
     hash_grid,
+    lookup,
     losses,
     physical_scale,
     rasteriser,
+    relevancy,
 )
 from lang3dxl_ns.evaluation.numerics.measure import Case
 
-GROUPS = (rasteriser, hash_grid, decoder, downsampler, losses, physical_scale)
+GROUPS = (
+    rasteriser,
+    appearance,
+    hash_grid,
+    decoder,
+    downsampler,
+    losses,
+    physical_scale,
+    relevancy,
+    lookup,
+)
 
 
 def all_cases(quick: bool, device: str) -> Iterator[Case]:

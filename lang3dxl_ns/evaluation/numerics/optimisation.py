@@ -1,0 +1,100 @@
+"""Long and stiff optimisations of the semantic field alone: what drifts, grows or breaks only with time."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from lang3dxl_ns.components.losses import clip_loss
+from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+
+PIXELS, BATCH, CHANNELS, KINDS = 1024, 64, 32, 12
+NOISE = 0.3
+"""Deviation of the targets around their kind's, as crops that show the same thing differ."""
+PARTS = 10
+LARGEST_CODE = 25.0
+"""At 17 float32's sigmoid is 1 and has no slope: a code stops there, after what momentum it has left."""
+DRIFT = 1.05
+"""The last part's loss may be this much above the lowest part's."""
+
+
+@dataclass
+class Run:
+    """An optimisation, by tenths of its steps."""
+
+    name: str
+    steps: int
+    converges: bool
+    """Whether its loss is held to a bound, not just its numbers to being finite."""
+    seconds: float = 0.0
+    losses: list[float] = field(default_factory=list)
+    """Mean over the part."""
+    codes: list[float] = field(default_factory=list)
+    """Largest code at the part's end."""
+    finite: bool = True
+    """All parameters and moments, at the end of every part."""
+
+    @property
+    def misses(self) -> list[str]:
+        """What is out of bounds, in words; empty for a pass."""
+        found = [] if self.finite else ["not finite"]
+        if self.converges and not self.losses[-1] <= DRIFT * min(self.losses):
+            found.append(f"loss {self.losses[-1]:.3f}, was {min(self.losses):.3f}")
+        if self.converges and not self.codes[-1] <= LARGEST_CODE:
+            found.append(f"largest code {self.codes[-1]:.1f} > {LARGEST_CODE:.0f}")
+        return found
+
+
+def runs(quick: bool) -> list[Run]:
+    """The catalogue of optimisations, carried out (on the CPU: their steps are too small for a GPU)."""
+    long = 1_000 if quick else 100_000
+    steps = 200 if quick else 2_000
+    return [
+        optimise("usual rates, no decay", long, 1e-3, 5e-4, 5e-4),
+        optimise("rates 1e6 apart, codes fast", steps, 10.0, 1e-3, 1e-5, converges=False),
+        optimise("rates 1e6 apart, decoder fast", steps, 1e-5, 1e-3, 10.0, converges=False),
+    ]
+
+
+def optimise(
+    name: str, steps: int, code_rate: float, grid_rate: float, decoder_rate: float, converges: bool = True
+) -> Run:
+    """Adam as in training (epsilon 1e-15) at constant rates, on pixels that show a few kinds of things."""
+    generator = torch.Generator().manual_seed(0)
+    model = SemanticField(SemanticFieldConfig(preset="short"), CHANNELS, generator=generator)
+    kinds = torch.randn(KINDS, CHANNELS, generator=generator)
+    targets = kinds[torch.randint(KINDS, (PIXELS,), generator=generator)]
+    codes = model.initial_codes(PIXELS, generator).requires_grad_()
+    groups = [([codes], code_rate), (model.encoding_parameters(), grid_rate)]
+    groups += [(model.decoder_parameters(), decoder_rate)]
+    adam = torch.optim.Adam([{"params": list(p), "lr": rate} for p, rate in groups], eps=1e-15)
+    weight = torch.ones(1, BATCH)
+
+    def step() -> float:
+        chosen = torch.randint(PIXELS, (BATCH,), generator=generator)
+        target = targets[chosen] + NOISE * torch.randn(BATCH, CHANNELS, generator=generator)
+        loss = clip_loss(model.decode_clip(codes[chosen])[None], target[None], weight)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        return loss.item()
+
+    run, start = Run(name, steps, converges), time.process_time()
+    for _ in range(PARTS):
+        losses = [step() for _ in range(steps // PARTS)]
+        run.losses.append(math.fsum(losses) / len(losses))
+        run.codes.append(float(codes.detach().abs().max()))
+        run.finite &= _all_finite(adam)
+    run.seconds = time.process_time() - start
+    return run
+
+
+def _all_finite(optimizer: torch.optim.Optimizer) -> bool:
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    moments = [value for state in optimizer.state.values() for value in state.values()]
+    tensors: list[Tensor] = [*parameters, *moments]
+    return all(bool(tensor.isfinite().all()) for tensor in tensors)
