@@ -19,6 +19,7 @@ from lang3dxl_ns.lookup_benchmark import LookupBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.query_commands import Export, Query
 from lang3dxl_ns.training_benchmark import TrainingBenchmark
+from lang3dxl_ns.viewer.command import View
 
 if TYPE_CHECKING:
     from lang3dxl_ns.datamanager import Lang3DXLDataManager
@@ -92,6 +93,7 @@ Command = (
     | Annotated[Needs, tyro.conf.subcommand("needs")]
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]
     | Annotated[Numerics, tyro.conf.subcommand("numerics")]
     | Annotated[
