@@ -35,12 +35,18 @@ class RecordedSceneDataParser(DataParser):
         photos = [
             Photo(p.name, folder / p.name, None, p.width, p.height, p.fx, p.fy, p.cx, p.cy) for p in chosen
         ]
-        sizes = {name: torch.tensor([getattr(p, name) for p in chosen]) for name in ("width", "height")}
-        lenses = {name: torch.tensor([getattr(p, name) for p in chosen]) for name in ("fx", "fy", "cx", "cy")}
-        poses = torch.tensor([p.camera_to_world for p in chosen])
+        cameras = Cameras(
+            camera_to_worlds=torch.tensor([p.camera_to_world for p in chosen]),
+            fx=torch.tensor([p.fx for p in chosen]),
+            fy=torch.tensor([p.fy for p in chosen]),
+            cx=torch.tensor([p.cx for p in chosen]),
+            cy=torch.tensor([p.cy for p in chosen]),
+            width=torch.tensor([p.width for p in chosen]),
+            height=torch.tensor([p.height for p in chosen]),
+        )
         return DataparserOutputs(
             image_filenames=[photo.path for photo in photos],
-            cameras=Cameras(camera_to_worlds=poses, **lenses, **sizes),
+            cameras=cameras,
             scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
             metadata={
                 "photos": photos,

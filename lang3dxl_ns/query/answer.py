@@ -83,14 +83,11 @@ class Asked:
     def outputs(
         self, image: Float[Tensor, "h w 3"], codes: Float[Tensor, "h w d"], alpha: Float[Tensor, "h w"]
     ) -> dict[str, Float[Tensor, "h w k"]]:
-        """`relevancy_0` … [h, w, 1], one per prompt; `overlay`, the heat map of the best of them over the image
-        (the image itself where nothing is asked for); `clip_pca` [h, w, 3]. Every code is decoded once."""
+        """`relevancy_0` … [h, w, 1], one per prompt; `overlay`, the heat map of the best of them over the
+        image (the image itself where nothing is asked for); `clip_pca` [h, w, 3]. A code is decoded once."""
         keep, found = alpha >= self.min_alpha, {"overlay": image}
-        directions = [
-            part
-            for part in (self.queries.vectors, self.colours and self.colours.axes)
-            if part is not None and len(part)
-        ]
+        directions = [self.queries.vectors] if len(self.queries) else []
+        directions += [self.colours.axes] if self.colours else []
         if not directions:
             return found
         prompts = replace(self.queries, vectors=torch.cat(directions))

@@ -22,9 +22,6 @@ from lang3dxl_ns.query.scene_file import SceneFile
 from lang3dxl_ns.query.text import EncodeTexts, Prompt
 from lang3dxl_ns.scene_loading import scene_of_model, text_encoder
 
-_WHILE_LEARNING = {"views": 24, "view_side": 160}
-"""The scene is looked at anew for every question while it is learned: briefly, then."""
-
 
 @dataclass
 class Seconds:
@@ -49,9 +46,9 @@ class Question:
 class Conversation:
     """Questions to a model, which may be in training in another thread.
 
-    The thread that renders calls `outputs`, holding the lock, with the model in evaluation; threads that serve
-    the panel call the rest, without it. The lookup table is of a model that has done learning: until then, and
-    until it is made, every pixel is decoded.
+    The thread that renders calls `outputs`, holding the lock, with the model in evaluation; threads that
+    serve the panel call the rest, without it. The lookup table is of a model that has done learning: until
+    then, and until it is made, every pixel is decoded.
 
     Args:
         lock: held by whoever uses the model.
@@ -93,9 +90,8 @@ class Conversation:
         """Take up a question: prompts as `parse_prompts` reads them, and phrases that all of them must beat,
         separated by commas or semicolons. Raises UserError where nothing is asked for, or can be."""
         scene = self._scene_now()
-        extra = tuple(
-            part for part in (" ".join(p.split()) for p in negatives.replace(";", ",").split(",")) if part
-        )
+        phrases = [" ".join(phrase.split()) for phrase in negatives.replace(";", ",").split(",")]
+        extra = tuple(phrase for phrase in phrases if phrase)
         prompts = tuple(replace(p, negatives=p.negatives + extra) for p in scene.prompts(text))
         start = time.perf_counter()
         queries = scene.queries(prompts)
@@ -134,7 +130,8 @@ class Conversation:
             learning = self._learning()
             if self._scene is None or not self._scene_was_learned:
                 self._encode_texts = self._encode_texts or text_encoder(self._file, self._model.device)
-                settings = QueryConfig(**_WHILE_LEARNING) if learning else QueryConfig()
+                # What is looked at anew for every question is looked at briefly.
+                settings = QueryConfig(views=24, view_side=160) if learning else QueryConfig()
                 self._scene = scene_of_model(
                     self._model,
                     self._file,
@@ -217,14 +214,12 @@ class Conversation:
 
     def status(self) -> str:
         """Times, in one line."""
-        s = self.seconds
-        parts = (
-            []
-            if s.frame is None
-            else [f"{s.frame * 1e3:.0f} ms per frame, {s.words * 1e3:.0f} of it for words"]
-        )
-        parts += [] if s.text is None else [f"{s.text * 1e3:.0f} ms per text"]
-        return " · ".join([*parts, self.path])
+        s, parts = self.seconds, [self.path]
+        if s.frame is not None:
+            parts.insert(0, f"{s.frame * 1e3:.0f} ms per frame, {s.words * 1e3:.0f} of it for words")
+        if s.text is not None:
+            parts.insert(-1, f"{s.text * 1e3:.0f} ms per text")
+        return " · ".join(parts)
 
 
 def shortened(text: str, most: int = 40) -> str:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from lang3dxl_ns.query.scene import Found, Viewpoint
+from lang3dxl_ns.query.scene_file import ScenePhoto
 from lang3dxl_ns.rendering import Camera
 
 
 @dataclass(frozen=True)
 class Stand:
-    """How the viewer's camera stands: no roll, since its controls have none. World axes of the model, z up."""
+    """How the viewer's camera stands: without roll, as its controls have none. The model's axes, z up."""
 
     position: np.ndarray
     """[3]."""
@@ -37,6 +39,18 @@ def stand_of(camera: Camera, aspect: float, target: tuple[float, ...] | None = N
     half_width = max(k[0, 2], camera.width - k[0, 2]) / k[0, 0]
     fov = 2 * math.atan(max(half_height, half_width / aspect))
     return Stand(position, position + max(ahead, 0.05) * forward, fov)
+
+
+def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePhoto:
+    """The photo that sees the middle of the scene near its own middle, from farthest away; else the first."""
+    best, farthest = photos[0], 0.0
+    for photo in photos:
+        camera = photo.camera
+        x, y, z = camera.view_matrix[:3, :3] @ torch.tensor(middle) + camera.view_matrix[:3, 3]
+        wide, high = abs(x) * photo.fx / photo.width, abs(y) * photo.fy / photo.height
+        if z > farthest and max(wide, high) < z / 4:
+            best, farthest = photo, float(z)
+    return best
 
 
 def flight(start: Stand, end: Stand, steps: int) -> Iterator[Stand]:
@@ -72,9 +86,15 @@ class Tour:
         self.place = -1
         """Index of the viewpoint shown; −1: none yet."""
 
+    def best(self) -> Viewpoint:
+        """The best viewpoint."""
+        self.place = 0
+        return self.found.viewpoints[0]
+
     def move(self, step: int) -> Viewpoint:
-        """The viewpoint so many further on; the first move leads to the best, or back to the last."""
-        self.place = (max(self.place, 0 if step < 0 else -1) + step) % len(self.found.viewpoints)
+        """The viewpoint so many further on; forward from nowhere leads to the best, backward to the last."""
+        nowhere = 0 if step < 0 else -1
+        self.place = ((nowhere if self.place < 0 else self.place) + step) % len(self.found.viewpoints)
         return self.found.viewpoints[self.place]
 
     def __str__(self) -> str:

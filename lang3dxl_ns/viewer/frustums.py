@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import viser
 import viser.transforms as tf
@@ -38,6 +39,10 @@ def draw_frustums(
             wxyz=tf.SO3.from_matrix(view[:3, :3].T).wxyz,
             position=-view[:3, :3].T @ view[:3, 3] * scale,
         )
-        handle.on_click(lambda event, photo=photo: pressed(photo, event.client))
+        handle.on_click(partial(_pass_on, photo, pressed))
         handles.append(handle)
     return handles
+
+
+def _pass_on(photo: ScenePhoto, pressed: Callable[[ScenePhoto, viser.ClientHandle], None], event) -> None:
+    pressed(photo, event.client)

@@ -7,29 +7,37 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import viser
+import viser.theme
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl
 
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.query.scene import Found, Viewpoint
+from lang3dxl_ns.query.scene import Found
+from lang3dxl_ns.query.scene_file import ScenePhoto
+from lang3dxl_ns.rendering import Camera
 from lang3dxl_ns.viewer.conversation import Conversation, shortened
-from lang3dxl_ns.viewer.flight import Stand, Tour, box_lines, flight, stand_of
+from lang3dxl_ns.viewer.flight import Stand, Tour, box_lines, flight, overview, stand_of
+from lang3dxl_ns.viewer.frustums import draw_frustums
 from lang3dxl_ns.viewer.worker import Worker
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
 
+    from lang3dxl_ns.model import Lang3DXLModel
     from lang3dxl_ns.pipeline import Lang3DXLPipeline
 
+STEPS = {"Previous": -1, "Next": 1}
 COLOUR_MAPS = ("turbo", "viridis", "magma", "plasma", "inferno", "cividis")
 PER_VIEW, PER_SCENE = "to this view", "to the whole scene"
 OWN_LOOK = "of the nearest photo"
 INVITATION = 'Type what to look for: `rose window`, several as `dome; towers`, or `"windows" not "doors"`.'
 LONG_TEXT = 300
 """Characters that a CLIP's 77 tokens hold, about."""
+BRAND = (255, 211, 105)
 _TYPING = 0.5
 """Seconds without a keystroke after which the text is taken up."""
 _FLIGHT_SECONDS, _FLIGHT_STEPS = 1.2, 30
@@ -43,23 +51,36 @@ class AskPanel(ViewerControl):
 
     def __init__(self, pipeline: Lang3DXLPipeline) -> None:
         self._pipeline = pipeline
+        self._results: viser.GuiFolderHandle | None = None
         self._tours: list[Tour] = []
         self._drawn: list[Any] = []
         self._flights = 0
+        self._first_frame = True
 
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
         self._gui, self._scene = self.viser_server.gui, self.viser_server.scene
+        self._leave_out_logo()
         model = self._pipeline.model
-        with self._gui.add_folder("Ask the scene", order=-1):
+        with self._gui.add_folder("Ask the scene", order=-1) as self._folder:
             if model.semantic_field is None:
                 self._gui.add_markdown("This run has no semantics (it was trained with clip none).")
-                return
-            self._add_question()
-            self._add_settings()
-            self._status = self._gui.add_markdown("")
-            self._gui.add_markdown(self._who_may_look())
+            else:
+                self._add_question()
+                self._add_settings()
+                self._status = self._gui.add_markdown("")
+            with self._gui.add_folder("Who can open this page", expand_by_default=False):
+                self._gui.add_markdown(self._who_may_look())
         CONSOLE.print(self._who_may_look().replace("`", ""), soft_wrap=True, highlight=False)
+        self._photos = [photo for photo in self._pipeline.scene_file.photos if photo.split == "train"]
+        self.viser_server.on_client_connect(self._welcome)
+        if viewer.trainer is None:
+            self._draw_cameras()
+        if model.semantic_field is not None:
+            self._start(model)
+
+    def _start(self, model: Lang3DXLModel) -> None:
+        viewer = self.viewer
         self.conversation = Conversation(
             model,
             self._pipeline.scene_file,
@@ -70,66 +91,74 @@ class AskPanel(ViewerControl):
             watch=self._say,
         )
         self._asker, self._finder = Worker("ask"), Worker("find")
-        self._first_frame = True
         model.answers = self._answers
         if self._pipeline.query:
             self._question.value = self._pipeline.query
 
-    # ── what the panel holds ────────────────────────────────────────────────────────────────────────
+    # ── what the page holds ─────────────────────────────────────────────────────────────────────────
 
     def _add_question(self) -> None:
-        self._question = self._gui.add_text("Look for", "", hint="Several prompts are separated by ;")
-        self._negatives = self._gui.add_text(
-            "But not", "", hint="What it is not to be confused with: arcades, doors"
-        )
-        button = self._gui.add_button("Ask", icon=viser.Icon.SEARCH)
+        gui = self._gui
+        self._question = gui.add_text("Look for", "", hint="Several prompts are separated by ;")
+        self._negatives = gui.add_text("But not", "", hint="Things that it is not: arcades, doors")
+        button = gui.add_button("Ask", icon=viser.Icon.SEARCH)
         for box in (self._question, self._negatives):
             box.on_update(lambda _: self._asker.submit(self._guarded(self._ask), _TYPING))
         button.on_click(lambda _: self._asker.submit(self._guarded(self._ask)))
-        self._message = self._gui.add_markdown(INVITATION)
-        self._results = self._gui.add_folder("Fly to", visible=False)
-        with self._results:
-            self._steps = self._gui.add_button_group("", ("Previous", "Next"))
-            self._place = self._gui.add_markdown("")
-        self._steps.on_click(
-            lambda event: self._fly(self._tour, -1 if event.target.value == "Previous" else 1, event.client)
-        )
-        self._buttons: list[Any] = []
+        self._message = gui.add_markdown(INVITATION)
 
     def _add_settings(self) -> None:
-        gui = self._gui
+        gui, appearance = self._gui, self._pipeline.model.appearance
+        looks = (OWN_LOOK, *(() if appearance is None else appearance.names))
         with gui.add_folder("How it is shown"):
-            self._threshold = gui.add_slider(
-                "Threshold", 0.3, 0.95, 0.01, 0.5, hint="Relevancy that counts as found"
-            )
-            self._opacity = gui.add_slider(
-                "Opacity", 0.0, 1.0, 0.05, 0.7, hint="Of the heat map over the view"
-            )
+            self._threshold = gui.add_slider("Threshold", 0.0, 1.0, 0.01, 0.5, hint="Relevancy that counts")
+            self._opacity = gui.add_slider("Opacity", 0.0, 1.0, 0.05, 0.7, hint="Of the heat map")
             self._colour_map = gui.add_dropdown("Colours", COLOUR_MAPS)
-            self._stretch = gui.add_dropdown(
-                "Stretch", (PER_VIEW, PER_SCENE), hint="What gets the last colour"
-            )
-            self._boxes = gui.add_checkbox("3D box", True, hint="Around the strongest match of each prompt")
-            self._exact = gui.add_checkbox(
-                "Exact", False, hint="Decode every pixel instead of reading the table"
-            )
-            appearance = self._pipeline.model.appearance
-            names = () if appearance is None else tuple(appearance.names)
-            self._look = gui.add_dropdown("Light", (OWN_LOOK, *names), visible=bool(names),
-                                          hint="Show the scene in the light of a photo")  # fmt: skip
-        for setting in (self._opacity, self._colour_map, self._stretch, self._look):
+            self._stretch = gui.add_dropdown("Stretch", (PER_VIEW, PER_SCENE), hint="To highest relevancy")
+            self._boxes = gui.add_checkbox("3D box", True, hint="Around each prompt's strongest match")
+            self._exact = gui.add_checkbox("Exact", False, hint="Decode every pixel")
+            light = "Show the scene in the light of a photo"
+            self._look = gui.add_dropdown("Light", looks, visible=len(looks) > 1, hint=light)
+        shown: tuple[Any, ...] = (self._opacity, self._colour_map, self._stretch, self._look)
+        found: tuple[Any, ...] = (self._threshold, self._exact)
+        for setting in shown:
             setting.on_update(lambda _: self._take_settings())
-        for setting in (self._threshold, self._exact):
+        for setting in found:
             setting.on_update(lambda _: self._take_settings(find=True))
         self._boxes.on_update(lambda _: self._draw_boxes())
 
     def _who_may_look(self) -> str:
         host = self.viewer.config.websocket_host
         if host in ("127.0.0.1", "localhost", "::1"):
-            return "Only this machine can open this viewer; `--viewer.websocket-host 0.0.0.0` lets the network in."
-        return (
-            f"This viewer is open to the network ({host}); `--viewer.websocket-host 127.0.0.1` keeps it here."
+            return "Only this machine can open the viewer. `--viewer.websocket-host 0.0.0.0` lets others in."
+        return f"Others can open the viewer ({host}). `--viewer.websocket-host 127.0.0.1` keeps it here."
+
+    def _leave_out_logo(self) -> None:
+        """nerfstudio's title bar without the picture that it loads from the Internet."""
+        button = viser.theme.TitlebarButton(
+            text="nerfstudio", icon="Description", href="https://docs.nerf.studio"
         )
+        self._gui.configure_theme(
+            titlebar_content=viser.theme.TitlebarConfig(buttons=(button,), image=None),
+            control_layout="collapsible",
+            dark_mode=True,
+            brand_color=BRAND,
+        )
+
+    def _draw_cameras(self) -> None:
+        """With ns-viewer: cameras without photos, which nerfstudio would read all before anything else."""
+        config = self.viewer.config
+        config.max_num_display_images = 0
+        frustums = draw_frustums(
+            self._scene, self._photos, _scale(), config.camera_frustum_scale, self._fly_to_photo
+        )
+
+        def show(visible: bool) -> None:
+            for frustum in frustums:
+                frustum.visible = visible
+
+        self.viewer.hide_images.on_click(lambda _: show(False))
+        self.viewer.show_images.on_click(lambda _: show(True))
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -170,12 +199,7 @@ class AskPanel(ViewerControl):
         if found is not self.conversation.found:
             return  # something else was asked meanwhile
         self._show_results(found)
-        cut = (
-            " Only its beginning was read: CLIP takes about 60 words."
-            if len(self._question.value) > LONG_TEXT
-            else ""
-        )
-        self._say((self.conversation.advice() or self._summary(found)) + cut)
+        self._say(self.conversation.advice() or self._summary(found))
         self._rerender()
 
     def _summary(self, found: list[Found]) -> str:
@@ -184,12 +208,18 @@ class AskPanel(ViewerControl):
             count, best = len(one.viewpoints), max((v.score for v in one.viewpoints), default=0.0)
             where = f"{count} good views, best {best:.2f}" if count else "nowhere"
             lines.append(f"**{shortened(one.prompt.text)}**: {where}")
+        if max(len(one.prompt.text) for one in found) > LONG_TEXT:
+            lines.append("Only the beginning of a long text counts: CLIP reads about 60 words.")
         return "  \n".join(lines)
 
     def _take_settings(self, find: bool = False) -> None:
         c = self.conversation
-        c.display = replace(c.display, threshold=self._threshold.value, opacity=self._opacity.value,
-                            colour_map=self._colour_map.value)  # fmt: skip
+        c.display = replace(
+            c.display,
+            threshold=self._threshold.value,
+            opacity=self._opacity.value,
+            colour_map=self._colour_map.value,
+        )
         c.per_scene, c.exact = self._stretch.value == PER_SCENE, self._exact.value
         look = self._look.value
         self._pipeline.model.look = None if look == OWN_LOOK else look
@@ -226,10 +256,10 @@ class AskPanel(ViewerControl):
         self.viewer._trigger_rerender()
 
     def _clear_results(self) -> None:
-        for handle in (*self._buttons, *self._drawn):
-            handle.remove()
-        self._buttons, self._drawn, self._tours = [], [], []
-        self._results.visible = False
+        if self._results is not None:
+            self._results.remove()
+        self._results, self._tours = None, []
+        self._draw_boxes()
 
     def _show_results(self, found: list[Found]) -> None:
         self._clear_results()
@@ -237,15 +267,13 @@ class AskPanel(ViewerControl):
         if not self._tours:
             return
         self._tour = self._tours[0]
-        with self._results:
-            for place, tour in enumerate(self._tours):
-                button = self._gui.add_button(
-                    shortened(tour.found.prompt.text), icon=viser.Icon.PLANE, order=place - 100.0
-                )
-                button.on_click(lambda event, tour=tour: self._fly(tour, 0, event.client))
-                self._buttons.append(button)
-        self._place.content = ""
-        self._results.visible = True
+        with self._folder, self._gui.add_folder("Fly to", order=self._message.order + 0.5) as self._results:
+            for tour in self._tours:
+                button = self._gui.add_button(shortened(tour.found.prompt.text), icon=viser.Icon.PLANE)
+                button.on_click(partial(self._fly_to_best, tour))
+            steps = self._gui.add_button_group("View", tuple(STEPS))
+            steps.on_click(lambda event: self._fly(self._tour, STEPS[event.target.value], event.client))
+            self._place = self._gui.add_markdown("")
         self._draw_boxes()
 
     def _draw_boxes(self) -> None:
@@ -258,40 +286,66 @@ class AskPanel(ViewerControl):
             if box is None or not self._boxes.value:
                 continue
             low, high = (tuple(scale * x for x in corner) for corner in (box.low, box.high))
-            # Without tension this curve is straight between its points.
             lines = self._scene.add_spline_catmull_rom(
-                f"/ask/box_{i}", box_lines(low, high), "catmullrom", tension=0.0, line_width=2.5,
-                color=(255, 211, 105), segments=15,
-            )  # fmt: skip
+                f"/ask/box_{i}",
+                box_lines(low, high),
+                "catmullrom",
+                tension=0.0,  # straight from point to point
+                line_width=2.5,
+                color=BRAND,
+                segments=15,
+            )
             top = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[2])
             label = self._scene.add_label(f"/ask/label_{i}", shortened(tour.found.prompt.text), position=top)
             self._drawn += [lines, label]
 
     # ── flying ──────────────────────────────────────────────────────────────────────────────────────
 
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Whoever opens the page begins at a photo that sees the whole."""
+        middle = tuple(self._pipeline.model.means.detach().median(0).values.tolist())
+        camera = overview(self._photos, middle).camera
+        _place_camera(client, stand_of(camera, client.camera.aspect, middle))
+
+    def _fly_to_best(self, tour: Tour, event) -> None:
+        self._fly(tour, 0, event.client)
+
     def _fly(self, tour: Tour, step: int, client: viser.ClientHandle | None) -> None:
         """To the best viewpoint (`step` 0), or that many further on."""
         self._tour = tour
-        if step == 0:
-            tour.place = -1
-        viewpoint = tour.move(step or 1)
+        viewpoint = tour.best() if step == 0 else tour.move(step)
         self._place.content = str(tour)
+        target = None if tour.found.box is None else tour.found.box.centre
         for one in [client] if client is not None else self.viser_server.get_clients().values():
-            threading.Thread(target=self._fly_camera, args=(one, viewpoint, tour.found), daemon=True).start()
+            self._fly_camera(one, viewpoint.camera, target)
 
-    def _fly_camera(self, client: viser.ClientHandle, viewpoint: Viewpoint, found: Found) -> None:
+    def _fly_to_photo(self, photo: ScenePhoto, client: viser.ClientHandle) -> None:
+        self._fly_camera(client, photo.camera, None)
+
+    def _fly_camera(
+        self, client: viser.ClientHandle, camera: Camera, target: tuple[float, ...] | None
+    ) -> None:
+        """In a thread of its own: this one may be the one that hears from the page."""
         self._flights += 1
-        mine, camera, scale = self._flights, client.camera, _scale()
-        target = None if found.box is None else found.box.centre
-        start = Stand(camera.position / scale, camera.look_at / scale, camera.fov)
-        for stand in flight(start, stand_of(viewpoint.camera, camera.aspect, target), _FLIGHT_STEPS):
-            if mine != self._flights:
-                return  # another flight has begun
-            with client.atomic():
-                camera.position, camera.look_at = stand.position * scale, stand.look_at * scale
-                camera.fov = stand.fov
-            client.flush()
-            time.sleep(_FLIGHT_SECONDS / _FLIGHT_STEPS)
+        mine = self._flights
+        start = Stand(client.camera.position / _scale(), client.camera.look_at / _scale(), client.camera.fov)
+        end = stand_of(camera, client.camera.aspect, target)
+
+        def fly() -> None:
+            for stand in flight(start, end, _FLIGHT_STEPS):
+                if mine != self._flights:
+                    return  # another flight has begun
+                _place_camera(client, stand)
+                client.flush()
+                time.sleep(_FLIGHT_SECONDS / _FLIGHT_STEPS)
+
+        threading.Thread(target=fly, daemon=True).start()
+
+
+def _place_camera(client: viser.ClientHandle, stand: Stand) -> None:
+    with client.atomic():
+        client.camera.position, client.camera.look_at = stand.position * _scale(), stand.look_at * _scale()
+        client.camera.fov = stand.fov
 
 
 def _scale() -> float:
