@@ -175,7 +175,8 @@ class Conversation:
             colours=self._colours_of(field_.decode_clip, codes, alpha) if in_colour else None,
             display=self.display,
         )
-        found = {"clip_pca": outputs["bottleneck"]} | asked.outputs(outputs["rgb"], codes, alpha)
+        found = asked.outputs(outputs["rgb"], codes, alpha)
+        found.setdefault("clip_pca", outputs["bottleneck"])
         self.seconds.words = time.perf_counter() - start
         self.seconds.frame = seconds + self.seconds.words
         return found

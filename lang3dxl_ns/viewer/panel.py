@@ -54,6 +54,7 @@ class AskPanel(ViewerControl):
         self._results: viser.GuiFolderHandle | None = None
         self._tours: list[Tour] = []
         self._drawn: list[Any] = []
+        self._frustums: list[viser.CameraFrustumHandle] = []
         self._flights = 0
         self._first_frame = True
 
@@ -147,18 +148,27 @@ class AskPanel(ViewerControl):
 
     def _draw_cameras(self) -> None:
         """With ns-viewer: cameras without photos, which nerfstudio would read all before anything else."""
-        config = self.viewer.config
-        config.max_num_display_images = 0
-        frustums = draw_frustums(
-            self._scene, self._photos, _scale(), config.camera_frustum_scale, self._fly_to_photo
-        )
+        viewer = self.viewer
+        viewer.pause_train.visible = False  # there is nothing to pause
+        viewer.config.max_num_display_images = 0
+        size = viewer.config.camera_frustum_scale
+        self._frustums = draw_frustums(self._scene, self._photos, _scale(), size, self._fly_to_photo)
+        viewer.hide_images.on_click(lambda _: self._show_frustums(False))
+        viewer.show_images.on_click(lambda _: self._show_frustums(True))
+        self._hide_cameras()
 
-        def show(visible: bool) -> None:
-            for frustum in frustums:
-                frustum.visible = visible
+    def _show_frustums(self, visible: bool) -> None:
+        for frustum in self._frustums:
+            frustum.visible = visible
 
-        self.viewer.hide_images.on_click(lambda _: show(False))
-        self.viewer.show_images.on_click(lambda _: show(True))
+    def _hide_cameras(self) -> None:
+        """As if by the button: who stands where a photo was taken stands in its camera's frustum."""
+        viewer = self.viewer
+        if viewer.hide_images.visible:
+            self._show_frustums(False)
+            for frustum in getattr(viewer, "camera_handles", {}).values():  # none before training begins
+                frustum.visible = False
+            viewer.toggle_cameravis_button()
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -326,6 +336,7 @@ class AskPanel(ViewerControl):
         self, client: viser.ClientHandle, camera: Camera, target: tuple[float, ...] | None
     ) -> None:
         """In a thread of its own: this one may be the one that hears from the page."""
+        self._hide_cameras()
         self._flights += 1
         mine = self._flights
         start = Stand(client.camera.position / _scale(), client.camera.look_at / _scale(), client.camera.fov)
