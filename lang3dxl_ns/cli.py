@@ -21,6 +21,7 @@ from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.presets import Preset
 from lang3dxl_ns.query_commands import Export, Query
 from lang3dxl_ns.training_benchmark import TrainingBenchmark
+from lang3dxl_ns.viewer.command import View
 
 if TYPE_CHECKING:
     from lang3dxl_ns.datamanager import Lang3DXLDataManager
@@ -94,6 +95,7 @@ Command = (
     | Annotated[Needs, tyro.conf.subcommand("needs")]
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[DemoScene, tyro.conf.subcommand("demo-scene")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate", description="Score words against ground truth.")]
     | Annotated[Preset, tyro.conf.subcommand("preset")]

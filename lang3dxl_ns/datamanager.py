@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
@@ -37,6 +38,7 @@ from lang3dxl_ns.preparation.photo import Photo, scaled_size
 from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, points_in_view
 from lang3dxl_ns.preparation.prepare import PreparationConfig, TargetReader
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
+from lang3dxl_ns.recorded_scene import recorded_scene
 from lang3dxl_ns.scene_needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.timing import part
 
@@ -54,6 +56,8 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     """Memory for decoded photos, in gigabytes; the least recently used ones make room."""
     read_ahead: int = 4
     """Photos decoded ahead of the training step."""
+    run: tyro.conf.Suppress[Path | None] = None
+    """Folder of the run whose config.yml this comes from; set as that is read."""
 
 
 class PhotoDataset(InputDataset):
@@ -138,7 +142,17 @@ class Lang3DXLDataManager(FullImageDatamanager):
         self._left_out: set[int] = set()
         if hasattr(config.dataparser, "load_3D_points"):
             config.dataparser.load_3D_points = True  # nerfstudio-data leaves them out by default
-        super().__init__(config, *args, **kwargs)
+        try:
+            super().__init__(config, *args, **kwargs)
+        except (UserError, OSError) as reason:
+            recorded = recorded_scene(config.run)
+            if recorded is None or kwargs.get("test_mode", "val") == "val":
+                raise
+            CONSOLE.log(
+                f"[yellow]The cameras are taken from the run's folder, since the photos are gone: {reason}"
+            )
+            config.dataparser, config.camera_res_scale_factor = recorded, 1.0
+            super().__init__(config, *args, **kwargs)
 
     def create_train_dataset(self) -> PhotoDataset:
         return self._dataset(self.train_dataparser_outputs)

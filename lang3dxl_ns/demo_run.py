@@ -266,7 +266,7 @@ def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer) -> PictureRow:
     if scorer is not None:
         size = next(iter(photo.field_maps.values())).shape
         truth = scorer.truth.masks(photo.name, (size[0], size[1]))
-    codes = photo.images.get("semantics", rendered)
+    codes = photo.images.get("bottleneck", rendered)
     return PictureRow(
         name=photo.name,
         photo=real.numpy(),

@@ -20,6 +20,7 @@ from pytorch_msssim import SSIM
 from torch import Tensor, nn
 from torch.nn import Parameter
 
+from lang3dxl_ns.answering import AnsweringModel
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
@@ -37,7 +38,7 @@ from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.timing import part
 
 
-class Lang3DXLModel(SplatfactoModel):
+class Lang3DXLModel(AnsweringModel):
     """Gaussians with colours and semantic codes; without targets to learn (clip = none) it has no
     semantic parts at all."""
 
@@ -180,8 +181,8 @@ class Lang3DXLModel(SplatfactoModel):
         return self.gauss_params["codes"]
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
-        """Render a camera: `rgb`, `accumulation`, `background`; in training `bottleneck` (codes [H, W, 3]);
-        otherwise also `depth` and `semantics`, the codes as a picture in [0, 1]."""
+        """Render a camera: `rgb`, `accumulation`, `background`; in training `codes` [H, W, 3]; otherwise also
+        `depth` and `bottleneck`, the codes as a picture in [0, 1]."""
         keep = None
         if self.crop_box is not None and not self.training:
             keep = self.crop_box.within(self.means).squeeze(-1)
@@ -208,11 +209,11 @@ class Lang3DXLModel(SplatfactoModel):
             if self.config.divide_codes_by_alpha:
                 codes = codes / rendering.alpha.detach().clamp_min(1e-3)
             if self.training:
-                outputs["bottleneck"] = codes
+                outputs["codes"] = codes
             else:
                 # Kept aside for the metrics: viewers show every output, and would show this one raw.
                 self.rendered_codes = codes
-                outputs["semantics"] = codes.sigmoid() * rendering.alpha
+                outputs["bottleneck"] = codes.sigmoid() * rendering.alpha
         return outputs
 
     def _render(self, camera: Cameras, keep: Tensor | None) -> tuple[Rendering, Float[Tensor, "3"]]:
@@ -293,8 +294,8 @@ class Lang3DXLModel(SplatfactoModel):
             loss = {"rgb": losses.rgb_loss(outputs["rgb"], target, mask, self.config.ssim_lambda)}
         if self.training:
             self.camera_optimizer.get_loss_dict(loss)
-        if "bottleneck" in outputs and "clip_target" in batch:
-            loss |= self._semantic_losses(outputs["bottleneck"], batch, mask)
+        if "codes" in outputs and "clip_target" in batch:
+            loss |= self._semantic_losses(outputs["codes"], batch, mask)
         return loss
 
     def _semantic_losses(
@@ -370,8 +371,8 @@ class Lang3DXLModel(SplatfactoModel):
         if perceptual is not None:
             metrics["lpips"] = perceptual
         images = {"img": torch.cat([target, predicted], dim=1)}
-        if "semantics" in outputs:
-            images["semantics"] = outputs["semantics"]
+        if "bottleneck" in outputs:
+            images["bottleneck"] = outputs["bottleneck"]
             if "clip_target" in batch:
                 metrics |= self._feature_metrics(batch)
         return metrics, images

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -28,7 +29,13 @@ from lang3dxl_ns.evaluation.scores import Maps, map_size
 from lang3dxl_ns.model import Lang3DXLModel
 from lang3dxl_ns.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.preparation.photo import Photo
+from lang3dxl_ns.query.answer import Asked, ClipColours
 from lang3dxl_ns.query.relevancy import TEMPERATURE
+from lang3dxl_ns.query.scene_file import SCENE_FILE, SceneFile
+from lang3dxl_ns.scene_loading import describe_scene, scene_of_model
+from lang3dxl_ns.viewer.panel import AskPanel
+
+QUERY_VARIABLE = "LANG3DXL_QUERY"
 
 
 @dataclass
@@ -47,6 +54,9 @@ class Lang3DXLPipelineConfig(VanillaPipelineConfig):
     evaluated_photos: Literal["held-out", "seen"] = "held-out"
     """Which photos `ns-eval` looks at: those held out of training, or those of the training photos that have
     ground truth (the main tables of HolyScenes are of photos that training saw)."""
+    query: str = ""
+    """What `ns-render` looks for ("rose window; dome"), and the viewer at first; the environment variable
+    LANG3DXL_QUERY overrules it."""
 
 
 @dataclass
@@ -58,7 +68,7 @@ class EvaluatedPhoto:
     """psnr …, `render_seconds`, and with ground truth `query_seconds` and the figures of
     `evaluation.aggregate.average`: `ap_{category}` …, with the prefixes raw_, authors_ and teacher_."""
     images: dict[str, Tensor]
-    """`img` (photo beside rendering, [H, 2W, 3]) and, with semantics, `semantics`."""
+    """`img` (photo beside rendering, [H, 2W, 3]) and, with semantics, `bottleneck`."""
     field_maps: Maps
     """Relevancy by category as scored without prefix: blurred, at half the photo's size; empty without
     ground truth."""
@@ -80,6 +90,7 @@ class Lang3DXLPipeline(VanillaPipeline):
     def __init__(self, *args, **kwargs):
         print_user_errors_plainly()
         super().__init__(*args, **kwargs)
+        self.panel = AskPanel(self)  # nerfstudio's viewer looks for it here
 
     # ── evaluation ──────────────────────────────────────────────────────────────────────────────────
 
@@ -135,7 +146,8 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def _evaluate_photo(self, camera, batch: dict, photo: Photo) -> EvaluatedPhoto:
         start = perf_counter()
-        outputs = self.model.get_outputs_for_camera(camera)
+        self.model.set_crop(None)
+        outputs = self.model.get_outputs(camera)
         synchronize()
         seconds = perf_counter() - start
         metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
@@ -203,6 +215,36 @@ class Lang3DXLPipeline(VanillaPipeline):
         """Outputs, losses and metrics of the next photo."""
         outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
         return outputs, self.last_losses, metrics
+
+    @property
+    def query(self) -> str:
+        """What is to be looked for in renderings."""
+        return os.environ.get(QUERY_VARIABLE) or self.config.query
+
+    @cached_property
+    def scene_file(self) -> SceneFile:
+        """The photos' names and cameras, and the CLIP."""
+        run = self.datamanager.config.run
+        if run is not None and (run / SCENE_FILE).is_file():
+            return SceneFile.read(run / SCENE_FILE)
+        return describe_scene(self.datamanager)
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint; to render, get ready to answer what is asked for."""
+        super().load_pipeline(loaded_state, step)
+        if self.test_mode != "val" and self.query:
+            self.model.answers = self._answers
+
+    def _answers(self, outputs: dict[str, Tensor], codes: Tensor, _seconds: float) -> dict[str, Tensor]:
+        return self._asked.outputs(outputs["rgb"], codes, outputs["accumulation"][..., 0])
+
+    @cached_property
+    def _asked(self) -> Asked:
+        scene = scene_of_model(self.model, self.scene_file, self.datamanager.config.run)
+        queries = scene.queries(scene.prompts(self.query))
+        CONSOLE.log(f"Looking for {self.query}; lookup table: {scene.lookup}")
+        colours = ClipColours.of(scene.decode, scene.rendered_codes())
+        return Asked(scene.scorer(), queries, scene.config.min_alpha, colours=colours)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
         """Load a checkpoint; whatever does not fit is an error (nerfstudio would silently leave it out)."""

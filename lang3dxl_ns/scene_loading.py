@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -23,7 +24,10 @@ from lang3dxl_ns.model import Lang3DXLModel
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, load_image_text_encoder
 from lang3dxl_ns.query.scene import QueryConfig, Scene, View
 from lang3dxl_ns.query.scene_file import SCENE_FILE, SceneFile, ScenePhoto
+from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.rendering import Camera
+
+NO_SEMANTICS = "this run has no semantics (it was trained with clip none): there is nothing to ask it"
 
 
 def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
@@ -91,33 +95,61 @@ def load_scene(
 
 
 def scene_of_model(
-    model: Lang3DXLModel, file: SceneFile, cache_dir: Path | None = None, settings: QueryConfig | None = None
+    model: Lang3DXLModel,
+    file: SceneFile,
+    cache_dir: Path | None = None,
+    settings: QueryConfig | None = None,
+    guard: Callable[[], AbstractContextManager] = nullcontext,
+    encode_texts: EncodeTexts | None = None,
+    watch: Callable[[str], None] | None = None,
 ) -> Scene:
     """A scene around a model that is loaded, be it still in training (then without `cache_dir`).
+
+    Args:
+        guard: entered around every use of the model, which other threads may be using.
+        encode_texts: the run's CLIP, where it is loaded already (`text_encoder`).
+        watch: see `Scene`.
 
     Raises UserError where the model has no semantics, or its CLIP has changed.
     """
     field = model.semantic_field
-    if field is None or file.clip is None:
-        raise UserError(
-            "this run has no semantics (it was trained with clip none): there is nothing to ask it"
-        )
-    encoder = load_image_text_encoder(file.clip, model.device)
+    encode_texts = encode_texts or text_encoder(file, model.device)
+    if field is None:
+        raise UserError(NO_SEMANTICS)
+    render = renderer(model)
+
+    def guarded_render(camera: Camera) -> View:
+        with guard():
+            return render(camera)
+
+    def guarded_decode(codes: Float[Tensor, "n code"]) -> Float[Tensor, "n c"]:
+        with guard():
+            return field.decode_clip(codes)
+
+    return Scene(
+        render=guarded_render,
+        decode=guarded_decode,
+        bounded=field.settings.bounding == "sigmoid",
+        gaussians={name: parameter.detach() for name, parameter in model.gauss_params.items()},
+        file=file,
+        encode_texts=encode_texts,
+        state=model.state_dict(),
+        cache_dir=cache_dir,
+        config=settings,
+        watch=watch,
+    )
+
+
+def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
+    """The CLIP that a run learned from. Raises UserError where there is none, or it has changed."""
+    if file.clip is None:
+        raise UserError(NO_SEMANTICS)
+    encoder = load_image_text_encoder(file.clip, device)
     if encoder.identity != file.clip_identity:
         raise UserError(
             f"the CLIP in {file.clip} is not the one that this run learned from: restore it, or train anew"
         )
-    return Scene(
-        render=renderer(model),
-        decode=field.decode_clip,
-        bounded=field.settings.bounding == "sigmoid",
-        gaussians={name: parameter.detach() for name, parameter in model.gauss_params.items()},
-        file=file,
-        encode_texts=encoder.encode_texts,
-        state=model.state_dict(),
-        cache_dir=cache_dir,
-        config=settings,
-    )
+    return encoder.encode_texts
 
 
 def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch.device) -> Lang3DXLModel:
@@ -148,7 +180,8 @@ def renderer(model: Lang3DXLModel) -> Callable[[Camera], View]:
 
     def render(camera: Camera) -> View:
         start = time.perf_counter()
-        outputs = model.get_outputs_for_camera(as_nerfstudio(camera).to(model.device))
+        model.set_crop(None)
+        outputs = model.get_outputs(as_nerfstudio(camera).to(model.device))
         maps = {name: outputs[name][..., 0] for name in ("accumulation", "depth")}
         return View(
             camera,

@@ -119,6 +119,12 @@ class Lang3DXLTrainerConfig(TrainerConfig):
     max_skipped_steps: int = 20
     """A step whose loss or gradient is not finite is skipped; after this many in a row the run stops."""
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """As config.yml is read: tell the data manager where the run is, which only this class knows."""
+        self.__dict__.update(state)
+        if self.timestamp != "{timestamp}":
+            self.pipeline.datamanager.run = self.get_base_dir()
+
     def set_timestamp(self) -> None:
         """Called once before the configuration is printed and saved: settle what depends on the run."""
         super().set_timestamp()

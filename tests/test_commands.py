@@ -77,8 +77,8 @@ def test_resume(run, scene, tiny_clip, tiny_dense, folder):
 @pytest.mark.parametrize(
     "words",
     [
-        ("interpolate", "--interpolation-steps", "2", "--rendered-output-names", "rgb", "semantics"),
-        ("dataset", "--split", "test", "--rendered-output-names", "rgb", "semantics"),
+        ("interpolate", "--interpolation-steps", "2", "--rendered-output-names", "rgb", "bottleneck"),
+        ("dataset", "--split", "test", "--rendered-output-names", "rgb", "bottleneck"),
     ],
 )
 def test_render(run, folder, words):

@@ -98,11 +98,11 @@ class CodeTable:
     def cosines(self, vectors: Float[Tensor, "v c"]) -> Float[Tensor, "vertices v"]:
         """Cosines of every vertex to unit vectors; those of the last call are kept, since many views are
         asked the same."""
-        if self._last is not None and torch.equal(self._last[0], vectors):
-            return self._last[1]
-        parts = [part.to(vectors.dtype) @ vectors.T for part in self.features.split(_ROWS_AT_ONCE)]
-        self._last = vectors.clone(), torch.cat(parts)
-        return self._last[1]
+        last = self._last  # another thread may ask something else meanwhile
+        if last is None or not torch.equal(last[0], vectors):
+            parts = [part.to(vectors.dtype) @ vectors.T for part in self.features.split(_ROWS_AT_ONCE)]
+            last = self._last = vectors.clone(), torch.cat(parts)
+        return last[1]
 
     @torch.no_grad()
     def leave_out_rough_cells(
@@ -322,23 +322,23 @@ class CodeScorer:
         """Relevancy of every code; 0 where `keep` is false (nothing is seen there)."""
         shape = codes.shape[:-1]
         flat = codes.reshape(-1, codes.shape[-1])
-        if keep is None:
-            return self._relevancy(flat, queries).reshape(len(queries), *shape)
-        chosen = keep.flatten().nonzero()[:, 0]
+        chosen = slice(None) if keep is None else keep.flatten().nonzero()[:, 0]
         scores = flat.new_zeros(len(queries), len(flat))
-        scores[:, chosen] = self._relevancy(flat[chosen], queries)
+        cosines = self.cosines(flat[chosen], queries)
+        scores[:, chosen] = queries.relevancy_of_cosines(cosines, self.temperature)
         return scores.reshape(len(queries), *shape)
 
-    def _relevancy(self, codes: Float[Tensor, "n d"], queries: Queries) -> Float[Tensor, "q n"]:
+    @torch.no_grad()
+    def cosines(self, codes: Float[Tensor, "n d"], queries: Queries) -> Float[Tensor, "n v"]:
+        """Cosine of every code's feature to every vector."""
         if not len(codes):
-            return codes.new_zeros(len(queries), 0)
+            return codes.new_zeros(0, len(queries.vectors))
         if self.table is None:
-            cosines = self._exact(codes, queries)
-        else:
-            cosines, known = self.table.read(codes, self.table.cosines(queries.vectors))
-            if not bool(known.all()):
-                cosines[~known] = self._exact(codes[~known], queries)
-        return queries.relevancy_of_cosines(cosines, self.temperature)
+            return self._exact(codes, queries)
+        cosines, known = self.table.read(codes, self.table.cosines(queries.vectors))
+        if not bool(known.all()):
+            cosines[~known] = self._exact(codes[~known], queries)
+        return cosines
 
     def _exact(self, codes: Float[Tensor, "n d"], queries: Queries) -> Float[Tensor, "n v"]:
         return cosines_of_codes(self.decode, codes, queries, self.max_mb)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -148,6 +148,7 @@ class Scene:
         encode_texts: the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
         state: all tensors that a rendering or a decode depends on; they name the cache.
         cache_dir: where small views and the table are kept; None: nowhere.
+        watch: told in a few words what takes long; None: a progress bar shows it.
     """
 
     def __init__(
@@ -161,8 +162,10 @@ class Scene:
         state: Mapping[str, Tensor],
         cache_dir: Path | None = None,
         config: QueryConfig | None = None,
+        watch: Callable[[str], None] | None = None,
     ) -> None:
         self.config = config or QueryConfig()
+        self._watch = watch
         self.render = render
         self.decode = decode
         self.gaussians = gaussians
@@ -207,10 +210,10 @@ class Scene:
         prompts = self.prompts(texts)  # a mistake in them is told before anything is rendered
         return self.match(prompts, self.view(place), exact)
 
-    def prompts(self, texts: str | Sequence[str]) -> list[Prompt]:
+    def prompts(self, texts: str | Sequence[str | Prompt]) -> list[Prompt]:
         """What is typed, as prompts. Raises UserError where nothing is asked for."""
         typed = [texts] if isinstance(texts, str) else texts
-        prompts = [prompt for text in typed for prompt in parse_prompts(text)]
+        prompts = [p for text in typed for p in ([text] if isinstance(text, Prompt) else parse_prompts(text))]
         return prompts or parse_prompts("")
 
     def match(self, prompts: Sequence[Prompt], view: View, exact: bool = False) -> list[Match]:
@@ -253,11 +256,11 @@ class Scene:
             raise UserError(f"{text!r} are {len(prompts)} prompts: Gaussians are scored for one at a time")
         return self.scorer().relevancy(self.gaussians["codes"], self.queries(prompts))[0]
 
-    def find(self, text: str | Sequence[str], most: int = 10) -> list[Found]:
+    def find(self, text: str | Sequence[str | Prompt], most: int = 10, exact: bool = False) -> list[Found]:
         """Where in the scene each prompt is found: the training views that show it best, and a box."""
         prompts = self.prompts(text)
         queries = self.queries(prompts)
-        scorer, maps = self.scorer(), []
+        scorer, maps = self.scorer(exact), []
         for view in self.small_views:
             codes, keep = view.codes.float(), view.seen(self.config.min_alpha) & view.counts
             maps.append(scorer.relevancy(codes, queries, self._foreground(scorer, codes, keep)))
@@ -308,9 +311,7 @@ class Scene:
         cameras = self._small_cameras
         views = load_small_views(path, self._views_key, cameras, self.device) if path else None
         if views is None:
-            with progress_bar() as bar:
-                items = bar.track(cameras.items(), description="looking at the scene, once per checkpoint")
-                views = [self._small_view(name, camera) for name, camera in items]
+            views = [self._small_view(name, camera) for name, camera in self._watched(cameras)]
             if path:
                 save_small_views(path, views, self._views_key)
         return views
@@ -321,6 +322,8 @@ class Scene:
         path, key = self._cache_file("lookup"), self._lookup_key
         lookup = load_lookup(path, key, self.device) if path else None
         if lookup is None:
+            if self._watch:
+                self._watch("making the lookup table, once per checkpoint")
             probes = self.text.plain_queries(PROBES).to(self.device)
             lookup = Lookup.build(
                 self.decode,
@@ -338,6 +341,16 @@ class Scene:
         """Codes of all pixels of the small views that show something."""
         seen = [view.codes[view.seen(self.config.min_alpha)] for view in self.small_views]
         return torch.cat(seen).float()
+
+    def _watched(self, cameras: Mapping[str, Camera]) -> Iterator[tuple[str, Camera]]:
+        what = "looking at the scene, once per checkpoint"
+        if self._watch is None:
+            with progress_bar() as bar:
+                yield from bar.track(cameras.items(), description=what)
+            return
+        for i, item in enumerate(cameras.items()):
+            self._watch(f"{what}: view {i + 1} of {len(cameras)}")
+            yield item
 
     def _small_view(self, name: str, camera: Camera) -> SmallView:
         view, counts = self.render(camera), self.file.photo(name).foreground()

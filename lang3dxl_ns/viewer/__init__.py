@@ -1,0 +1,1 @@
+"""The panel "Ask the scene" in nerfstudio's viewer."""
