@@ -23,6 +23,7 @@ from lang3dxl_ns.evaluation.average_precision import deviation_over_photos, mean
 from lang3dxl_ns.evaluation.holyscenes import GroundTruth, mean_average_precision, scoring_size
 from lang3dxl_ns.evaluation.language import LanguageScorer, Maps, blurred, inside, open_scorer
 from lang3dxl_ns.evaluation.report import progress_bar
+from lang3dxl_ns.lift_features import lift_features
 from lang3dxl_ns.model import Lang3DXLModel
 from lang3dxl_ns.model_config import Lang3DXLModelConfig
 
@@ -134,6 +135,17 @@ class Lang3DXLPipeline(VanillaPipeline):
         """Outputs, losses and metrics of the next photo."""
         outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
         return outputs, self.last_losses, metrics
+
+    def finish_training(self) -> None:
+        """What is left to do when the last iteration is: lift features, where the encoder learns none."""
+        encoder = self.model.semantic_field
+        if encoder is None or not encoder.needs_lifting:
+            return
+        self.model.train()
+        photos = self.datamanager.train_photos()
+        with progress_bar() as bar:
+            total = len(self.datamanager.train_dataset)
+            lift_features(self.model, bar.track(photos, total=total, description="lifting features"))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
         """Load a checkpoint; whatever does not fit is an error (nerfstudio would silently leave it out)."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -142,6 +142,10 @@ class TargetReader:
         return StoredClipTarget(
             **self._store.read(CLIP, name), crop_fractions=[side / width for side in settings["crop_sides"]]
         )
+
+    def clip_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "hd wd c"]]:
+        """The CLIP targets of photos, one at a time, float16."""
+        return (self.clip(name).features for name in names)
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
         """The dense features of the squashed photo, float16; None when prepared without."""
