@@ -101,11 +101,14 @@ def scene_of_model(
         raise UserError(
             f"the CLIP in {file.clip} is not the one that this run learned from: restore it, or train anew"
         )
+    gaussians = {name: parameter.detach() for name, parameter in model.gauss_params.items()}
+    with torch.no_grad():
+        carried = field.carried(gaussians)
     return Scene(
         render=renderer(model),
         decode=field.decode_clip,
-        bounded=field.settings.bounding == "sigmoid",
-        gaussians={name: parameter.detach() for name, parameter in model.gauss_params.items()},
+        bounded=field.bounded,
+        gaussians=gaussians if carried is None else gaussians | {"codes": carried},
         file=file,
         encode_texts=encoder.encode_texts,
         state=model.state_dict(),
