@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from lang3dxl_ns.ablation import Ablation
 from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.demo_run import Demo
 from lang3dxl_ns.errors import UserError
@@ -88,6 +89,7 @@ Benchmark = (
     Annotated[RasterizerBenchmark, tyro.conf.subcommand("rasterizer")]
     | Annotated[TrainingBenchmark, tyro.conf.subcommand("training")]
     | Annotated[LookupBenchmark, tyro.conf.subcommand("lookup")]
+    | Annotated[Ablation, tyro.conf.subcommand("ablation")]
 )
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
@@ -176,6 +176,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             prepared = set(self.targets.names)  # without damaged photos
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
             self.train_dataset.metadata["feature_statistics"] = self.targets.feature_statistics(names)
+            self.train_dataset.metadata["clip_targets"] = partial(self.targets.clip_features, names)
 
     @cached_property
     def targets(self) -> TargetReader | None:
@@ -297,6 +298,19 @@ class Lang3DXLDataManager(FullImageDatamanager):
             self.random_generator.setstate(state["generator"])
         upcoming = [index[name] for name in state["upcoming"] if name in index]
         self.train_unseen_cameras = upcoming or self.sample_train_cameras()
+
+    def train_photos(self) -> Iterator[tuple[Cameras, dict]]:
+        """Camera and batch of every training photo once, without the damaged ones."""
+        for index, photo in enumerate(self.train_dataset.photos):
+            if index in self._left_out:
+                continue
+            try:
+                camera, batch = self._batch(self.train_dataset, index, self.train_dataset.read(index))
+            except UserError as reason:
+                CONSOLE.log(f"[yellow]{photo.name} is left out: {reason}")
+                continue
+            camera.metadata = {"cam_idx": index}
+            yield camera, batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
         """Camera and batch of a held-out photo, in turn."""

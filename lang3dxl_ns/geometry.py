@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -54,6 +55,11 @@ def fitted_size(codes: Float[Tensor, "H W 3"], longer_side: int) -> tuple[int, i
     height, width = codes.shape[:2]
     scale = min(longer_side / max(height, width), 1.0)
     return max(round(height * scale), 1), max(round(width * scale), 1)
+
+
+def resize_nearest(image: Float[Tensor, "H W c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:
+    """Nearest-exact: picks samples, since averaging codes would make codes of nothing."""
+    return F.interpolate(image.permute(2, 0, 1)[None], size, mode="nearest-exact")[0].permute(1, 2, 0)
 
 
 def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "count 3"]:

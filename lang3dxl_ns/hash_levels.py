@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.optim import Optimizer
 
+from lang3dxl_ns.components.encoder import SemanticEncoder
 from lang3dxl_ns.components.semantic_field import SemanticField, ShrunkParameter
 from lang3dxl_ns.scene_needs import Need
 
@@ -28,16 +29,16 @@ class HashLevels:
         """What was decided; None before."""
 
     @torch.no_grad()
-    def watch(self, field: SemanticField, codes: Float[Tensor, "h w 3"]) -> None:
+    def watch(self, field: SemanticEncoder, codes: Float[Tensor, "h w 3"]) -> None:
         """Note the median step between neighbours of a map of codes, as large as it is decoded."""
         # The published forms (an index coordinate, unbounded codes) are kept as they are.
-        if field.settings.bounding == "sigmoid" and not field.settings.indexed:
+        if isinstance(field, SemanticField) and field.bounded and not field.settings.indexed:
             places = codes.sigmoid()
             self.steps.append(float((places[:, 1:] - places[:, :-1]).norm(dim=-1).median()))
 
-    def decide(self, field: SemanticField, optimizers: Mapping[str, Optimizer]) -> None:
+    def decide(self, field: SemanticEncoder, optimizers: Mapping[str, Optimizer]) -> None:
         """Drop the levels from the field, and from the optimisers' moments."""
-        if not self.steps:
+        if not self.steps or not isinstance(field, SemanticField):
             return
         step, levels = median(self.steps), field.grid.levels
         keep = field.grid.resolved_levels(step)

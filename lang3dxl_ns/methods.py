@@ -53,6 +53,11 @@ def _optimizers() -> dict[str, dict]:
             "optimizer": RunAdamConfig(lr=5e-4, short_lr=1e-2, weight_decay=1e-5),
             "scheduler": learned(),
         },
+        # As published for long runs.
+        "feature3dgs_decoder": {
+            "optimizer": RunAdamConfig(lr=1e-4, short_lr=1e-2),
+            "scheduler": learned(),
+        },
         "downsampler": {
             "optimizer": RunAdamConfig(lr=5e-4, short_lr=5e-3, weight_decay=1e-5),
             "scheduler": learned(),

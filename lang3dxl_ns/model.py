@@ -8,8 +8,6 @@ from math import isqrt
 from typing import Any
 
 import torch
-import torch.nn.functional as F
-from gsplat.strategy import DefaultStrategy
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import color_correct
@@ -21,17 +19,18 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from lang3dxl_ns.answering import AnsweringModel
+from lang3dxl_ns.baselines.encoders import make_encoder
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
-from lang3dxl_ns.components.semantic_field import SemanticField
+from lang3dxl_ns.components.encoder import SemanticEncoder
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
-from lang3dxl_ns.geometry import centre_and_radius, fitted_size, in_view, view_matrix
+from lang3dxl_ns.geometry import centre_and_radius, fitted_size, in_view, resize_nearest, view_matrix
 from lang3dxl_ns.hash_levels import HashLevels
 from lang3dxl_ns.initial_gaussians import initial_gaussians, seed_positions
-from lang3dxl_ns.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.model_config import Lang3DXLModelConfig, make_strategy
 from lang3dxl_ns.preparation.prepare import FeatureStatistics
 from lang3dxl_ns.rendering import Camera, Gaussians, Rendering, rasterize, spherical_harmonics
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
@@ -43,7 +42,7 @@ class Lang3DXLModel(AnsweringModel):
     semantic parts at all."""
 
     config: Lang3DXLModelConfig
-    semantic_field: SemanticField | None
+    semantic_field: SemanticEncoder | None
     downsampler: AttenuatedDownsampler | None
     appearance: AppearanceField | None
     look: str | None
@@ -64,12 +63,7 @@ class Lang3DXLModel(AnsweringModel):
         statistics: FeatureStatistics | None = self.kwargs["metadata"].get("feature_statistics")
         if statistics is not None:
             clip, dense = statistics.clip, statistics.dense
-            self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean)
-            assert self.semantic_field is not None
-            self.semantic_field.set_output_statistics(
-                torch.cat([self.clip_mean, self.dense_mean]),
-                clip.std if dense is None else torch.cat([clip.std, dense.std]),
-            )
+            self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean, statistics)
         self.look = None
         self.hash_levels = HashLevels()
         self.appearance = None
@@ -83,16 +77,34 @@ class Lang3DXLModel(AnsweringModel):
         self.background_color = get_color(
             "black" if self.config.background_color == "random" else self.config.background_color
         )
-        self.strategy = self._make_strategy()
+        self.strategy = make_strategy(self.config)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
-    def _add_semantics(self, clip_mean: Float[Tensor, " c"], dense_mean: Float[Tensor, " d"]) -> None:
-        """Give every Gaussian a code, and build the field and the downsampler for features of this width."""
+    def _add_semantics(
+        self,
+        clip_mean: Float[Tensor, " c"],
+        dense_mean: Float[Tensor, " d"],
+        statistics: FeatureStatistics | None = None,
+    ) -> None:
+        """Build the encoder and the downsampler for features of this width, and give every Gaussian a code.
+
+        `statistics` of the targets, where these are at hand: not for a model that is loaded.
+        """
         self.register_buffer("clip_mean", clip_mean)
         self.register_buffer("dense_mean", dense_mean)
-        self.semantic_field = SemanticField(self.config.semantic_field, len(clip_mean), len(dense_mean))
-        self.downsampler = AttenuatedDownsampler(self.config.downsampler, len(clip_mean))
-        self.gauss_params["codes"] = Parameter(self.semantic_field.initial_codes(self.num_points))
+        c = self.config
+        self.semantic_field = make_encoder(
+            c.encoder, c.semantic_field, len(clip_mean), len(dense_mean), *self.extent
+        )
+        if statistics is not None:
+            clip, dense = statistics.clip.std, statistics.dense
+            std = clip if dense is None else torch.cat([clip, dense.std])
+            self.semantic_field.set_output_statistics(torch.cat([clip_mean, dense_mean]), std)
+            self.semantic_field.learn_targets(self.kwargs["metadata"]["clip_targets"])
+        self.downsampler = AttenuatedDownsampler(c.downsampler, len(clip_mean))
+        codes = self.semantic_field.initial_codes(self.num_points)
+        if codes is not None:
+            self.gauss_params["codes"] = Parameter(codes)
 
     def _wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
         """Whether to build an optional component; `auto`: if the scene's measured needs say so."""
@@ -110,26 +122,6 @@ class Lang3DXLModel(AnsweringModel):
         names = [photo.name for photo in self.kwargs["metadata"].get("photos", ())]
         generator = torch.Generator().manual_seed(0)
         return AppearanceField(self.config.appearance, names, *self.extent, generator=generator)
-
-    def _make_strategy(self) -> DefaultStrategy:
-        c, steps = self.config, self.config.total_steps
-        return DefaultStrategy(
-            prune_opa=c.cull_alpha_thresh,
-            grow_grad2d=c.densify_grad_thresh,
-            grow_scale3d=c.densify_size_thresh,
-            grow_scale2d=c.split_screen_size,
-            prune_scale3d=c.cull_scale_thresh,
-            prune_scale2d=c.cull_screen_size,
-            refine_scale2d_stop_iter=0,
-            refine_start_iter=round(c.densify_from * steps),
-            refine_stop_iter=round(c.densify_until * steps),
-            refine_every=max(round(c.densify_every * steps), 1),
-            # The paper never resets opacities in a run of 70,000.
-            reset_every=10**9,
-            pause_refine_after_reset=0,
-            absgrad=c.use_absgrad,
-            verbose=False,
-        )
 
     # ── training ────────────────────────────────────────────────────────────────────────────────────
 
@@ -161,8 +153,7 @@ class Lang3DXLModel(AnsweringModel):
         """Optimiser groups: one per Gaussian property, and those of the components that exist."""
         groups = super().get_param_groups()
         if self.semantic_field is not None and self.downsampler is not None:
-            groups["field_encoding"] = list(self.semantic_field.encoding_parameters())
-            groups["field_decoder"] = list(self.semantic_field.decoder_parameters())
+            groups |= self.semantic_field.parameter_groups()
             groups["downsampler"] = list(self.downsampler.parameters())
         if self.appearance is not None:
             groups["appearance_vectors"] = [self.appearance.vectors]
@@ -213,7 +204,8 @@ class Lang3DXLModel(AnsweringModel):
             else:
                 # Kept aside for the metrics: viewers show every output, and would show this one raw.
                 self.rendered_codes = codes
-                outputs["bottleneck"] = codes.sigmoid() * rendering.alpha
+                assert self.semantic_field is not None
+                outputs["bottleneck"] = self.semantic_field.picture(codes) * rendering.alpha
         return outputs
 
     def _render(self, camera: Cameras, keep: Tensor | None) -> tuple[Rendering, Float[Tensor, "3"]]:
@@ -243,12 +235,15 @@ class Lang3DXLModel(AnsweringModel):
             "antialiased": self.config.rasterize_mode == "antialiased",
             "absgrad": self.strategy.absgrad and self.training,
         }
+        carried = None
+        if self.semantic_field is not None and self._warm_up_is_over:
+            carried = self.semantic_field.carried(g)
         rendering = rasterize(
             gaussians,
             view,
             colours,
             background,
-            features=g["codes"] if "codes" in g and self._warm_up_is_over else None,
+            features=carried,
             detach_features=not self.config.feature_gradient_to_geometry,
             render_depth=not self.training or self.config.output_depth_during_training,
             **settings,
@@ -306,33 +301,35 @@ class Lang3DXLModel(AnsweringModel):
         ramp = schedules.semantic_ramp(self.step / c.total_steps)
         size = fitted_size(codes, self._random_size())
         if c.hash_levels == "auto" and 0.4 <= self.step / c.total_steps < 0.5 and self.semantic_field:
-            self.hash_levels.watch(self.semantic_field, _resize(codes, size))
+            self.hash_levels.watch(self.semantic_field, resize_nearest(codes, size))
         clip, dense, small_mask = self._decode_small(codes, mask, size)
         with part("downsample"):
-            predicted, weight = self._downsample(clip, batch, small_mask)
+            predicted, target, weight = self._match(clip, batch, small_mask)
         with part("losses"):
             # Cells that see little of the foreground say little about it.
             weight = None if small_mask is None else weight
-            loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, batch["clip_target"], weight)}
+            loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, target, weight)}
             if dense is not None and "dense_target" in batch:
                 difference = losses.dense_loss(dense, batch["dense_target"], small_mask)
                 loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
-                labels = _resize(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()
+                labels = resize_nearest(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()
                 loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
-        return loss
+            assert self.semantic_field is not None
+            own = self.semantic_field.own_losses(clip, dense)
+        return loss | {name: ramp * value for name, value in own.items()}
 
     def _decode_small(self, codes: Float[Tensor, "H W 3"], mask: Tensor | None, size: tuple[int, int]):
         """Decode a map resized (nearest) to a given size → clip [h, w, C], dense, mask [h, w]."""
-        small_mask = None if mask is None else _resize(mask[..., None].float(), size)[..., 0]
+        small_mask = None if mask is None else resize_nearest(mask[..., None].float(), size)[..., 0]
         assert self.semantic_field is not None
         with part("decode"):
-            clip, dense = self.semantic_field(_resize(codes, size))
+            clip, dense = self.semantic_field(resize_nearest(codes, size))
         return clip, dense, small_mask
 
-    def _downsample(self, clip: Float[Tensor, "h w c"], batch: dict, mask: Tensor | None):
+    def _match(self, clip: Float[Tensor, "h w c"], batch: dict, mask: Tensor | None):
         assert self.downsampler is not None
-        return self.downsampler(clip, tuple(batch["clip_target"].shape[:2]), batch["crop_sides"], mask)
+        return self.downsampler.match(clip, batch["clip_target"], batch["crop_sides"], mask)
 
     def _random_size(self) -> int:
         """Longer side to decode at in this iteration; the same again after a resume."""
@@ -383,8 +380,8 @@ class Lang3DXLModel(AnsweringModel):
         mask = batch["mask"][..., 0] if "mask" in batch else None
         size = fitted_size(self.rendered_codes, self.config.decode_size[1])
         clip, dense, small_mask = self._decode_small(self.rendered_codes, mask, size)
-        predicted, weight = self._downsample(clip, batch, small_mask)
-        metrics = feature_metrics("clip", predicted, batch["clip_target"], self.clip_mean, weight)
+        predicted, target, weight = self._match(clip, batch, small_mask)
+        metrics = feature_metrics("clip", predicted, target, self.clip_mean, weight)
         if dense is not None and "dense_target" in batch:
             target = losses.resize(batch["dense_target"], dense.shape[:2])
             metrics |= feature_metrics("dense", dense, target, self.dense_mean, small_mask)
@@ -423,16 +420,19 @@ class Lang3DXLModel(AnsweringModel):
 
     def _match_semantics(self, state: Mapping[str, Any]) -> None:
         """Build the components that the checkpoint has, or say how they differ."""
-        if "gauss_params.codes" not in state:
+        if "clip_mean" not in state:
             return
         saved = {"CLIP": state["clip_mean"], "dense": state["dense_mean"]}
         if self.semantic_field is None:
             self._add_semantics(*saved.values())
-            self.to(self.device)
         assert self.semantic_field is not None
-        kept = self.semantic_field.grid.levels_in(len(state["semantic_field.grid.table"]))
-        if kept is not None and kept < self.semantic_field.grid.levels:
-            self.semantic_field.keep_levels(kept)
+        if self.semantic_field.needs_lifting and "gauss_params.codes" in state:
+            self.gauss_params["codes"] = Parameter(state["gauss_params.codes"].clone(), requires_grad=False)
+        self.to(self.device)
+        prefix = "semantic_field."
+        self.semantic_field.fit_to_state(
+            {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+        )
         for kind, mean, prepared in zip(
             saved, saved.values(), (self.clip_mean, self.dense_mean), strict=True
         ):
@@ -442,8 +442,3 @@ class Lang3DXLModel(AnsweringModel):
                     f"targets have {len(prepared)}: pass the --pipeline.datamanager.{kind.lower()} that the "
                     f"checkpoint was trained with, or train anew"
                 )
-
-
-def _resize(image: Float[Tensor, "H W c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:
-    """Nearest-exact: picks samples, since averaging codes would make codes of nothing."""
-    return F.interpolate(image.permute(2, 0, 1)[None], size, mode="nearest-exact")[0].permute(1, 2, 0)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from gsplat.strategy import DefaultStrategy
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
+from lang3dxl_ns.baselines.encoders import EncoderConfig
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
@@ -20,6 +22,8 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     """Splatfacto's settings, with the method's schedule, and the semantic components."""
 
     _target: type = field(default_factory=lambda: _model_class())
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """What carries the semantics: the semantic field, or a system that it is compared with."""
     semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
     """Decoder from a 3-number code to CLIP and dense features."""
     downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
@@ -90,6 +94,28 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
             self.dense_weight = 2.0 if short else 0.5
         if self.decode_size is None:
             self.decode_size = (56, 72) if short else (80, 120)
+
+
+def make_strategy(config: Lang3DXLModelConfig) -> DefaultStrategy:
+    """gsplat's densification with the schedule of the run."""
+    steps = config.total_steps
+    return DefaultStrategy(
+        prune_opa=config.cull_alpha_thresh,
+        grow_grad2d=config.densify_grad_thresh,
+        grow_scale3d=config.densify_size_thresh,
+        grow_scale2d=config.split_screen_size,
+        prune_scale3d=config.cull_scale_thresh,
+        prune_scale2d=config.cull_screen_size,
+        refine_scale2d_stop_iter=0,
+        refine_start_iter=round(config.densify_from * steps),
+        refine_stop_iter=round(config.densify_until * steps),
+        refine_every=max(round(config.densify_every * steps), 1),
+        # The paper never resets opacities in a run of 70,000.
+        reset_every=10**9,
+        pause_refine_after_reset=0,
+        absgrad=config.use_absgrad,
+        verbose=False,
+    )
 
 
 def _model_class() -> type:

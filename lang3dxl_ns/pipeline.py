@@ -26,6 +26,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
 from lang3dxl_ns.evaluation.report import host_peak, progress_bar, synchronize
 from lang3dxl_ns.evaluation.scores import Maps, map_size
+from lang3dxl_ns.lift_features import lift_features
 from lang3dxl_ns.model import Lang3DXLModel
 from lang3dxl_ns.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.preparation.photo import Photo
@@ -245,6 +246,17 @@ class Lang3DXLPipeline(VanillaPipeline):
         CONSOLE.log(f"Looking for {self.query}; lookup table: {scene.lookup}")
         colours = ClipColours.of(scene.decode, scene.rendered_codes())
         return Asked(scene.scorer(), queries, scene.config.min_alpha, colours=colours)
+
+    def finish_training(self) -> None:
+        """What is left to do when the last iteration is: lift features, where the encoder learns none."""
+        encoder = self.model.semantic_field
+        if encoder is None or not encoder.needs_lifting:
+            return
+        self.model.train()
+        photos = self.datamanager.train_photos()
+        with progress_bar() as bar:
+            total = len(self.datamanager.train_dataset)
+            lift_features(self.model, bar.track(photos, total=total, description="lifting features"))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
         """Load a checkpoint; whatever does not fit is an error (nerfstudio would silently leave it out)."""

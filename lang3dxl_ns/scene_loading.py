@@ -126,11 +126,14 @@ def scene_of_model(
         with guard():
             return field.decode_clip(codes)
 
+    gaussians = {name: parameter.detach() for name, parameter in model.gauss_params.items()}
+    with torch.no_grad():
+        carried = field.carried(gaussians)
     return Scene(
         render=guarded_render,
         decode=guarded_decode,
-        bounded=field.settings.bounding == "sigmoid",
-        gaussians={name: parameter.detach() for name, parameter in model.gauss_params.items()},
+        bounded=field.bounded,
+        gaussians=gaussians if carried is None else gaussians | {"codes": carried},
         file=file,
         encode_texts=encode_texts,
         state=model.state_dict(),

@@ -324,7 +324,9 @@ class Lang3DXLTrainer(Trainer):
                 signal.signal(number, handler)
 
     def _after_train(self) -> None:
-        """Save; after an interruption also say how to go on, and don't wait in the viewer."""
+        """Finish and save; after an interruption say how to go on instead, and don't wait in the viewer."""
+        if not self.interrupted:
+            self.pipeline.finish_training()
         if self.interrupted:
             self.step = max(self._last_iteration, self._start_step)  # not the one that was about to begin
             self.config.viewer.quit_on_train_completion = True

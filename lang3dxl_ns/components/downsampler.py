@@ -47,6 +47,10 @@ class DownsamplerConfig:
     logit_bound: float | None = 10.0
     """Logits w become b·tanh(w/b), so that no pixel outweighs another by more than exp(2b). None leaves them
     free and takes a slower path that is stable for any logits."""
+    match: Literal["attenuated", "resize-features", "resize-target"] = "attenuated"
+    """How features and target meet. The others are the paper's ablations: features resized to the target's
+    grid ("w/o AD (LR)"), or the target to the features' size ("w/o AD (HR)"), bilinear; the settings above
+    are then without effect."""
 
 
 class SeparableKernel(NamedTuple):
@@ -69,7 +73,27 @@ class AttenuatedDownsampler(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
-        self.network = _weight_network(channels, config.hidden, generator) if config.hidden else None
+        learned = config.hidden and config.match == "attenuated"
+        self.network = _weight_network(channels, config.hidden, generator) if learned else None
+
+    def match(
+        self,
+        features: Float[Tensor, "h w c"],
+        target: Float[Tensor, "hd wd c"],
+        crop_sides: Sequence[float],
+        mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
+    ) -> tuple[Float[Tensor, "a b c"], Float[Tensor, "a b c"], Float[Tensor, "a b"]]:
+        """Features and target on one grid, the target's unless configured otherwise, and the cells' weight
+        (see `forward`)."""
+        inside = features.new_ones(features.shape[:2]) if mask is None else mask.to(features.dtype)
+        if self.config.match == "resize-target":
+            return features, upsample_target(target, (features.shape[0], features.shape[1])), inside
+        grid = (target.shape[0], target.shape[1])
+        if self.config.match == "resize-features":
+            share = resize_features_down(inside[..., None], grid)[..., 0]
+            return _divide(resize_features_down(features * inside[..., None], grid), share), target, share
+        predicted, share = self(features, grid, crop_sides, mask)
+        return predicted, target, share
 
     def forward(
         self,

@@ -1,4 +1,4 @@
-"""Multi-resolution hash grid in plain torch, for spaces of two to four dimensions.
+"""Multi-resolution hash grid in plain torch, for spaces of two to six dimensions.
 
 Every level lays a regular lattice over the unit cube and keeps one feature vector per lattice vertex, in a
 table of bounded size: levels that fit are stored densely, finer ones share entries through a hash. A point
@@ -14,7 +14,8 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-HASH_PRIMES = (1, 2654435761, 805459861, 3674653429)
+HASH_PRIMES = (1, 2654435761, 805459861, 3674653429, 2097192037, 1434869437)
+MOST_DIMENSIONS = len(HASH_PRIMES)
 INITIAL_RANGE = 1e-4
 COORDINATE_LIMIT = 1024.0
 """Coordinates are clamped to ± this; there, float32 resolves an eighth of a cell 1/2048 wide."""
@@ -33,8 +34,9 @@ class HashGrid(nn.Module):
     equally far, so fine levels, which few samples constrain, grow as loud as coarse ones.
 
     Args:
-        input_dim: d, 2 to 4.
-        levels: number of resolutions, in geometric progression from `min_resolution` to `max_resolution`.
+        input_dim: d, 2 to 6.
+        levels: number of resolutions, in geometric progression from `min_resolution` to `max_resolution`;
+            0 makes a grid without any feature.
         features_per_level: length of an entry.
         log2_table_size: a level keeps at most 2 to this power entries.
         generator: source of the uniform ± 1e-4 initial values.
@@ -52,11 +54,11 @@ class HashGrid(nn.Module):
         generator: torch.Generator | None = None,
     ):
         super().__init__()
-        if not 2 <= input_dim <= len(HASH_PRIMES):
-            raise ValueError(f"input_dim must be 2 to {len(HASH_PRIMES)}, got {input_dim}")
-        if levels < 1 or not 3 <= log2_table_size <= 30 or not 3 <= min_resolution <= max_resolution:
+        if not 2 <= input_dim <= MOST_DIMENSIONS:
+            raise ValueError(f"input_dim must be 2 to {MOST_DIMENSIONS}, got {input_dim}")
+        if levels < 0 or not 3 <= log2_table_size <= 30 or not 3 <= min_resolution <= max_resolution:
             raise ValueError(
-                "needs levels ≥ 1, 3 ≤ log2_table_size ≤ 30, 3 ≤ min_resolution ≤ max_resolution; got "
+                "needs levels ≥ 0, 3 ≤ log2_table_size ≤ 30, 3 ≤ min_resolution ≤ max_resolution; got "
                 f"{levels}, {log2_table_size}, {min_resolution}, {max_resolution}"
             )
         self.input_dim, self.levels, self.features_per_level = input_dim, levels, features_per_level
@@ -90,6 +92,8 @@ class HashGrid(nn.Module):
         Features have the table's number type. Coordinates are computed in float32 at least: in 16 bits a
         fine level would have no fractions left.
         """
+        if not self.levels:
+            return x.new_zeros(len(x), 0)
         x = x.to(torch.promote_types(self.table.dtype, torch.float32)).clamp(
             -COORDINATE_LIMIT, COORDINATE_LIMIT
         )

@@ -6,7 +6,7 @@ CLIP features and, through the same hidden layers, dense (DINO) features.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple
 
@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, HashGrid
+from lang3dxl_ns.components.encoder import SemanticEncoder
+from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, MOST_DIMENSIONS, HashGrid
 from lang3dxl_ns.errors import UserError
 
 Preset = Literal["default", "short", "paper", "official"]
@@ -128,7 +129,7 @@ class SemanticFieldConfig:
     """`default`: long GPU run; `short`: 300 to 1,000 steps on a CPU; `paper`: as printed; `official`: as
     released; `auto`: chosen by the length of the run (`default` where none is known)."""
     code_dim: int | None = None
-    """Channels of the rendered code, 2 to 4 (2 or 3 with `indexed`)."""
+    """Channels of the rendered code, 2 to 6 (2 to 5 with `indexed`). Each doubles the work of a lookup."""
     code_std: float | None = None
     """Standard deviation of the initial codes. Small: wide starts scatter equal surfaces over the field."""
     bounding: Literal["sigmoid", "raw"] | None = None
@@ -141,7 +142,7 @@ class SemanticFieldConfig:
     """Put an index coordinate before the code and look up at index 0, 1/k, 2/k, … until there are as many
     channels as CLIP has (Lang3D-XL). Without it the grid is read once."""
     levels: int | None = None
-    """Resolutions of the hash grid."""
+    """Resolutions of the hash grid; 0 for none, the Fourier features alone."""
     features_per_level: int | None = None
     """Features that each level contributes to a lookup."""
     log2_table_size: int | None = None
@@ -168,7 +169,7 @@ class SemanticFieldConfig:
 
         Raises:
             UserError: the preset is unknown, the code has too many or too few channels for the grid, or the
-                decoder has no hidden layer.
+                decoder has no hidden layer or nothing to read.
         """
         name = "default" if self.preset == "auto" else self.preset
         if name not in PRESETS:
@@ -180,7 +181,9 @@ class SemanticFieldConfig:
         settings = FieldSettings(**{k: getattr(preset, k) if v is None else v for k, v in chosen.items()})
         if settings.hidden_layers < 1:
             raise UserError(f"hidden_layers is {settings.hidden_layers}: the decoder needs at least one")
-        most = 3 if settings.indexed else 4
+        if settings.levels == 0 and (settings.fourier_frequencies == 0 or settings.indexed):
+            raise UserError("without levels the decoder sees Fourier features alone: set fourier_frequencies")
+        most = MOST_DIMENSIONS - settings.indexed
         if not 2 <= settings.code_dim <= most:
             raise UserError(
                 f"code_dim is {settings.code_dim}, but the hash grid reads 2 to {most} code channels"
@@ -197,7 +200,7 @@ class ShrunkParameter(NamedTuple):
     cut: Callable[[Tensor], Tensor]
 
 
-class SemanticField(nn.Module):
+class SemanticField(SemanticEncoder):
     """Decodes rendered codes to raw (not unit length) CLIP features and, if asked for, dense features.
 
     Codes may be any number: ±inf decode to finite features, NaN to NaN in their own pixel alone. Everything
@@ -218,9 +221,9 @@ class SemanticField(nn.Module):
         *,
         generator: torch.Generator | None = None,
     ):
-        super().__init__()
+        super().__init__(clip_dim, dense_dim)
         self.settings = s = config.resolved()
-        self.code_dim, self.clip_dim, self.dense_dim = s.code_dim, clip_dim, dense_dim
+        self.code_dim = s.code_dim
         self.grid = HashGrid(
             s.code_dim + s.indexed,
             s.levels,
@@ -235,13 +238,13 @@ class SemanticField(nn.Module):
         self.hidden = _hidden_layers(grid_dim + fourier_dim, s, generator)
         self.output = _linear(s.hidden_width, clip_dim + dense_dim, generator)
 
-        self.output_mean: Tensor
-        self.output_std: Tensor
         self.level_weights: Tensor | None
-        self.register_buffer("output_mean", torch.zeros(clip_dim + dense_dim))
-        self.register_buffer("output_std", torch.ones(clip_dim + dense_dim))
         # All levels are open until `set_progress` says otherwise.
         self.register_buffer("level_weights", torch.ones(s.levels) if s.coarse_to_fine > 0 else None)
+
+    @property
+    def bounded(self) -> bool:  # type: ignore[override]
+        return self.settings.bounding == "sigmoid"
 
     def initial_codes(
         self, count: int, generator: torch.Generator | None = None
@@ -252,21 +255,9 @@ class SemanticField(nn.Module):
         return (self.settings.code_std * noise).to(self.output_mean)
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
-        """Per-channel mean and deviation of the targets, CLIP then dense; without `whiten` they are ignored.
-
-        Raises:
-            ValueError: wrong number of channels, or a value that is not finite, or a negative deviation.
-        """
-        if mean.shape != self.output_mean.shape or std.shape != self.output_std.shape:
-            raise ValueError(
-                f"output statistics need {len(self.output_mean)} channels (CLIP {self.clip_dim}, dense "
-                f"{self.dense_dim}), got mean {tuple(mean.shape)} and std {tuple(std.shape)}"
-            )
-        if not (mean.isfinite().all() and std.isfinite().all() and (std >= 0).all()):
-            raise ValueError("output statistics must be finite and the deviations not negative")
+        """See `SemanticEncoder`; without `whiten` they are ignored."""
         if self.settings.whiten:
-            self.output_mean.copy_(mean)
-            self.output_std.copy_(std)
+            super().set_output_statistics(mean, std)
 
     def set_progress(self, fraction: float) -> None:
         """Tell how much of the run is done (0 to 1): opens the grid's levels; saved with the checkpoint."""
@@ -305,6 +296,15 @@ class SemanticField(nn.Module):
     def decode_clip(self, codes: Float[Tensor, "*batch code"]) -> Float[Tensor, "*batch clip"]:
         """CLIP features of every code, without computing the dense ones."""
         return self._head(self._decode_hidden(codes), slice(0, self.clip_dim))
+
+    def fit_to_state(self, state: Mapping[str, Tensor]) -> None:
+        """Drop the levels that the saved grid has lost."""
+        kept = self.grid.levels_in(len(state["grid.table"]))
+        if kept is not None and kept < self.grid.levels:
+            self.keep_levels(kept)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {"field_encoding": self.encoding_parameters(), "field_decoder": self.decoder_parameters()}
 
     def encoding_parameters(self) -> list[nn.Parameter]:
         """Parameters of the hash grid: an optimiser group without weight decay."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -58,13 +59,14 @@ def plan_crops(
         )
     if config.scale_mode == "relative" or not len(reconstruction.points):
         scales = relative_scales() if config.scale_range is None else relative_scales(7, *config.scale_range)
+        scales = _kept(scales, config)
         reasons = [f"crops of {_listed(scales)} of the photo's width"]
         if config.scale_mode != "relative":
             reasons.insert(0, "the scene has no 3D points: crops have no size in the world")
         return CropPlan(scales, None, None, reasons)
     sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
     chosen = _scale_range(config, reconstruction, sizes)
-    scales = physical_scales(chosen.smallest, chosen.largest)
+    scales = _kept(physical_scales(chosen.smallest, chosen.largest), config)
     reasons = [
         f"{chosen.reason}; crop sides: {_listed(scales)} (--pipeline.datamanager.scale-range overrides)"
     ]
@@ -117,6 +119,10 @@ def _scale_range(
             f"the scale range {smallest} {largest} is not a range: give the smallest crop first, both above 0"
         )
     return ScaleRange(smallest, largest, f"crops of {smallest:.3g}–{largest:.3g} world units, as asked")
+
+
+def _kept(scales: list[float], config: PreparationConfig) -> list[float]:
+    return [math.sqrt(scales[0] * scales[-1])] if config.single_scale else scales
 
 
 def _listed(values: Sequence[float]) -> str:

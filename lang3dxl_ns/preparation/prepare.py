@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -57,6 +57,8 @@ class PreparationConfig:
     scale_mode: Literal["auto", "physical", "relative"] = "auto"
     """Whether crops have one size in the world or one size in the photo. In the world, the crop that fits a
     window fits it in near and far photos; `auto`: in the world, unless the photos agree in scale anyway."""
+    single_scale: bool = False
+    """Crops of one size alone, the (geometric) middle of the range."""
     pixel_distance: DistanceRule = "median"
     """How far a photo's subject is: the camera's distance to the median of its tracked points, to their mean,
     or to the mean of those away from the edges ("mean-inner", the paper's text)."""
@@ -142,6 +144,10 @@ class TargetReader:
         return StoredClipTarget(
             **self._store.read(CLIP, name), crop_fractions=[side / width for side in settings["crop_sides"]]
         )
+
+    def clip_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "hd wd c"]]:
+        """The CLIP targets of photos, one at a time, float16."""
+        return (self.clip(name).features for name in names)
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
         """The dense features of the squashed photo, float16; None when prepared without."""

@@ -93,9 +93,13 @@ class ClipSeg:
         self._processor = _load_processor(CLIPSegProcessor, files)
         self._context: int = self._model.config.text_config.max_position_embeddings
 
-    @torch.no_grad()
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
         """As `TextSegmenter.segment`."""
+        return (self.probabilities(image, prompts) >= 0.5).any(dim=0)
+
+    @torch.no_grad()
+    def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
+        """Of every prompt in every pixel, at the size of the image, on the CPU."""
         inputs = self._processor(
             text=list(prompts),
             images=[_picture(image)] * len(prompts),
@@ -106,8 +110,7 @@ class ClipSeg:
         ).to(self._model.device)
         logits = self._model(**inputs).logits.cpu()
         logits = logits.reshape(len(prompts), 1, *logits.shape[-2:])  # of one prompt it comes without an axis
-        logits = F.interpolate(logits, tuple(image.shape[:2]), mode="bilinear")
-        return (logits >= 0).any(dim=0)[0]
+        return F.interpolate(logits, tuple(image.shape[:2]), mode="bilinear")[:, 0].sigmoid()
 
 
 class BoxesAndSam:

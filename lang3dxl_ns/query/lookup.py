@@ -21,6 +21,7 @@ from lang3dxl_ns.query.relevancy import TEMPERATURE, Decode, Queries, cosines_of
 
 _ROWS_AT_ONCE = 1 << 16
 """Vertices that are decoded, or converted from half precision, at a time."""
+_MOST_DIMENSIONS = 4
 _CHECKED_CODES = 50_000
 _EDGE = 1e-6
 """Bounded coordinates keep this distance from 0 and 1, whose codes are infinite."""
@@ -250,11 +251,12 @@ class Lookup:
     ) -> Lookup:
         """Try the configured sizes in turn; each is checked against exact decodes of a sample of the codes.
 
-        probes: prompts of the kind that people will ask, whose relevancies are compared.
+        probes: prompts of the kind that people will ask, whose relevancies are compared. Codes of more
+        numbers than a grid can hold have no table.
         """
         checks: list[TableCheck] = []
         codes = codes[codes.isfinite().all(1)]  # one that is not would leave the box without bounds
-        if not len(codes):
+        if not len(codes) or codes.shape[1] > _MOST_DIMENSIONS:
             return cls(None, checks)
         sample = codes[_random_rows(len(codes), _CHECKED_CODES).to(codes.device)]
         exact = probes.relevancy_of_cosines(cosines_of_codes(decode, sample, probes), temperature)

@@ -1,0 +1,32 @@
+"""Feature 3DGS (Zhou et al. 2024): wide codes on the Gaussians, one linear layer after rendering."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lang3dxl_ns.components.encoder import SemanticEncoder
+
+
+class Feature3DGS(SemanticEncoder):
+    """Codes half as wide as CLIP's features (256 for ViT-B/32), and its "speed-up" layer, a 1×1 convolution,
+    from there to CLIP and dense features. Whitened like the semantic field, which only helps it."""
+
+    def __init__(self, clip_dim: int, dense_dim: int) -> None:
+        super().__init__(clip_dim, dense_dim)
+        self.code_dim = max(clip_dim // 2, 1)
+        self.layer = nn.Linear(self.code_dim, clip_dim + dense_dim)
+
+    def initial_codes(
+        self, count: int, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count code"]:
+        return self.output_mean.new_zeros(count, self.code_dim)
+
+    def forward(
+        self, rendered: Float[Tensor, "*batch d"]
+    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
+        return self._split(self.output_mean + self.output_std * self.layer(rendered))
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {"feature3dgs_decoder": list(self.layer.parameters())}

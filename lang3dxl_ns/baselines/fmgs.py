@@ -1,0 +1,89 @@
+"""FMGS (Zuo et al. 2024), as Lang3D-XL adapts it: a hash grid over places, decoded before rendering."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lang3dxl_ns.components.encoder import SemanticEncoder
+from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+
+_STRETCH = 2.0
+"""Places within a scene's radius fill 0.12 … 0.88 of the grid, almost evenly; all beyond share the rest."""
+
+
+class PlaceField(SemanticEncoder):
+    """The semantic field read at a Gaussian's place instead of a pixel's code: every Gaussian is decoded, and
+    the whole features are rendered. Gaussians learn nothing of their own.
+
+    Args:
+        centre, radius: of the scene, world units.
+        alignment_weight: of the pixel alignment loss.
+    """
+
+    def __init__(
+        self,
+        config: SemanticFieldConfig,
+        clip_dim: int,
+        dense_dim: int,
+        centre: Float[Tensor, "3"],
+        radius: float,
+        alignment_weight: float,
+    ) -> None:
+        super().__init__(clip_dim, dense_dim)
+        # A place is a coordinate of three numbers, whatever codes the field would have.
+        self.field = SemanticField(replace(config, code_dim=3, bounding="sigmoid"), clip_dim, dense_dim)
+        self.alignment_weight = alignment_weight
+        self.centre: Tensor
+        self.radius: Tensor
+        self.register_buffer("centre", centre.detach().clone())
+        self.register_buffer("radius", centre.new_tensor(radius))
+
+    def initial_codes(self, count: int, generator: torch.Generator | None = None) -> None:
+        return None
+
+    def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"]:
+        """Features of the Gaussians' places; places themselves get no gradient."""
+        places = _STRETCH * (gaussians["means"].detach() - self.centre) / self.radius
+        clip, dense = self.field(places)
+        return clip if dense is None else torch.cat([clip, dense], dim=-1)
+
+    def forward(
+        self, rendered: Float[Tensor, "*batch d"]
+    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
+        return self._split(rendered)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return self.field.parameter_groups()
+
+    def own_losses(
+        self, clip: Float[Tensor, "h w clip"], dense: Float[Tensor, "h w dense"] | None
+    ) -> dict[str, Float[Tensor, ""]]:
+        if dense is None:
+            return {}
+        return {"alignment": self.alignment_weight * pixel_alignment_loss(clip, dense)}
+
+    def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
+        self.field.set_output_statistics(mean, std)
+
+    def set_progress(self, fraction: float) -> None:
+        self.field.set_progress(fraction)
+
+
+def pixel_alignment_loss(clip: Float[Tensor, "h w c"], dense: Float[Tensor, "h w d"]) -> Float[Tensor, ""]:
+    """Mean difference of how alike neighbours are in CLIP and in dense features; these get no gradient."""
+    return (neighbour_similarity(clip) - neighbour_similarity(dense.detach())).abs().mean()
+
+
+def neighbour_similarity(features: Float[Tensor, "h w c"]) -> Float[Tensor, "h w 8"]:
+    """Cosine of every pixel to its eight neighbours; mirrored at the border."""
+    height, width, _ = features.shape
+    unit = F.normalize(features, dim=-1)
+    padded = F.pad(unit.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="reflect")[0].permute(1, 2, 0)
+    shifts = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
+    return torch.stack([(unit * padded[y : y + height, x : x + width]).sum(-1) for y, x in shifts], dim=-1)

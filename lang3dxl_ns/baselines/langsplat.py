@@ -1,0 +1,110 @@
+"""LangSplat (Qin et al. 2024): a per-scene autoencoder's three numbers on every Gaussian."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lang3dxl_ns.components.encoder import SemanticEncoder
+
+_ENCODER = (256, 128, 64, 32, 3)
+_DECODER = (16, 32, 64, 128, 256, 256)
+_BATCH = 1024
+_RATE = 2e-3
+"""The published 7e-4 is for batches of 64."""
+_MOST_FEATURES = 400_000
+"""Features that the autoencoder learns from, at most."""
+
+
+class LangSplat(SemanticEncoder):
+    """Codes of unit length, decoded after rendering by the autoencoder's decoder, which stays as it is.
+
+    The autoencoder learns the scene's CLIP targets before the run, as unit vectors; decoded features get the
+    targets' typical length back. It has no dense features. The published system trains a model for each of
+    three levels of SAM's segments, on segment features; this one has the targets that all encoders have here.
+
+    Args:
+        clip_dim: channels of the CLIP features.
+        steps: iterations of the autoencoder.
+    """
+
+    def __init__(self, clip_dim: int, steps: int) -> None:
+        super().__init__(clip_dim, 0)
+        self.steps = steps
+        self.decoder = _layers((3, *_DECODER, clip_dim)).requires_grad_(False)
+        self.first_code: Tensor
+        self.norm: Tensor
+        self.register_buffer("first_code", torch.tensor([0.0, 0.0, 1.0]))
+        self.register_buffer("norm", torch.ones(()))
+
+    def initial_codes(self, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "count 3"]:
+        """All near the code of the mean target."""
+        device = generator.device if generator else None
+        noise = torch.randn(count, 3, generator=generator, device=device)
+        return self.first_code + 0.1 * noise.to(self.first_code)
+
+    def carried(self, gaussians: dict[str, Tensor]) -> Float[Tensor, "n 3"]:  # type: ignore[override]
+        return F.normalize(gaussians["codes"], dim=-1)
+
+    def forward(self, rendered: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch clip"], None]:
+        return self.norm * F.normalize(self.decoder(rendered), dim=-1), None
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {}
+
+    def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
+        """Only the typical length of the CLIP targets is used."""
+        mean, std = mean[: self.clip_dim], std[: self.clip_dim]
+        super().set_output_statistics(mean, std)
+        self.norm.copy_((mean.square() + std.square()).sum().sqrt())
+
+    def learn_targets(self, targets: Callable[[], Iterable[Float[Tensor, "h w clip"]]]) -> None:
+        """Train the autoencoder on the scene's targets."""
+        generator = torch.Generator().manual_seed(0)
+        features = _sample(targets(), generator).to(self.norm.device)
+        with torch.random.fork_rng(devices=[]), torch.enable_grad():
+            torch.manual_seed(0)
+            encoder = _layers((self.clip_dim, *_ENCODER), normalise=True).to(features)
+        self.decoder.requires_grad_(True)
+        parameters = [*encoder.parameters(), *self.decoder.parameters()]
+        optimizer = torch.optim.Adam(parameters, lr=_RATE)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(self.steps, 1))
+        for _ in range(self.steps):
+            batch = features[torch.randint(len(features), (_BATCH,), generator=generator)]
+            decoded = F.normalize(self.decoder(F.normalize(encoder(batch), dim=-1)), dim=-1)
+            cosine = F.cosine_similarity(decoded, batch, dim=-1).mean()
+            loss = F.mse_loss(decoded, batch) + 1e-3 * (1 - cosine)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+        self.decoder.requires_grad_(False)
+        with torch.no_grad():
+            mean = F.normalize(features.mean(0, keepdim=True), dim=-1)
+            self.first_code.copy_(F.normalize(encoder.eval()(mean), dim=-1)[0])
+
+
+def _sample(targets: Iterable[Tensor], generator: torch.Generator) -> Float[Tensor, "n c"]:
+    """Unit vectors of the targets, thinned out as they come where there are too many."""
+    rows: list[Tensor] = []
+    for target in targets:
+        flat = F.normalize(target.flatten(0, 1).float(), dim=-1)
+        rows.append(flat)
+        if sum(map(len, rows)) > _MOST_FEATURES:
+            rows = [part[torch.randperm(len(part), generator=generator)[: len(part) // 2]] for part in rows]
+    return torch.cat(rows)
+
+
+def _layers(widths: tuple[int, ...], normalise: bool = False) -> nn.Sequential:
+    """Linear layers with a ReLU between two, after a batch normalisation if asked for."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        if layers:
+            layers += [nn.BatchNorm1d(inputs), nn.ReLU()] if normalise else [nn.ReLU()]
+        layers.append(nn.Linear(inputs, outputs))
+    return nn.Sequential(*layers)
