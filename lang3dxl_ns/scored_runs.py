@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
@@ -268,7 +269,7 @@ def score_photo(
 
     small = scorer.truth.scoring_size(*size)
     resized = {category: resize_map(scores[None], small)[0] for category, scores in maps.items()}
-    figures = {}
+    figures: dict[str, float] = {}
     for prefix, variant in scorer.variants(resized).items():
         figures |= scorer.scores(name, variant, prefix)
     return figures
