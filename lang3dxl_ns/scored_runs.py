@@ -223,9 +223,7 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
         return {}
     pipeline.eval()
     times: dict[str, list[float]] = {"render_ms": [], "answer_ms": []}
-    for (camera, _), _ in zip(
-        pipeline.datamanager.fixed_indices_eval_dataloader, range(_TIMED_PHOTOS), strict=False
-    ):
+    for camera, _ in islice(pipeline.datamanager.fixed_indices_eval_dataloader, _TIMED_PHOTOS):
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
