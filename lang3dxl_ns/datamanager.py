@@ -5,6 +5,7 @@ Photos come through a bounded cache with read-ahead, targets straight from the m
 
 from __future__ import annotations
 
+import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
@@ -27,6 +28,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markdown import Markdown
+from rich.markup import escape
 from torch import Tensor
 
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
@@ -35,8 +37,9 @@ from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo import Photo, scaled_size
 from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, points_in_view
-from lang3dxl_ns.preparation.prepare import PreparationConfig, TargetReader
+from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
+from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.scene_needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.timing import part
 
@@ -176,7 +179,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             self.config,
             self.cache_dir,
             self.device,
-            log=CONSOLE.log,
+            log=_log,
             regions=self._region_source,
         ).reader
 
@@ -203,7 +206,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         datasets = (self.train_dataset, self.eval_dataset)
         photos = {photo.name: photo for dataset in datasets for photo in dataset.photos}
         masked = with_foreground(
-            list(photos.values()), self.config, self.data_folder, self.cache_dir, self.device, CONSOLE.log
+            list(photos.values()), self.config, self.data_folder, self.cache_dir, self.device, _log
         )
         photos = {photo.name: photo for photo in masked}
         for dataset in datasets:
@@ -257,7 +260,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
                 camera, batch = self._batch(self.train_dataset, index, data)
         except UserError as reason:
-            CONSOLE.log(f"[yellow]{self.train_dataset.photos[index].name} is left out of training: {reason}")
+            _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
             self._left_out.add(index)
             self.train_unseen_cameras = self.sample_train_cameras()
             return self.next_train(step)
@@ -322,12 +325,17 @@ class EvalPhotos:
             try:
                 item = self._datamanager._batch(dataset, index, dataset.read(index))
             except UserError as reason:
-                CONSOLE.log(f"[yellow]{photo.name} is left out of evaluation: {reason}")
+                _log(f"{photo.name} is left out of evaluation: {reason}")
                 continue
             usable = True
             yield item
         if not usable:
             raise UserError("none of the held-out photos can be used: see the reasons above")
+
+
+def _log(message: str) -> None:
+    """Say it as it is: in a photo's name, brackets are no markup."""
+    CONSOLE.log(escape(message))
 
 
 def pinhole_cameras(photos: list[Photo], posed: Cameras, scale: float) -> Cameras:
@@ -347,10 +355,26 @@ def pinhole_cameras(photos: list[Photo], posed: Cameras, scale: float) -> Camera
 
 
 def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
-    """`Photo`s for the outputs of any of nerfstudio's dataparsers (perspective cameras)."""
+    """`Photo`s for the outputs of any of nerfstudio's dataparsers.
+
+    Raises UserError for a camera that is no perspective one, and for a photo outside the data folder.
+    """
     cameras, folder = outputs.cameras, data if data.is_dir() else data.parent
     photos = []
     for i, path in enumerate(outputs.image_filenames):
+        kind = CameraType(int(cameras.camera_type[i]))
+        if kind is not CameraType.PERSPECTIVE:
+            raise UserError(
+                f"photo {path} has a {kind.name.lower()} camera, which is not undistorted on this way: leave "
+                "nerfstudio-data off, so that the COLMAP model is read (ns-process-data keeps it in "
+                "colmap/sparse/0) and photos are undistorted; panoramas must be cut up first "
+                "(ns-process-data images --camera-type equirectangular)"
+            )
+        if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder)):
+            raise UserError(
+                f"photo {path} lies outside {folder}: copy it there, and name it in the scene's file "
+                "relative to that folder"
+            )
         k1, k2, k3, _, p1, p2 = (
             cameras.distortion_params[i].tolist() if cameras.distortion_params is not None else [0.0] * 6
         )

@@ -15,6 +15,7 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
+from rich.markup import escape
 from torch import Tensor
 
 from lang3dxl_ns.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
@@ -25,6 +26,7 @@ from lang3dxl_ns.evaluation.language import LanguageScorer, Maps, blurred, insid
 from lang3dxl_ns.evaluation.report import progress_bar
 from lang3dxl_ns.model import Lang3DXLModel
 from lang3dxl_ns.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.preparation.progress import some
 
 
 @dataclass
@@ -80,7 +82,15 @@ class Lang3DXLPipeline(VanillaPipeline):
                 return None
         if self.model.semantic_field is None:
             return None
-        return open_scorer(GroundTruth(folder), self.datamanager.config.clip, self.device)
+        truth = GroundTruth(folder)
+        datasets = (self.datamanager.train_dataset, self.datamanager.eval_dataset)
+        unknown = truth.unknown(photo.name for dataset in datasets for photo in dataset.photos)
+        if unknown:
+            CONSOLE.log(
+                f"[yellow]{len(unknown)} masks in {folder} belong to no photo of the scene and are not "
+                f"scored:[/yellow] {escape(some(unknown))}"
+            )
+        return open_scorer(truth, self.datamanager.config.clip, self.device)
 
     @torch.no_grad()
     def evaluate(self) -> Iterator[EvaluatedPhoto]:
@@ -185,6 +195,6 @@ def _print_user_error(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
     if issubclass(kind, UserError):
-        CONSOLE.print(f"[bold red]Error:[/bold red] {error}", soft_wrap=True)
+        CONSOLE.print(f"[bold red]Error:[/bold red] {escape(str(error))}", soft_wrap=True)
     else:
         _previous_hook(kind, error, traceback)

@@ -20,6 +20,7 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
@@ -220,7 +221,7 @@ class Lang3DXLTrainer(Trainer):
 
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, with the guard before them."""
-        self.guard = StepGuard(self.config.max_skipped_steps, CONSOLE.log)
+        self.guard = StepGuard(self.config.max_skipped_steps, lambda message: CONSOLE.log(escape(message)))
         groups = self.pipeline.get_param_groups()
         return GuardedOptimizers(self.config.optimizers.copy(), groups, self._step_is_sound)
 
@@ -256,7 +257,7 @@ class Lang3DXLTrainer(Trainer):
             if found := self.pipeline.model.hash_levels.verdict:
                 write_needs([*self.pipeline.datamanager.needs, found], self.base_dir)
             if summary := self.guard.summary():
-                CONSOLE.log(f"[yellow]{summary}")
+                CONSOLE.log(escape(summary))
 
     def train_iteration(self, step: int):
         result = super().train_iteration(step)

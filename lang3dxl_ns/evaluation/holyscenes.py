@@ -5,7 +5,7 @@ A folder per category with `NNNN-gt.jpg` (object black on white, JPEG) for the p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -48,6 +48,11 @@ class GroundTruth:
     def photos(self, category: str) -> list[str]:
         """Stems of the photos that have a mask of the category."""
         return list(self._paths[category])
+
+    def unknown(self, photos: Iterable[str]) -> list[str]:
+        """Masks that belong to none of the scene's photos, as category/stem."""
+        known = {PurePosixPath(photo).stem for photo in photos}
+        return [f"{c}/{stem}" for c, paths in self._paths.items() for stem in paths if stem not in known]
 
     def masks(self, photo: str, size: tuple[int, int]) -> dict[str, Bool[Array, "h w"]]:
         """The photo's masks, {category: True on the object}, at `size` (height, width).

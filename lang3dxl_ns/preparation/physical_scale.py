@@ -117,6 +117,16 @@ def read_reconstruction(model_dir: Path) -> Reconstruction:
     )
 
 
+def photos_in_model(model_dir: Path) -> int:
+    """How many photos a COLMAP model has, without reading it: its images file begins with, or lists, them."""
+    binary, text = model_dir / "images.bin", model_dir / "images.txt"
+    if binary.is_file():
+        with binary.open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    with text.open(errors="replace") as lines:
+        return sum(not line.startswith("#") for line in lines) // 2  # a line of keypoints follows each
+
+
 def points_in_view(points: Float[Array, "m 3"], photo: PhotoGeometry) -> Float[Array, "k 3"]:
     """The points in front of the camera that project into the (undistorted) photo, hidden ones included."""
     return _track_all_in_view(points, photo).points

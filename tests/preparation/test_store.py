@@ -46,7 +46,7 @@ def test_what_is_written_is_read_in_half_precision(store):
         assert torch.equal(tensor, written[key].half())
     assert store.settings("clip", "a.jpg") == SETTINGS
     assert store.shapes("clip", "a.jpg") == {"features": (4, 5, 8), "valid": (4, 5)}
-    assert store.size() == store.path("clip", "a.jpg").stat().st_size
+    assert store.sizes() == {"clip": (1, store.path("clip", "a.jpg").stat().st_size)}
 
 
 def test_whole_numbers_and_views_survive(store):
