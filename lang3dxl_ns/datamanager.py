@@ -1,24 +1,20 @@
-"""Hands the trainer one photo at a time with its targets, out of core.
-
-Photos come through a bounded cache with read-ahead, targets straight from the memory-mapped store.
-"""
+"""Hands the trainer one photo at a time with its targets, out of core: read ahead, in a bounded cache."""
 
 from __future__ import annotations
 
-import os
+import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
@@ -33,10 +29,13 @@ from torch import Tensor
 
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.memory import machine_memory
+from lang3dxl_ns.older_config import ReadsOlder
+from lang3dxl_ns.other_scenes import photos_of, reconstruction_of
 from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo import Photo, scaled_size
-from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, points_in_view
+from lang3dxl_ns.preparation.physical_scale import Reconstruction
 from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.targets import TargetReader
@@ -45,7 +44,7 @@ from lang3dxl_ns.timing import part
 
 
 @dataclass
-class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
+class Lang3DXLDataManagerConfig(ReadsOlder, PreparationConfig, FullImageDatamanagerConfig):
     """Photos and their targets. `--pipeline.datamanager.clip none` trains colours only."""
 
     _target: type = field(default_factory=lambda: Lang3DXLDataManager)
@@ -53,10 +52,11 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     """Where photos and cameras come from."""
     cache_dir: Path | None = None
     """Where prepared targets are kept (default: lang3dxl_cache inside the data folder)."""
-    photo_cache_gb: float = 4.0
-    """Memory for decoded photos, in gigabytes; the least recently used ones make room."""
+    cache_gb: float | None = None
+    """Memory for decoded photos and their targets, in gigabytes; the least recently used ones make room.
+    Left out: a quarter of the machine's memory."""
     read_ahead: int = 4
-    """Photos decoded ahead of the training step."""
+    """Photos read ahead of the training step, on top of that memory."""
 
 
 class PhotoDataset(InputDataset):
@@ -88,15 +88,15 @@ class PhotoDataset(InputDataset):
 
 
 class PhotoCache:
-    """Keeps decoded photos up to a number of bytes, the few read ahead (in a thread) on top."""
+    """Keeps what was read of photos up to a number of bytes, the few read ahead (in a thread) on top."""
 
-    def __init__(self, read: Callable[[int], dict[str, Tensor]], max_bytes: float):
+    def __init__(self, read: Callable[[int], dict[str, Any]], max_bytes: float):
         self._read = read
         self._max_bytes = max_bytes
-        self._entries: OrderedDict[int, Future[dict[str, Tensor]]] = OrderedDict()
+        self._entries: OrderedDict[int, Future[dict[str, Any]]] = OrderedDict()
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photo-reader")
 
-    def get(self, index: int, upcoming: list[int]) -> dict[str, Tensor]:
+    def get(self, index: int, upcoming: list[int]) -> dict[str, Any]:
         """The photo at `index`; starts reading the `upcoming` ones."""
         for i in (index, *upcoming):
             if i not in self._entries:
@@ -121,11 +121,11 @@ class PhotoCache:
                 excess -= _bytes(future)
 
 
-def _bytes(future: Future[dict[str, Tensor]]) -> int:
+def _bytes(future: Future[dict[str, Any]]) -> int:
     """Memory of a photo that has been read; none of one that could not be (its own turn says why)."""
     if future.exception():
         return 0
-    return sum(t.numel() * t.element_size() for t in future.result().values())
+    return sum(value.nbytes for value in future.result().values() if isinstance(value, Tensor))
 
 
 class Lang3DXLDataManager(FullImageDatamanager):
@@ -165,6 +165,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             prepared = set(self.targets.names)  # without damaged photos
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
             self.train_dataset.metadata["feature_statistics"] = self.targets.feature_statistics(names)
+        _log(self._memory_budget())
 
     @cached_property
     def targets(self) -> TargetReader | None:
@@ -237,7 +238,27 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def _train_cache(self) -> PhotoCache:
-        return PhotoCache(self.train_dataset.read, self.config.photo_cache_gb * 1e9)
+        _ = self.targets  # not to be made in the cache's thread
+        return PhotoCache(lambda index: self._read(self.train_dataset, index), self.cache_bytes)
+
+    @property
+    def cache_bytes(self) -> float:
+        """Memory for photos and targets."""
+        gigabytes = self.config.cache_gb
+        return machine_memory() / 4 if gigabytes is None else gigabytes * 1e9
+
+    def _memory_budget(self) -> str:
+        """What training holds in memory of the photos, estimated from the first one's targets."""
+        photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
+        total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
+        if self.targets is not None:
+            total += len(photos) * self.targets.bytes_of(self.targets.names[0])
+        held = min(total, self.cache_bytes)
+        return (
+            f"memory: at most {held / 1e9:.2f} GB of photos and targets at a time (of "
+            f"{total / 1e9:.2f} GB in {len(photos)} photos), {self.config.read_ahead} photos read ahead "
+            "(--pipeline.datamanager.cache-gb sets the most)"
+        )
 
     def sample_train_cameras(self) -> list[int]:
         """A new round of all training photos that can be used."""
@@ -285,25 +306,40 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Pixels of a typical photo, for nerfstudio's speed display."""
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
 
-    def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Tensor]) -> tuple[Cameras, dict]:
-        """Everything a step needs of one photo:
+    def _read(self, dataset: PhotoDataset, index: int) -> dict[str, Any]:
+        """Everything a step needs of one photo, as it is kept in memory: bytes and half precision.
 
-        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, `name`, and with semantics `clip_target`
-        [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and
-        `regions` [h, w] (labels, −1 for none).
+        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with semantics `clip_target` [Hd, Wd, C],
+        `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
+        (labels, −1 for none).
         """
-        photo = dataset.photos[index]
-        batch: dict[str, Any] = {key: value.to(self.device) for key, value in data.items()}
-        batch |= {"image_idx": index, "name": photo.name}
+        data: dict[str, Any] = dict(dataset.read(index))
         if self.targets is not None:
-            clip, dense = self.targets.clip(photo.name), self.targets.dense(photo.name)
-            regions = self.targets.regions(photo.name)
-            batch["clip_target"] = clip.features.to(self.device).float()
-            batch["crop_sides"] = clip.crop_fractions
-            if dense is not None:
-                batch["dense_target"] = dense.to(self.device).float()
-            if regions is not None:
-                batch["regions"] = regions.to(self.device).long()
+            name = dataset.photos[index].name
+            clip = self.targets.clip(name)
+            found = {
+                "clip_target": clip.features,
+                "dense_target": self.targets.dense(name),
+                "regions": self.targets.regions(name),
+            }
+            # Cloned: read from disk now, not when the step comes to it.
+            data |= {key: value.clone() for key, value in found.items() if value is not None}
+            data["crop_sides"] = clip.crop_fractions
+        return data
+
+    def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, dict]:
+        """What was read of a photo as a step takes it: on the device, with `name` and `image_idx`."""
+        batch: dict[str, Any] = {
+            key: value.to(self.device) if isinstance(value, Tensor) else value for key, value in data.items()
+        }
+        for key, number in (
+            ("clip_target", torch.float32),
+            ("dense_target", torch.float32),
+            ("regions", torch.int64),
+        ):
+            if key in batch:
+                batch[key] = batch[key].to(number)
+        batch |= {"image_idx": index, "name": dataset.photos[index].name}
         return dataset.cameras[index : index + 1].to(self.device), batch
 
 
@@ -323,7 +359,7 @@ class EvalPhotos:
         usable = False
         for index, photo in enumerate(dataset.photos):
             try:
-                item = self._datamanager._batch(dataset, index, dataset.read(index))
+                item = self._datamanager._batch(dataset, index, self._datamanager._read(dataset, index))
             except UserError as reason:
                 _log(f"{photo.name} is left out of evaluation: {reason}")
                 continue
@@ -351,81 +387,4 @@ def pinhole_cameras(photos: list[Photo], posed: Cameras, scale: float) -> Camera
         cy=(torch.tensor([p.cy for p in photos]) * zoom[:, 1]).float(),
         width=sizes[:, 0],
         height=sizes[:, 1],
-    )
-
-
-def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
-    """`Photo`s for the outputs of any of nerfstudio's dataparsers.
-
-    Raises UserError for a camera that is no perspective one, and for a photo outside the data folder.
-    """
-    cameras, folder = outputs.cameras, data if data.is_dir() else data.parent
-    photos = []
-    for i, path in enumerate(outputs.image_filenames):
-        kind = CameraType(int(cameras.camera_type[i]))
-        if kind is not CameraType.PERSPECTIVE:
-            raise UserError(
-                f"photo {path} has a {kind.name.lower()} camera, which is not undistorted on this way: leave "
-                "nerfstudio-data off, so that the COLMAP model is read (ns-process-data keeps it in "
-                "colmap/sparse/0) and photos are undistorted; panoramas must be cut up first "
-                "(ns-process-data images --camera-type equirectangular)"
-            )
-        if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder)):
-            raise UserError(
-                f"photo {path} lies outside {folder}: copy it there, and name it in the scene's file "
-                "relative to that folder"
-            )
-        k1, k2, k3, _, p1, p2 = (
-            cameras.distortion_params[i].tolist() if cameras.distortion_params is not None else [0.0] * 6
-        )
-        photos.append(
-            Photo(
-                name=path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name,
-                path=path,
-                mask_path=outputs.mask_filenames[i] if outputs.mask_filenames else None,
-                width=int(cameras.width[i]),
-                height=int(cameras.height[i]),
-                fx=float(cameras.fx[i]),
-                fy=float(cameras.fy[i]),
-                cx=float(cameras.cx[i]),
-                cy=float(cameras.cy[i]),
-                distortion=(k1, k2, p1, p2, k3) if any((k1, k2, k3, p1, p2)) else (),
-            )
-        )
-    return photos
-
-
-def reconstruction_of(splits: list[DataparserOutputs]) -> Reconstruction:
-    """A reconstruction in the scene's original units made of cameras and seed points, for scenes that
-    come without tracks: a photo's points are the seed points that project into it."""
-    metadata = splits[0].metadata
-    scale = splits[0].dataparser_scale
-    points = (
-        metadata["points3D_xyz"].double().numpy() / scale if "points3D_xyz" in metadata else np.zeros((0, 3))
-    )
-    photos = {}
-    for outputs in splits:
-        for photo, pose in zip(outputs.metadata["photos"], outputs.cameras.camera_to_worlds, strict=True):
-            geometry = _geometry(photo, pose.double().numpy(), scale)
-            photos[photo.name] = replace(geometry, points=points_in_view(points, geometry))
-    colours = metadata["points3D_rgb"].numpy() if len(points) else np.zeros((0, 3))
-    return Reconstruction(photos=dict(sorted(photos.items())), points=points, colours=colours)
-
-
-def _geometry(photo: Photo, world_from_camera: np.ndarray, scale: float) -> PhotoGeometry:
-    rotation = (world_from_camera[:, :3] * [1, -1, -1]).T  # OpenGL camera axes to OpenCV's, inverted
-    camera_from_world = np.hstack([rotation, -rotation @ world_from_camera[:, 3:] / scale])
-    return PhotoGeometry(
-        name=photo.name,
-        width=photo.width,
-        height=photo.height,
-        fx=photo.fx,
-        fy=photo.fy,
-        cx=photo.cx,
-        cy=photo.cy,
-        distortion=photo.distortion,
-        fisheye=False,
-        camera_from_world=camera_from_world,
-        points=np.zeros((0, 3)),
-        pixels=np.zeros((0, 2)),
     )

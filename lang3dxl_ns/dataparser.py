@@ -15,6 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.older_config import ReadsOlder
 from lang3dxl_ns.preparation.companions import inside
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.preparation.photo import Photo
@@ -32,7 +33,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".g
 
 
 @dataclass
-class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
+class PhotoCollectionDataParserConfig(ReadsOlder, ColmapDataParserConfig):
     """A folder with images/ and a COLMAP model, and perhaps masks/."""
 
     _target: type = field(default_factory=lambda: PhotoCollectionDataParser)

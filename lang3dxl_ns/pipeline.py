@@ -26,11 +26,12 @@ from lang3dxl_ns.evaluation.language import LanguageScorer, Maps, blurred, insid
 from lang3dxl_ns.evaluation.report import progress_bar
 from lang3dxl_ns.model import Lang3DXLModel
 from lang3dxl_ns.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.older_config import ReadsOlder
 from lang3dxl_ns.preparation.progress import some
 
 
 @dataclass
-class Lang3DXLPipelineConfig(VanillaPipelineConfig):
+class Lang3DXLPipelineConfig(ReadsOlder, VanillaPipelineConfig):
     """Configuration of the pipeline."""
 
     _target: type = field(default_factory=lambda: Lang3DXLPipeline)

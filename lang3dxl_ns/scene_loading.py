@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -75,7 +77,13 @@ def load_scene(
     path = Path(config).expanduser()
     if not path.is_file():
         raise UserError(f"{path} is not a file: pass the config.yml of a run")
-    run = yaml.load(path.read_text(), Loader=yaml.Loader)
+    try:
+        run = yaml.load(path.read_text(), Loader=yaml.Loader)
+    except (yaml.YAMLError, UnicodeDecodeError, TypeError, AttributeError, ValueError) as error:
+        raise UserError(
+            f"{path} can't be read ({error}): it is damaged, or the run is of a version whose settings are "
+            "not known any more; restore it, or train anew"
+        ) from error
     if not isinstance(run, TrainerConfig):
         raise UserError(f"{path} is not the config.yml of a run of nerfstudio")
     file = SceneFile.read(path.parent / SCENE_FILE)
@@ -120,6 +128,7 @@ def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch
         raise UserError(
             f"{folder / run.relative_model_dir} holds no checkpoint: train for longer, or copy it"
         )
+    check_checkpoint(checkpoints[-1])
     state = torch.load(checkpoints[-1], map_location="cpu", weights_only=True)["pipeline"]
     photos = [photo for photo in file.photos if photo.split == "train"]
     # The checkpoint brings its own Gaussians: start from the fewest that there can be.
@@ -135,6 +144,26 @@ def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch
     assert isinstance(model, Lang3DXLModel)
     model.load_state_dict({k.removeprefix("_model."): v for k, v in state.items() if k.startswith("_model.")})
     return model.to(device).eval()
+
+
+def check_checkpoint(place: Path) -> None:
+    """Read the checkpoint at a path, or the latest in a folder, against its checksums.
+
+    Raises UserError where it is damaged. Nothing is said about a folder without any: a run begins so.
+    """
+    checkpoints = sorted(place.glob("step-*.ckpt")) if place.is_dir() else [place]
+    if not checkpoints or not checkpoints[-1].is_file():
+        return
+    try:
+        with zipfile.ZipFile(checkpoints[-1]) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, zlib.error):
+        damaged = "the whole file"
+    if damaged is not None:
+        raise UserError(
+            f"the checkpoint {checkpoints[-1]} is damaged ({damaged}), perhaps by an incomplete copy: copy "
+            "it again, or move it away to go on from an earlier one, or train anew (prepared targets are kept)"
+        )
 
 
 def renderer(model: Lang3DXLModel) -> Callable[[Camera], View]:

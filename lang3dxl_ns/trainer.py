@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -28,9 +29,10 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
+from lang3dxl_ns.older_config import ReadsOlder
+from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.query.scene_file import SCENE_FILE
-from lang3dxl_ns.scene_loading import describe_scene
+from lang3dxl_ns.scene_loading import check_checkpoint, describe_scene
 from lang3dxl_ns.scene_needs import read_needs, write_needs
 from lang3dxl_ns.step_guard import StepGuard
 
@@ -38,6 +40,16 @@ SHORT_RUN = 1_000
 """Iterations of a run that takes the short-run rates."""
 LONG_RUN = 30_000
 """Iterations of a run that takes the published rates."""
+_NOT_A_CHECKPOINT = (
+    RuntimeError,
+    EOFError,
+    OSError,
+    pickle.UnpicklingError,
+    LookupError,
+    ValueError,
+    AssertionError,
+)
+"""What nerfstudio and torch raise for a folder or a file that is none."""
 
 
 def run_length_weight(iterations: int) -> float:
@@ -110,7 +122,7 @@ class RunSchedule(Scheduler):
 
 
 @dataclass
-class Lang3DXLTrainerConfig(TrainerConfig):
+class Lang3DXLTrainerConfig(ReadsOlder, TrainerConfig):
     """Training configuration; `--max-num-iterations` alone rescales every schedule."""
 
     _target: type = field(default_factory=lambda: Lang3DXLTrainer)
@@ -122,6 +134,14 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         """Called once before the configuration is printed and saved: settle what depends on the run."""
         super().set_timestamp()
         self.fit_to_run()
+
+    def get_checkpoint_dir(self) -> Path:
+        """Folder of the checkpoints. Every command that loads a run asks for it: the place to look at the
+        latest one. Raises UserError where that one is damaged."""
+        folder = super().get_checkpoint_dir()
+        print_user_errors_plainly()
+        check_checkpoint(folder)
+        return folder
 
     def fit_to_run(self) -> None:
         """Settle rates, schedules and presets for this number of iterations; make paths absolute, so
@@ -296,6 +316,20 @@ class Lang3DXLTrainer(Trainer):
                 soft_wrap=True,
             )
         super()._after_train()
+
+    def _load_checkpoint(self) -> None:
+        """Raises UserError for a checkpoint that is damaged, or no checkpoint."""
+        chosen = self.config.load_checkpoint or self.config.load_dir
+        if chosen is None:
+            return
+        check_checkpoint(chosen)
+        try:
+            super()._load_checkpoint()
+        except _NOT_A_CHECKPOINT as error:
+            raise UserError(
+                f"there is no checkpoint of lang3dxl in {chosen} ({error}): give --load-dir the "
+                "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
+            ) from error
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:

@@ -82,6 +82,11 @@ class TargetReader:
         """Region labels of the photo, −1 for none; None (and nothing is read) for a photo without regions."""
         return self._store.read(REGIONS, name)["labels"] if name in self._with_regions else None
 
+    def bytes_of(self, name: str) -> int:
+        """Size of a photo's targets."""
+        kinds = [CLIP] + [DENSE] * self._with_dense + [REGIONS] * (name in self._with_regions)
+        return sum(self._store.path(kind, name).stat().st_size for kind in kinds)
+
     def check(self, encoder: ImageTextEncoder) -> None:
         """Raises UserError when a photo's target is missing or comes from another CLIP than `encoder`."""
         for name in self.names:

@@ -77,8 +77,8 @@ def _run_in_processes(count: int, maker: Maker[Item, Result], items: Sequence[It
             yield futures[future], future.result()
     except BrokenProcessPool as error:
         raise UserError(
-            f"one of the {count} processes ended before its time, perhaps because memory ran out: what it and "
-            "the others have made is kept; run the same command again, with fewer --workers"
+            f"one of the {count} processes ended before its time, perhaps because memory ran out: what they "
+            "have made is kept; run the same command again, with fewer --workers"
         ) from error
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
