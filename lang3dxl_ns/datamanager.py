@@ -33,12 +33,13 @@ from lang3dxl_ns.memory import machine_memory
 from lang3dxl_ns.older_config import ReadsOlder
 from lang3dxl_ns.other_scenes import photos_of, reconstruction_of
 from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
-from lang3dxl_ns.preparation.foreground import with_foreground
+from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.photo import Photo, scaled_size
 from lang3dxl_ns.preparation.physical_scale import Reconstruction
 from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
-from lang3dxl_ns.preparation.targets import TargetReader
+from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.targets import CLIP, DENSE, REGIONS, TargetReader
 from lang3dxl_ns.scene_needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.timing import part
 
@@ -184,6 +185,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
             regions=self._region_source,
         ).reader
 
+    def clean_store(self) -> tuple[int, int]:
+        """Delete what the scene's photos do not use with this configuration; returns files and bytes."""
+        c = self.config
+        used = {CLIP: c.clip != "none", DENSE: c.dense != "none", FOREGROUND: c.foreground == "text"}
+        used[REGIONS] = self._region_source is not None
+        names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
+        return FeatureStore(self.cache_dir).clean([kind for kind, wanted in used.items() if wanted], names)
+
     @cached_property
     def _region_source(self) -> RegionSource | None:
         c = self.config
@@ -227,7 +236,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @property
     def cache_dir(self) -> Path:
         """Folder of prepared targets."""
-        return self.config.cache_dir or self.data_folder / "lang3dxl_cache"
+        return (self.config.cache_dir or self.data_folder / "lang3dxl_cache").expanduser()
 
     def _reconstruction(self) -> Reconstruction:
         """The model in its own units: COLMAP's, or for other dataparsers one made of the seed points."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import time
 import zipfile
 import zlib
@@ -10,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-import yaml
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
@@ -25,6 +25,7 @@ from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, load_image
 from lang3dxl_ns.query.scene import QueryConfig, Scene, View
 from lang3dxl_ns.query.scene_file import SCENE_FILE, SceneFile, ScenePhoto
 from lang3dxl_ns.rendering import Camera
+from lang3dxl_ns.saved_config import read_config
 
 
 def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
@@ -66,8 +67,8 @@ def load_scene(
     """The scene of a run.
 
     Args:
-        config: the run's config.yml. Like nerfstudio's own commands this trusts the file: load those of
-            people that you trust. The latest checkpoint beside it is taken.
+        config: the run's config.yml. Nothing that stands in it is run (nerfstudio's own commands, ns-eval
+            and others, do trust the file). The latest checkpoint beside it is taken.
         device: a GPU where there is one, by default.
         settings: how to answer.
 
@@ -75,17 +76,7 @@ def load_scene(
     than the run's.
     """
     path = Path(config).expanduser()
-    if not path.is_file():
-        raise UserError(f"{path} is not a file: pass the config.yml of a run")
-    try:
-        run = yaml.load(path.read_text(), Loader=yaml.Loader)
-    except (yaml.YAMLError, UnicodeDecodeError, TypeError, AttributeError, ValueError) as error:
-        raise UserError(
-            f"{path} can't be read ({error}): it is damaged, or the run is of a version whose settings are "
-            "not known any more; restore it, or train anew"
-        ) from error
-    if not isinstance(run, TrainerConfig):
-        raise UserError(f"{path} is not the config.yml of a run of nerfstudio")
+    run = read_config(path)
     file = SceneFile.read(path.parent / SCENE_FILE)
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     model = _load_model(run, path.parent, file, device)
@@ -129,7 +120,13 @@ def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch
             f"{folder / run.relative_model_dir} holds no checkpoint: train for longer, or copy it"
         )
     check_checkpoint(checkpoints[-1])
-    state = torch.load(checkpoints[-1], map_location="cpu", weights_only=True)["pipeline"]
+    try:
+        state = torch.load(checkpoints[-1], map_location="cpu", weights_only=True)["pipeline"]
+    except (RuntimeError, pickle.UnpicklingError, LookupError, TypeError) as error:
+        raise UserError(
+            f"{checkpoints[-1]} is not a checkpoint of lang3dxl ({error}): nothing in it was run; pass a run "
+            "whose origin you know"
+        ) from error
     photos = [photo for photo in file.photos if photo.split == "train"]
     # The checkpoint brings its own Gaussians: start from the fewest that there can be.
     start = replace(run.pipeline.model, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
@@ -162,7 +159,7 @@ def check_checkpoint(place: Path) -> None:
     if damaged is not None:
         raise UserError(
             f"the checkpoint {checkpoints[-1]} is damaged ({damaged}), perhaps by an incomplete copy: copy "
-            "it again, or move it away to go on from an earlier one, or train anew (prepared targets are kept)"
+            "it again, move it away to go on from an earlier one, or train anew (prepared targets are kept)"
         )
 
 

@@ -15,7 +15,6 @@ from types import FrameType
 from typing import Any, Literal
 
 import torch
-import yaml
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
@@ -32,6 +31,7 @@ from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.older_config import ReadsOlder
 from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.query.scene_file import SCENE_FILE
+from lang3dxl_ns.saved_config import read_config
 from lang3dxl_ns.scene_loading import check_checkpoint, describe_scene
 from lang3dxl_ns.scene_needs import read_needs, write_needs
 from lang3dxl_ns.step_guard import StepGuard
@@ -168,7 +168,8 @@ class Lang3DXLTrainerConfig(ReadsOlder, TrainerConfig):
         """A resumed run keeps what `auto` meant when it began."""
         if not (run / "config.yml").is_file():
             return
-        earlier = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader).pipeline.model
+        earlier: Any = read_config(run / "config.yml").pipeline
+        earlier = earlier.model
         needs, mine = read_needs(run), self.pipeline.model
         for part in ("semantic_field", "appearance"):
             if getattr(mine, part).preset == "auto":

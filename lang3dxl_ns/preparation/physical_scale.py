@@ -17,6 +17,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.model_files import check_binary_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -289,9 +290,10 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
             "folder that holds them (usually sparse/0), or make one: "
             "colmap automatic_reconstructor --workspace_path SCENE --image_path SCENE/images"
         )
+    check_binary_model(folder)
     try:
         return pycolmap.Reconstruction(folder)
-    except (ValueError, IndexError, RuntimeError) as error:
+    except (ValueError, IndexError, RuntimeError, UnicodeDecodeError, MemoryError) as error:
         raise UserError(f"the COLMAP model in {folder} is damaged, copy or make it again: {error}") from error
 
 
