@@ -20,6 +20,7 @@ from lang3dxl_ns.lookup_benchmark import LookupBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.query_commands import Export, Query
+from lang3dxl_ns.scale_benchmark import ScaleBenchmark
 from lang3dxl_ns.training_benchmark import TrainingBenchmark
 
 if TYPE_CHECKING:
@@ -94,6 +95,7 @@ def _datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None
 Benchmark = (
     Annotated[RasterizerBenchmark, tyro.conf.subcommand("rasterizer")]
     | Annotated[TrainingBenchmark, tyro.conf.subcommand("training")]
+    | Annotated[ScaleBenchmark, tyro.conf.subcommand("scale")]
     | Annotated[LookupBenchmark, tyro.conf.subcommand("lookup")]
 )
 Command = (

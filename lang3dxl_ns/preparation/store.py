@@ -177,7 +177,7 @@ def _opened(path: Path, what: str) -> Iterator[Any]:
             yield file
     except FileNotFoundError as error:
         raise UserError(f"{what} is not prepared: {path} does not exist; run `lang3dxl prepare`") from error
-    except SafetensorError as error:
+    except (SafetensorError, ValueError) as error:
         raise UserError(
             f"{path} ({what}) is damaged ({error}): delete it and run `lang3dxl prepare`"
         ) from error
