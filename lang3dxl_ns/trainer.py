@@ -146,6 +146,13 @@ class Lang3DXLTrainerConfig(ReadsOlder, TrainerConfig):
     def fit_to_run(self) -> None:
         """Settle rates, schedules and presets for this number of iterations; make paths absolute, so
         that config.yml is complete and can be read from any folder."""
+        if self.machine.num_devices * self.machine.num_machines > 1:
+            print_user_errors_plainly()
+            raise UserError(
+                "training runs on one device: densification changes how many parameters there are, which "
+                "torch's DistributedDataParallel does not follow. Leave --machine.num-devices at 1; several "
+                "GPUs prepare targets (lang3dxl prepare --workers N), and several scenes train side by side"
+            )
         iterations = self.max_num_iterations
         for group in self.optimizers.values():
             if isinstance(group["optimizer"], RunAdamConfig):

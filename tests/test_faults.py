@@ -4,6 +4,7 @@ import errno
 import os
 import pickle
 import zipfile
+from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -278,6 +279,14 @@ def test_a_config_that_asks_for_more_than_settings_is_refused(tmp_path, text):
     with pytest.raises(UserError, match=r"config\.yml"):
         read_config(tmp_path / "config.yml")
     assert not (tmp_path / "trap").exists()
+
+
+@pytest.mark.parametrize("machine", [{"num_devices": 2}, {"num_machines": 2}])
+def test_several_devices_are_refused_before_anything_starts(machine):
+    config = deepcopy(lang3dxl.config)
+    vars(config.machine).update(machine)
+    with pytest.raises(UserError, match="training runs on one device"):
+        config.set_timestamp()
 
 
 def test_servers_listen_on_this_machine_alone():
