@@ -101,7 +101,7 @@ def _best_view(scene: Scene, texts: list[str]) -> str:
 
 
 def file_names(photos: list[str]) -> list[str]:
-    """A file name (no suffix) for each photo, no two the same: a.jpg and a.png keep theirs as a_jpg, a_png."""
+    """A file name (no suffix) for each photo, no two the same: a.jpg beside a.png is a_jpg."""
     stems = [str(PurePosixPath(photo).with_suffix("")).replace("/", "_") for photo in photos]
     whole = [photo.replace("/", "_").replace(".", "_") for photo in photos]
     names = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, whole, strict=True)]
