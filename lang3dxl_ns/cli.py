@@ -13,14 +13,17 @@ import tyro
 from lang3dxl_ns.ablation import Ablation
 from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.demo_run import Demo
+from lang3dxl_ns.doctor import Doctor
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluate_commands import Evaluate
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
 from lang3dxl_ns.evaluation.numerics.command import Numerics
 from lang3dxl_ns.lookup_benchmark import LookupBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
+from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.presets import Preset
 from lang3dxl_ns.query_commands import Export, Query
+from lang3dxl_ns.scale_benchmark import ScaleBenchmark
 from lang3dxl_ns.training_benchmark import TrainingBenchmark
 from lang3dxl_ns.viewer.command import View
 
@@ -40,11 +43,19 @@ class Prepare(PreparationConfig):
     """Folder with images/ and sparse/0/."""
     cache_dir: Path | None = None
     """Where to keep the targets (default: lang3dxl_cache inside the data folder)."""
+    clean: bool = False
+    """Make nothing; delete what these settings and the scene's photos do not use (such as the targets of
+    photos that are gone, or dense features with --dense none)."""
 
     def main(self) -> None:
         datamanager = _datamanager(self, self.data, self.cache_dir)
-        if datamanager.targets is not None:
+        if self.clean:
+            files, freed = datamanager.clean_store()
+            print(f"Deleted {files} files, {freed / 1e6:.1f} MB, from {datamanager.cache_dir}")
+        elif datamanager.targets is not None:
             print(f"Targets of {len(datamanager.targets.names)} photos are in {datamanager.cache_dir}")
+        for kind, (files, size) in FeatureStore(datamanager.cache_dir).sizes().items():
+            print(f"  {kind}: {files} files, {size / 1e6:.1f} MB")
 
 
 @dataclass(kw_only=True)
@@ -88,12 +99,14 @@ def _datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None
 Benchmark = (
     Annotated[RasterizerBenchmark, tyro.conf.subcommand("rasterizer")]
     | Annotated[TrainingBenchmark, tyro.conf.subcommand("training")]
+    | Annotated[ScaleBenchmark, tyro.conf.subcommand("scale")]
     | Annotated[LookupBenchmark, tyro.conf.subcommand("lookup")]
     | Annotated[Ablation, tyro.conf.subcommand("ablation")]
 )
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Prepare, tyro.conf.subcommand("prepare")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Needs, tyro.conf.subcommand("needs")]
     | Annotated[Query, tyro.conf.subcommand("query")]
     | Annotated[Export, tyro.conf.subcommand("export")]

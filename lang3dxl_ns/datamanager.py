@@ -1,20 +1,15 @@
-"""Hands the trainer one photo at a time with its targets, out of core.
-
-Photos come through a bounded cache with read-ahead, targets straight from the memory-mapped store.
-"""
+"""Hands the trainer one photo at a time with its targets, out of core: read ahead, in a bounded cache."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import tyro
 from jaxtyping import Bool, Float
@@ -28,23 +23,30 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markdown import Markdown
+from rich.markup import escape
 from torch import Tensor
 
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.memory import machine_memory
+from lang3dxl_ns.older_config import ReadsOlder
+from lang3dxl_ns.other_scenes import photos_of, reconstruction_of
+from lang3dxl_ns.photo_cache import PhotoCache
 from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
-from lang3dxl_ns.preparation.foreground import with_foreground
+from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.photo import Photo, scaled_size
-from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, points_in_view
-from lang3dxl_ns.preparation.prepare import PreparationConfig, TargetReader
+from lang3dxl_ns.preparation.physical_scale import Reconstruction
+from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
+from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.targets import CLIP, DENSE, REGIONS, TargetReader
 from lang3dxl_ns.recorded_scene import recorded_scene
 from lang3dxl_ns.scene_needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.timing import part
 
 
 @dataclass
-class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
+class Lang3DXLDataManagerConfig(ReadsOlder, PreparationConfig, FullImageDatamanagerConfig):
     """Photos and their targets. `--pipeline.datamanager.clip none` trains colours only."""
 
     _target: type = field(default_factory=lambda: Lang3DXLDataManager)
@@ -52,10 +54,11 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     """Where photos and cameras come from."""
     cache_dir: Path | None = None
     """Where prepared targets are kept (default: lang3dxl_cache inside the data folder)."""
-    photo_cache_gb: float = 4.0
-    """Memory for decoded photos, in gigabytes; the least recently used ones make room."""
+    cache_gb: float | None = None
+    """Memory for decoded photos and their targets, in gigabytes; the least recently used ones make room.
+    Left out: a quarter of the machine's memory."""
     read_ahead: int = 4
-    """Photos decoded ahead of the training step."""
+    """Photos read ahead of the training step, on top of that memory."""
     run: tyro.conf.Suppress[Path | None] = None
     """Folder of the run whose config.yml this comes from; set as that is read."""
 
@@ -86,47 +89,6 @@ class PhotoDataset(InputDataset):
 
     def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
         return self.photos[image_idx].read(self.scale)
-
-
-class PhotoCache:
-    """Keeps decoded photos up to a number of bytes, the few read ahead (in a thread) on top."""
-
-    def __init__(self, read: Callable[[int], dict[str, Tensor]], max_bytes: float):
-        self._read = read
-        self._max_bytes = max_bytes
-        self._entries: OrderedDict[int, Future[dict[str, Tensor]]] = OrderedDict()
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photo-reader")
-
-    def get(self, index: int, upcoming: list[int]) -> dict[str, Tensor]:
-        """The photo at `index`; starts reading the `upcoming` ones."""
-        for i in (index, *upcoming):
-            if i not in self._entries:
-                self._entries[i] = self._pool.submit(self._read, i)
-            self._entries.move_to_end(i)
-        data = self._entries[index].result()
-        self._make_room(keep={index, *upcoming})
-        return dict(data)
-
-    @property
-    def bytes(self) -> int:
-        """Memory of the photos that are decoded."""
-        return sum(_bytes(future) for future in self._entries.values() if future.done())
-
-    def _make_room(self, keep: set[int]) -> None:
-        excess = self.bytes - self._max_bytes
-        for i in [i for i in self._entries if i not in keep]:
-            if excess <= 0:
-                return
-            future = self._entries.pop(i)
-            if not future.cancel():
-                excess -= _bytes(future)
-
-
-def _bytes(future: Future[dict[str, Tensor]]) -> int:
-    """Memory of a photo that has been read; none of one that could not be (its own turn says why)."""
-    if future.exception():
-        return 0
-    return sum(t.numel() * t.element_size() for t in future.result().values())
 
 
 class Lang3DXLDataManager(FullImageDatamanager):
@@ -177,6 +139,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
             self.train_dataset.metadata["feature_statistics"] = self.targets.feature_statistics(names)
             self.train_dataset.metadata["clip_targets"] = partial(self.targets.clip_features, names)
+        _log(self._memory_budget())
 
     @cached_property
     def targets(self) -> TargetReader | None:
@@ -191,9 +154,17 @@ class Lang3DXLDataManager(FullImageDatamanager):
             self.config,
             self.cache_dir,
             self.device,
-            log=CONSOLE.log,
+            log=_log,
             regions=self._region_source,
         ).reader
+
+    def clean_store(self) -> tuple[int, int]:
+        """Delete what the scene's photos do not use with this configuration; returns files and bytes."""
+        c = self.config
+        used = {CLIP: c.clip != "none", DENSE: c.dense != "none", FOREGROUND: c.foreground == "text"}
+        used[REGIONS] = self._region_source is not None
+        names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
+        return FeatureStore(self.cache_dir).clean([kind for kind, wanted in used.items() if wanted], names)
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
@@ -218,7 +189,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         datasets = (self.train_dataset, self.eval_dataset)
         photos = {photo.name: photo for dataset in datasets for photo in dataset.photos}
         masked = with_foreground(
-            list(photos.values()), self.config, self.data_folder, self.cache_dir, self.device, CONSOLE.log
+            list(photos.values()), self.config, self.data_folder, self.cache_dir, self.device, _log
         )
         photos = {photo.name: photo for photo in masked}
         for dataset in datasets:
@@ -238,7 +209,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @property
     def cache_dir(self) -> Path:
         """Folder of prepared targets."""
-        return self.config.cache_dir or self.data_folder / "lang3dxl_cache"
+        return (self.config.cache_dir or self.data_folder / "lang3dxl_cache").expanduser()
 
     def _reconstruction(self) -> Reconstruction:
         """The model in its own units: COLMAP's, or for other dataparsers one made of the seed points."""
@@ -249,7 +220,27 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def _train_cache(self) -> PhotoCache:
-        return PhotoCache(self.train_dataset.read, self.config.photo_cache_gb * 1e9)
+        _ = self.targets  # not to be made in the cache's thread
+        return PhotoCache(lambda index: self._read(self.train_dataset, index), self.cache_bytes)
+
+    @property
+    def cache_bytes(self) -> float:
+        """Memory for photos and targets."""
+        gigabytes = self.config.cache_gb
+        return machine_memory() / 4 if gigabytes is None else gigabytes * 1e9
+
+    def _memory_budget(self) -> str:
+        """What training holds in memory of the photos, estimated from the first one's targets."""
+        photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
+        total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
+        if self.targets is not None:
+            total += len(photos) * self.targets.bytes_of(self.targets.names[0])
+        held = min(total, self.cache_bytes)
+        return (
+            f"memory: at most {held / 1e9:.2f} GB of photos and targets at a time (of "
+            f"{total / 1e9:.2f} GB in {len(photos)} photos), {self.config.read_ahead} photos read ahead "
+            "(--pipeline.datamanager.cache-gb sets the most)"
+        )
 
     def sample_train_cameras(self) -> list[int]:
         """A new round of all training photos that can be used."""
@@ -272,7 +263,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
                 camera, batch = self._batch(self.train_dataset, index, data)
         except UserError as reason:
-            CONSOLE.log(f"[yellow]{self.train_dataset.photos[index].name} is left out of training: {reason}")
+            _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
             self._left_out.add(index)
             # The round goes on without it: a resumed run, which comes to know it later, has the same order.
             rest = [i for i in self.train_unseen_cameras if i != index]
@@ -329,25 +320,40 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Pixels of a typical photo, for nerfstudio's speed display."""
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
 
-    def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Tensor]) -> tuple[Cameras, dict]:
-        """Everything a step needs of one photo:
+    def _read(self, dataset: PhotoDataset, index: int) -> dict[str, Any]:
+        """Everything a step needs of one photo, as it is kept in memory: bytes and half precision.
 
-        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, `name`, and with semantics `clip_target`
-        [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and
-        `regions` [h, w] (labels, −1 for none).
+        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with semantics `clip_target` [Hd, Wd, C],
+        `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
+        (labels, −1 for none).
         """
-        photo = dataset.photos[index]
-        batch: dict[str, Any] = {key: value.to(self.device) for key, value in data.items()}
-        batch |= {"image_idx": index, "name": photo.name}
+        data: dict[str, Any] = dict(dataset.read(index))
         if self.targets is not None:
-            clip, dense = self.targets.clip(photo.name), self.targets.dense(photo.name)
-            regions = self.targets.regions(photo.name)
-            batch["clip_target"] = clip.features.to(self.device).float()
-            batch["crop_sides"] = clip.crop_fractions
-            if dense is not None:
-                batch["dense_target"] = dense.to(self.device).float()
-            if regions is not None:
-                batch["regions"] = regions.to(self.device).long()
+            name = dataset.photos[index].name
+            clip = self.targets.clip(name)
+            found = {
+                "clip_target": clip.features,
+                "dense_target": self.targets.dense(name),
+                "regions": self.targets.regions(name),
+            }
+            # Cloned: read from disk now, not when the step comes to it.
+            data |= {key: value.clone() for key, value in found.items() if value is not None}
+            data["crop_sides"] = clip.crop_fractions
+        return data
+
+    def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, dict]:
+        """What was read of a photo as a step takes it: on the device, with `name` and `image_idx`."""
+        batch: dict[str, Any] = {
+            key: value.to(self.device) if isinstance(value, Tensor) else value for key, value in data.items()
+        }
+        for key, number in (
+            ("clip_target", torch.float32),
+            ("dense_target", torch.float32),
+            ("regions", torch.int64),
+        ):
+            if key in batch:
+                batch[key] = batch[key].to(number)
+        batch |= {"image_idx": index, "name": dataset.photos[index].name}
         return dataset.cameras[index : index + 1].to(self.device), batch
 
 
@@ -381,14 +387,19 @@ class EvalPhotos:
         for index in self._wanted:
             photo = dataset.photos[index]
             try:
-                item = self._datamanager._batch(dataset, index, dataset.read(index))
+                item = self._datamanager._batch(dataset, index, self._datamanager._read(dataset, index))
             except UserError as reason:
-                CONSOLE.log(f"[yellow]{photo.name} is left out of evaluation: {reason}")
+                _log(f"{photo.name} is left out of evaluation: {reason}")
                 continue
             usable = True
             yield item
         if not usable:
             raise UserError("none of the held-out photos can be used: see the reasons above")
+
+
+def _log(message: str) -> None:
+    """Say it as it is: in a photo's name, brackets are no markup."""
+    CONSOLE.log(escape(message))
 
 
 def pinhole_cameras(photos: list[Photo], posed: Cameras, scale: float) -> Cameras:
@@ -404,65 +415,4 @@ def pinhole_cameras(photos: list[Photo], posed: Cameras, scale: float) -> Camera
         cy=(torch.tensor([p.cy for p in photos]) * zoom[:, 1]).float(),
         width=sizes[:, 0],
         height=sizes[:, 1],
-    )
-
-
-def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
-    """`Photo`s for the outputs of any of nerfstudio's dataparsers (perspective cameras)."""
-    cameras, folder = outputs.cameras, data if data.is_dir() else data.parent
-    photos = []
-    for i, path in enumerate(outputs.image_filenames):
-        k1, k2, k3, _, p1, p2 = (
-            cameras.distortion_params[i].tolist() if cameras.distortion_params is not None else [0.0] * 6
-        )
-        photos.append(
-            Photo(
-                name=path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name,
-                path=path,
-                mask_path=outputs.mask_filenames[i] if outputs.mask_filenames else None,
-                width=int(cameras.width[i]),
-                height=int(cameras.height[i]),
-                fx=float(cameras.fx[i]),
-                fy=float(cameras.fy[i]),
-                cx=float(cameras.cx[i]),
-                cy=float(cameras.cy[i]),
-                distortion=(k1, k2, p1, p2, k3) if any((k1, k2, k3, p1, p2)) else (),
-            )
-        )
-    return photos
-
-
-def reconstruction_of(splits: list[DataparserOutputs]) -> Reconstruction:
-    """A reconstruction in the scene's original units made of cameras and seed points, for scenes that
-    come without tracks: a photo's points are the seed points that project into it."""
-    metadata = splits[0].metadata
-    scale = splits[0].dataparser_scale
-    points = (
-        metadata["points3D_xyz"].double().numpy() / scale if "points3D_xyz" in metadata else np.zeros((0, 3))
-    )
-    photos = {}
-    for outputs in splits:
-        for photo, pose in zip(outputs.metadata["photos"], outputs.cameras.camera_to_worlds, strict=True):
-            geometry = _geometry(photo, pose.double().numpy(), scale)
-            photos[photo.name] = replace(geometry, points=points_in_view(points, geometry))
-    colours = metadata["points3D_rgb"].numpy() if len(points) else np.zeros((0, 3))
-    return Reconstruction(photos=dict(sorted(photos.items())), points=points, colours=colours)
-
-
-def _geometry(photo: Photo, world_from_camera: np.ndarray, scale: float) -> PhotoGeometry:
-    rotation = (world_from_camera[:, :3] * [1, -1, -1]).T  # OpenGL camera axes to OpenCV's, inverted
-    camera_from_world = np.hstack([rotation, -rotation @ world_from_camera[:, 3:] / scale])
-    return PhotoGeometry(
-        name=photo.name,
-        width=photo.width,
-        height=photo.height,
-        fx=photo.fx,
-        fy=photo.fy,
-        cx=photo.cx,
-        cy=photo.cy,
-        distortion=photo.distortion,
-        fisheye=False,
-        camera_from_world=camera_from_world,
-        points=np.zeros((0, 3)),
-        pixels=np.zeros((0, 2)),
     )

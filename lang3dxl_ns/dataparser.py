@@ -12,19 +12,29 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.files import read_names
+from lang3dxl_ns.older_config import ReadsOlder
+from lang3dxl_ns.preparation.companions import inside
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.preparation.photo import Photo
-from lang3dxl_ns.preparation.physical_scale import PhotoGeometry, Reconstruction, read_reconstruction
+from lang3dxl_ns.preparation.physical_scale import (
+    PhotoGeometry,
+    Reconstruction,
+    photos_in_model,
+    read_reconstruction,
+)
+from lang3dxl_ns.preparation.progress import some
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif")
 
 
 @dataclass
-class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
+class PhotoCollectionDataParserConfig(ReadsOlder, ColmapDataParserConfig):
     """A folder with images/ and a COLMAP model, and perhaps masks/."""
 
     _target: type = field(default_factory=lambda: PhotoCollectionDataParser)
@@ -38,6 +48,8 @@ class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
     held_out: Path | None = None
     """Text file that names the photos to hold out of training, one per line, with or without suffix; instead
     of every eighth. `lang3dxl evaluate split` makes one from ground truth."""
+    follow_links: bool = False
+    """Whether photos and masks may be symbolic links that lead out of their folder."""
     downscale_factor: int | None = 1
     """Left at 1: photos are resized as they are read (--pipeline.datamanager.camera-res-scale-factor)."""
 
@@ -53,6 +65,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         super().__init__(config)
         self.reconstruction: Reconstruction | None = None
         self.photos: dict[Path, Photo] = {}
+        self._left_out: dict[str, UserError] = {}
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         data = self.config.data = Path(self.config.data).expanduser().absolute()
@@ -64,6 +77,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         self.config.images_path = _first_folder(data, (self.config.images_path, *IMAGE_FOLDERS), "*")
         if self.reconstruction is None:
             self._read_collection()
+            self._mention_what_is_not_used()
         # The parent would demand a mask for every photo; ours are optional and found per photo.
         masks, self.config.masks_path = self.config.masks_path, None
         try:
@@ -155,7 +169,11 @@ class PhotoCollectionDataParser(ColmapDataParser):
         }
 
     def _image_path(self, name: str) -> Path:
-        return self.config.data / self.config.images_path / name
+        return self._images_folder / name
+
+    @property
+    def _images_folder(self) -> Path:
+        return self.config.data / self.config.images_path
 
     def _name(self, path: Path) -> str:
         return Path(path).relative_to(self.config.data / self.config.images_path).as_posix()
@@ -167,11 +185,12 @@ class PhotoCollectionDataParser(ColmapDataParser):
         for name, geometry in reconstruction.photos.items():
             path = self._image_path(name)
             try:
-                if not path.is_file():
+                if not inside(self._images_folder, name, self.config.follow_links).is_file():
                     raise UserError(f"there is no {path}")
                 self.photos[path] = Photo.from_geometry(geometry, path, self._mask_path(name))
             except UserError as reason:
                 left_out[name] = reason
+        self._left_out = left_out
         if len(self.photos) == 1:
             raise UserError(
                 f"{self.config.data} has one photo that can be used: a scene needs at least two, one to "
@@ -186,7 +205,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         if left_out:
             CONSOLE.log(f"[yellow]{len(left_out)} photos of the model are left out:[/yellow]")
             for name, why in left_out.items():
-                CONSOLE.log(f"  {name}: {why}")
+                CONSOLE.log(f"  {escape(f'{name}: {why}')}")
         kept = {name: g for name, g in reconstruction.photos.items() if name not in left_out}
         self.reconstruction = replace(reconstruction, photos=kept)
 
@@ -194,7 +213,36 @@ class PhotoCollectionDataParser(ColmapDataParser):
         """The photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""
         if self.config.masks_path is None:
             return None
-        return find_mask(self.config.data / self.config.masks_path, name)
+        return find_mask(self.config.data / self.config.masks_path, name, self.config.follow_links)
+
+    def _mention_what_is_not_used(self) -> None:
+        """Other models beside the one that is read, and photos that it does not know."""
+        model = self.config.data / self.config.colmap_path
+        others = [folder for folder in _models_beside(model) if folder != model]
+        if others:
+            counts = (f"{f.relative_to(self.config.data)} with {photos_in_model(f)}" for f in others)
+            CONSOLE.log(
+                f"[yellow]{self.config.data} has {len(others) + 1} models; used is {self.config.colmap_path} "
+                f"with {photos_in_model(model)} photos.[/yellow] There are also {', '.join(counts)}: choose "
+                "with `lang3dxl-colmap --colmap-path FOLDER` after all other options"
+            )
+        known = set(self.photos)
+        files = (p for p in sorted(self._images_folder.rglob("*")) if p.suffix.lower() in PHOTO_SUFFIXES)
+        unknown = [p.relative_to(self._images_folder).as_posix() for p in files if p not in known]
+        unknown = [name for name in unknown if name not in self._left_out]
+        if unknown:
+            CONSOLE.log(
+                f"{len(unknown)} photos of {self._images_folder} are not in the COLMAP model and not used: "
+                f"{escape(some(unknown))}"
+            )
+
+
+def _models_beside(model: Path) -> list[Path]:
+    """The models that COLMAP's mapper left in one folder: 0, 1, …; just this one where it has no number."""
+    if not model.name.isdigit():
+        return [model]
+    numbered = (folder for folder in model.parent.iterdir() if folder.name.isdigit())
+    return sorted(folder for folder in numbered if any(folder.glob("images.*")))
 
 
 def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Path:

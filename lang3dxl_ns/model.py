@@ -31,7 +31,7 @@ from lang3dxl_ns.geometry import centre_and_radius, fitted_size, in_view, resize
 from lang3dxl_ns.hash_levels import HashLevels
 from lang3dxl_ns.initial_gaussians import initial_gaussians, seed_positions
 from lang3dxl_ns.model_config import Lang3DXLModelConfig, make_strategy
-from lang3dxl_ns.preparation.prepare import FeatureStatistics
+from lang3dxl_ns.preparation.targets import FeatureStatistics
 from lang3dxl_ns.rendering import Camera, Gaussians, Rendering, rasterize, spherical_harmonics
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.timing import part

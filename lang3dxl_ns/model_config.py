@@ -12,13 +12,14 @@ from lang3dxl_ns.baselines.encoders import EncoderConfig
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.older_config import ReadsOlder
 
 SHORT_FIELD_RUN = 5_000
 """Runs of fewer iterations take the field's `short` preset."""
 
 
 @dataclass
-class Lang3DXLModelConfig(SplatfactoModelConfig):
+class Lang3DXLModelConfig(ReadsOlder, SplatfactoModelConfig):
     """Splatfacto's settings, with the method's schedule, and the semantic components."""
 
     _target: type = field(default_factory=lambda: _model_class())

@@ -16,6 +16,7 @@ import torch
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image
+from rich.markup import escape
 from torch import Tensor
 
 from lang3dxl_ns.datamanager import EvalPhotos, Lang3DXLDataManager, Lang3DXLDataManagerConfig
@@ -29,7 +30,9 @@ from lang3dxl_ns.evaluation.scores import Maps, map_size
 from lang3dxl_ns.lift_features import lift_features
 from lang3dxl_ns.model import Lang3DXLModel
 from lang3dxl_ns.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.older_config import ReadsOlder
 from lang3dxl_ns.preparation.photo import Photo
+from lang3dxl_ns.preparation.progress import some
 from lang3dxl_ns.query.answer import Asked, ClipColours
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.scene_file import SCENE_FILE, SceneFile
@@ -40,7 +43,7 @@ QUERY_VARIABLE = "LANG3DXL_QUERY"
 
 
 @dataclass
-class Lang3DXLPipelineConfig(VanillaPipelineConfig):
+class Lang3DXLPipelineConfig(ReadsOlder, VanillaPipelineConfig):
     """Configuration of the pipeline."""
 
     _target: type = field(default_factory=lambda: Lang3DXLPipeline)
@@ -122,7 +125,10 @@ class Lang3DXLPipeline(VanillaPipeline):
                 f"and the first are {absent[0]} and {next(iter(self.datamanager.photos))}"
             )
         if absent:
-            CONSOLE.log(f"[yellow]the scene has no photo for the labels {', '.join(absent)}")
+            CONSOLE.log(
+                f"[yellow]{len(absent)} labels in {truth.folder} belong to no photo of the scene and are not "
+                f"scored:[/yellow] {escape(some(absent))}"
+            )
 
     @torch.no_grad()
     def evaluate(self) -> Iterator[EvaluatedPhoto]:
@@ -305,6 +311,6 @@ def _print_user_error(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
     if issubclass(kind, UserError):
-        CONSOLE.print(f"[bold red]Error:[/bold red] {error}", soft_wrap=True)
+        CONSOLE.print(f"[bold red]Error:[/bold red] {escape(str(error))}", soft_wrap=True)
     else:
         _previous_hook(kind, error, traceback)

@@ -85,10 +85,11 @@ class Query:
         if self.camera_path is not None:
             yield from ((f"{i:05d}", c) for i, c in enumerate(read_camera_path(self.camera_path)))
         elif self.all:
-            yield from ((_file_name(photo.name), photo.name) for photo in scene.file.photos)
+            names = file_names([photo.name for photo in scene.file.photos])
+            yield from zip(names, (photo.name for photo in scene.file.photos), strict=True)
         else:
             name = scene.file.photo(self.image).name if self.image else _best_view(scene, self.text)
-            yield _file_name(name), name
+            yield file_names([name])[0], name
 
 
 def _best_view(scene: Scene, texts: list[str]) -> str:
@@ -99,8 +100,12 @@ def _best_view(scene: Scene, texts: list[str]) -> str:
     return scene.file.photos[0].name
 
 
-def _file_name(photo: str) -> str:
-    return str(PurePosixPath(photo).with_suffix("")).replace("/", "_")
+def file_names(photos: list[str]) -> list[str]:
+    """A file name (no suffix) for each photo, no two the same: a.jpg beside a.png is a_jpg."""
+    stems = [str(PurePosixPath(photo).with_suffix("")).replace("/", "_") for photo in photos]
+    whole = [photo.replace("/", "_").replace(".", "_") for photo in photos]
+    names = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, whole, strict=True)]
+    return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
 
 
 def write_match(match: Match, stem: Path, threshold: float) -> None:

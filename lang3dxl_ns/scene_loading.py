@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 import time
+import zipfile
+import zlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -10,7 +13,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-import yaml
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
@@ -26,6 +28,7 @@ from lang3dxl_ns.query.scene import QueryConfig, Scene, View
 from lang3dxl_ns.query.scene_file import SCENE_FILE, SceneFile, ScenePhoto
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.rendering import Camera
+from lang3dxl_ns.saved_config import read_config
 
 NO_SEMANTICS = "this run has no semantics (it was trained with clip none): there is nothing to ask it"
 
@@ -74,8 +77,8 @@ def load_scene(
     """The scene of a run.
 
     Args:
-        config: the run's config.yml. Like nerfstudio's own commands this trusts the file: load those of
-            people that you trust. The latest checkpoint beside it is taken.
+        config: the run's config.yml. Nothing that stands in it is run (nerfstudio's own commands, ns-eval
+            and others, do trust the file). The latest checkpoint beside it is taken.
         device: a GPU where there is one, by default.
         settings: how to answer.
 
@@ -83,11 +86,7 @@ def load_scene(
     than the run's.
     """
     path = Path(config).expanduser()
-    if not path.is_file():
-        raise UserError(f"{path} is not a file: pass the config.yml of a run")
-    run = yaml.load(path.read_text(), Loader=yaml.Loader)
-    if not isinstance(run, TrainerConfig):
-        raise UserError(f"{path} is not the config.yml of a run of nerfstudio")
+    run = read_config(path)
     file = SceneFile.read(path.parent / SCENE_FILE)
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     model = _load_model(run, path.parent, file, device)
@@ -161,7 +160,14 @@ def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch
         raise UserError(
             f"{folder / run.relative_model_dir} holds no checkpoint: train for longer, or copy it"
         )
-    state = torch.load(checkpoints[-1], map_location="cpu", weights_only=True)["pipeline"]
+    check_checkpoint(checkpoints[-1])
+    try:
+        state = torch.load(checkpoints[-1], map_location="cpu", weights_only=True)["pipeline"]
+    except (RuntimeError, pickle.UnpicklingError, LookupError, TypeError) as error:
+        raise UserError(
+            f"{checkpoints[-1]} is not a checkpoint of lang3dxl ({error}): nothing in it was run; pass a run "
+            "whose origin you know"
+        ) from error
     photos = [photo for photo in file.photos if photo.split == "train"]
     # The checkpoint brings its own Gaussians: start from the fewest that there can be.
     start = replace(run.pipeline.model, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
@@ -176,6 +182,26 @@ def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch
     assert isinstance(model, Lang3DXLModel)
     model.load_state_dict({k.removeprefix("_model."): v for k, v in state.items() if k.startswith("_model.")})
     return model.to(device).eval()
+
+
+def check_checkpoint(place: Path) -> None:
+    """Read the checkpoint at a path, or the latest in a folder, against its checksums.
+
+    Raises UserError where it is damaged. Nothing is said about a folder without any: a run begins so.
+    """
+    checkpoints = sorted(place.glob("step-*.ckpt")) if place.is_dir() else [place]
+    if not checkpoints or not checkpoints[-1].is_file():
+        return
+    try:
+        with zipfile.ZipFile(checkpoints[-1]) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, zlib.error):
+        damaged = "the whole file"
+    if damaged is not None:
+        raise UserError(
+            f"the checkpoint {checkpoints[-1]} is damaged ({damaged}), perhaps by an incomplete copy: copy "
+            "it again, move it away to go on from an earlier one, or train anew (prepared targets are kept)"
+        )
 
 
 def renderer(model: Lang3DXLModel) -> Callable[[Camera], View]:

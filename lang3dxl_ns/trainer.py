@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -14,12 +15,12 @@ from types import FrameType
 from typing import Any, Literal
 
 import torch
-import yaml
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
@@ -28,10 +29,12 @@ from torch.optim.lr_scheduler import LambdaLR
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
+from lang3dxl_ns.older_config import ReadsOlder
+from lang3dxl_ns.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.query.scene_file import SCENE_FILE
 from lang3dxl_ns.run_state import restore_run_state, run_state
-from lang3dxl_ns.scene_loading import describe_scene
+from lang3dxl_ns.saved_config import read_config
+from lang3dxl_ns.scene_loading import check_checkpoint, describe_scene
 from lang3dxl_ns.scene_needs import read_needs, write_needs
 from lang3dxl_ns.step_guard import StepGuard
 
@@ -39,6 +42,16 @@ SHORT_RUN = 1_000
 """Iterations of a run that takes the short-run rates."""
 LONG_RUN = 30_000
 """Iterations of a run that takes the published rates."""
+_NOT_A_CHECKPOINT = (
+    RuntimeError,
+    EOFError,
+    OSError,
+    pickle.UnpicklingError,
+    LookupError,
+    ValueError,
+    AssertionError,
+)
+"""What torch and the components raise for a file that is none."""
 
 
 def run_length_weight(iterations: int) -> float:
@@ -111,7 +124,7 @@ class RunSchedule(Scheduler):
 
 
 @dataclass
-class Lang3DXLTrainerConfig(TrainerConfig):
+class Lang3DXLTrainerConfig(ReadsOlder, TrainerConfig):
     """Training configuration; `--max-num-iterations` alone rescales every schedule."""
 
     _target: type = field(default_factory=lambda: Lang3DXLTrainer)
@@ -130,9 +143,24 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         super().set_timestamp()
         self.fit_to_run()
 
+    def get_checkpoint_dir(self) -> Path:
+        """Folder of the checkpoints. Every command that loads a run asks for it: the place to look at the
+        latest one. Raises UserError where that one is damaged."""
+        folder = super().get_checkpoint_dir()
+        print_user_errors_plainly()
+        check_checkpoint(folder)
+        return folder
+
     def fit_to_run(self) -> None:
         """Settle rates, schedules and presets for this number of iterations; make paths absolute, so
         that config.yml is complete and can be read from any folder."""
+        if self.machine.num_devices * self.machine.num_machines > 1:
+            print_user_errors_plainly()
+            raise UserError(
+                "training runs on one device: densification changes how many parameters there are, which "
+                "torch's DistributedDataParallel does not follow. Leave --machine.num-devices at 1; several "
+                "GPUs prepare targets (lang3dxl prepare --workers N), and several scenes train side by side"
+            )
         iterations = self.max_num_iterations
         for group in self.optimizers.values():
             if isinstance(group["optimizer"], RunAdamConfig):
@@ -158,7 +186,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         """A resumed run keeps what `auto` meant when it began."""
         if not (run / "config.yml").is_file():
             return
-        earlier = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader).pipeline.model
+        earlier: Any = read_config(run / "config.yml").pipeline
+        earlier = earlier.model
         needs, mine = read_needs(run), self.pipeline.model
         for part in ("semantic_field", "appearance"):
             if getattr(mine, part).preset == "auto":
@@ -228,17 +257,25 @@ class Lang3DXLTrainer(Trainer):
             restore_run_state(self.pipeline, self._run_state)
 
     def _load_checkpoint(self) -> None:
-        """As nerfstudio's, and keep the state of the run for when everything is set up."""
+        """As nerfstudio's, and keep the state of the run for when everything is set up. Raises UserError for
+        a checkpoint that is damaged, or no checkpoint."""
         path = self._checkpoint_to_load()
         if path is None:
             return
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        self._start_step = state["step"] + 1
-        self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        self.optimizers.load_optimizers(state["optimizers"])
-        if self.config.load_scheduler:
-            self.optimizers.load_schedulers(state["schedulers"])
-        self.grad_scaler.load_state_dict(state["scalers"])
+        check_checkpoint(path)
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+            self._start_step = state["step"] + 1
+            self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            self.optimizers.load_optimizers(state["optimizers"])
+            if self.config.load_scheduler:
+                self.optimizers.load_schedulers(state["schedulers"])
+            self.grad_scaler.load_state_dict(state["scalers"])
+        except _NOT_A_CHECKPOINT as error:
+            raise UserError(
+                f"there is no checkpoint of lang3dxl in {path} ({error}): give --load-dir the "
+                "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
+            ) from error
         self._run_state = state.get("run")  # absent from checkpoints of earlier versions
         CONSOLE.log(f"Loaded {path}")
 
@@ -259,7 +296,7 @@ class Lang3DXLTrainer(Trainer):
 
     def setup_optimizers(self) -> Optimizers:
         """The optimisers, with the guard before them."""
-        self.guard = StepGuard(self.config.max_skipped_steps, CONSOLE.log)
+        self.guard = StepGuard(self.config.max_skipped_steps, lambda message: CONSOLE.log(escape(message)))
         groups = self.pipeline.get_param_groups()
         return GuardedOptimizers(self.config.optimizers.copy(), groups, self._step_is_sound)
 
@@ -295,7 +332,7 @@ class Lang3DXLTrainer(Trainer):
             if found := self.pipeline.model.hash_levels.verdict:
                 write_needs([*self.pipeline.datamanager.needs, found], self.base_dir)
             if summary := self.guard.summary():
-                CONSOLE.log(f"[yellow]{summary}")
+                CONSOLE.log(escape(summary))
 
     def train_iteration(self, step: int):
         result = super().train_iteration(step)

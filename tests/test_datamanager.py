@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from lang3dxl_ns.datamanager import PhotoCache, PhotoDataset
+from lang3dxl_ns.datamanager import PhotoDataset
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.geometry import sphere_around, view_matrix
+from lang3dxl_ns.photo_cache import PhotoCache
 from lang3dxl_ns.preparation.physical_scale import read_reconstruction
 
 

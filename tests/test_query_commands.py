@@ -10,6 +10,7 @@ from PIL import Image
 
 from lang3dxl_ns import cli, scene_loading
 from lang3dxl_ns.files import slugs
+from lang3dxl_ns.query_commands import file_names
 
 
 @pytest.fixture
@@ -115,6 +116,13 @@ def test_folder_names_are_safe_and_differ():
     texts = ["Rose window", "rose-window", "🙂", "../../etc", "окно", "x" * 500]
     names = slugs(texts)
     assert names == ["rose-window", "rose-window-2", "text-3", "etc", "окно", "x" * 40]
+
+
+def test_photos_of_one_stem_do_not_overwrite_each_other():
+    assert file_names(["a/b.jpg", "c.jpg"]) == ["a_b", "c"]
+    assert file_names(["a.jpg", "a.png", "../c.d.jpg"]) == ["a_jpg", "a_png", ".._c.d"]
+    names = file_names(["a/b.jpg", "a_b.jpg", "a/b.png"])
+    assert len(set(names)) == 3
 
 
 @pytest.fixture

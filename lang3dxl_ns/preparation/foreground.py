@@ -10,7 +10,7 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
@@ -61,12 +61,26 @@ def with_foreground(
     without = [photo.name for photo in masked if photo.mask_path is None]
     if 0 < len(without) < len(masked):
         log(f"{len(without)} of {len(masked)} photos have no mask and count whole: {some(without)}")
+    for path, names in _shared_masks(masked).items():
+        log(
+            f"{path} is the mask of {len(names)} photos, {some(names)}: where it belongs to one, name it "
+            f"like {path.parent / (PurePosixPath(names[0]).name + path.suffix)}"
+        )
     return masked
 
 
-def find_mask(folder: Path, name: str) -> Path | None:
+def _shared_masks(photos: Sequence[Photo]) -> dict[Path, list[str]]:
+    """Masks that several photos take, since these differ in their suffix alone, and the photos."""
+    names: dict[Path, list[str]] = {}
+    for photo in photos:
+        if photo.mask_path is not None:
+            names.setdefault(photo.mask_path, []).append(photo.name)
+    return {path: sharing for path, sharing in names.items() if len(sharing) > 1}
+
+
+def find_mask(folder: Path, name: str, follow_links: bool = False) -> Path | None:
     """A photo's mask in a folder: named like the photo, as PNG or JPEG."""
-    return companion(folder, name, MASK_SUFFIXES)
+    return companion(folder, name, MASK_SUFFIXES, follow_links)
 
 
 def _from_folder(photos: Sequence[Photo], folder: Path) -> list[Photo]:

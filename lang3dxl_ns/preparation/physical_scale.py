@@ -17,6 +17,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.preparation.model_files import check_binary_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -115,6 +116,16 @@ def read_reconstruction(model_dir: Path) -> Reconstruction:
         points=np.array(list(positions.values()), dtype=np.float64).reshape(-1, 3),
         colours=np.array([point.color for point in points.values()], dtype=np.uint8).reshape(-1, 3),
     )
+
+
+def photos_in_model(model_dir: Path) -> int:
+    """How many photos a COLMAP model has, without reading it: its images file begins with, or lists, them."""
+    binary, text = model_dir / "images.bin", model_dir / "images.txt"
+    if binary.is_file():
+        with binary.open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    with text.open(errors="replace") as lines:
+        return sum(not line.startswith("#") for line in lines) // 2  # a line of keypoints follows each
 
 
 def points_in_view(points: Float[Array, "m 3"], photo: PhotoGeometry) -> Float[Array, "k 3"]:
@@ -279,9 +290,10 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
             "folder that holds them (usually sparse/0), or make one: "
             "colmap automatic_reconstructor --workspace_path SCENE --image_path SCENE/images"
         )
+    check_binary_model(folder)
     try:
         return pycolmap.Reconstruction(folder)
-    except (ValueError, IndexError, RuntimeError) as error:
+    except (ValueError, IndexError, RuntimeError, UnicodeDecodeError, MemoryError) as error:
         raise UserError(f"the COLMAP model in {folder} is damaged, copy or make it again: {error}") from error
 
 

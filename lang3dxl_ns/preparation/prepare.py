@@ -1,4 +1,4 @@
-"""Makes and reads the targets of a scene: CLIP grids, dense features and regions, one photo after the other.
+"""Makes the targets of a scene: CLIP grids, dense features and regions, one photo after the other.
 
 Every entry carries the settings that made it. A second run makes only what is missing or was made with other
 settings, so a run that was stopped, at any moment, is simply started again.
@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Collection, Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.errors import UserError
@@ -32,12 +34,18 @@ from lang3dxl_ns.preparation.progress import progress, say, some
 from lang3dxl_ns.preparation.pyramid import build_clip_target, crop_centres
 from lang3dxl_ns.preparation.regions import RegionLevel, RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.store import FeatureStore
-
-CLIP, DENSE, REGIONS = "clip", "dense", "regions"
+from lang3dxl_ns.preparation.targets import CLIP, DENSE, REGIONS, TargetReader
+from lang3dxl_ns.preparation.workers import Workers
 
 _CROP_RULE = 1
 """Raised when the crops or their average change: entries made by an older rule are then made again."""
-_STD_FLOOR = 0.01
+_CHECKERS = 4
+"""Threads."""
+_PATIENCE_S = 1.0
+"""Between looks at photos that another process is making."""
+_BUSY = "another process is making it"
+_CROP_PIXELS = 224**2
+"""Of a crop as CLIP takes it."""
 
 
 @dataclass
@@ -70,6 +78,13 @@ class PreparationConfig:
     disk and over four times the time."""
     crop_batch: int = 256
     """Crops encoded at once: more are faster on a GPU, and take more of its memory."""
+    workers: int = 1
+    """Processes that encode photos: on one machine, each with its own copy of the encoders and, with several
+    GPUs, a GPU in turn."""
+    engine: Literal["local", "ray"] = "local"
+    """What runs them: this machine, or a Ray cluster that sees the same folders (extra [ray])."""
+    address: str | None = None
+    """Of the Ray cluster, such as auto or ray://HOST:10001. Left out: one is started on this machine."""
     foreground: str = "auto"
     """Where photos count: "auto" (masks/ in the data folder, where there is one), "none" (everywhere), "text"
     (where a model sees the prompts), or a folder of masks, white = keep, named like the photos."""
@@ -90,99 +105,6 @@ class PreparationConfig:
 
 
 @dataclass
-class StoredClipTarget:
-    """A photo's CLIP target, mapped from disk: float16, CPU."""
-
-    features: Float[Tensor, "hd wd c"]
-    """Mean embedding over the scales, not normalised."""
-    valid: Float[Tensor, "hd wd"]
-    """Mean fraction of the crops' area inside the photo, 0…1."""
-    crop_fractions: list[float]
-    """Crop sides as fractions of the photo's width, ascending."""
-
-    @property
-    def range_factor(self) -> float:
-        """Largest over smallest crop."""
-        return self.crop_fractions[-1] / self.crop_fractions[0]
-
-
-@dataclass
-class ChannelStatistics:
-    """Mean and standard deviation per channel; the deviation is floored at 1 % of the channels' average."""
-
-    mean: Float[Tensor, " c"]
-    std: Float[Tensor, " c"]
-
-
-@dataclass
-class FeatureStatistics:
-    """Of the CLIP and the dense targets, for whitening the field's output."""
-
-    clip: ChannelStatistics
-    dense: ChannelStatistics | None
-
-
-class TargetReader:
-    """The prepared targets of a scene's photos, by photo name; nothing is loaded before it is touched."""
-
-    def __init__(
-        self,
-        store: FeatureStore,
-        names: Sequence[str],
-        with_dense: bool = True,
-        with_regions: Collection[str] = (),
-    ) -> None:
-        self.names = list(names)
-        self._store, self._with_dense, self._with_regions = store, with_dense, frozenset(with_regions)
-        self.clip_dim: int = store.shapes(CLIP, self.names[0])["features"][-1]
-        self.dense_dim: int = store.shapes(DENSE, self.names[0])["features"][-1] if with_dense else 0
-
-    def clip(self, name: str) -> StoredClipTarget:
-        """The CLIP target of a photo. Raises UserError when it isn't prepared."""
-        settings = self._store.settings(CLIP, name)
-        width = settings["size"][0]
-        return StoredClipTarget(
-            **self._store.read(CLIP, name), crop_fractions=[side / width for side in settings["crop_sides"]]
-        )
-
-    def clip_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "hd wd c"]]:
-        """The CLIP targets of photos, one at a time, float16."""
-        return (self.clip(name).features for name in names)
-
-    def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
-        """The dense features of the squashed photo, float16; None when prepared without."""
-        return self._store.read(DENSE, name)["features"] if self._with_dense else None
-
-    def regions(self, name: str) -> Int[Tensor, "h w"] | None:
-        """Region labels of the photo, −1 for none; None (and nothing is read) for a photo without regions."""
-        return self._store.read(REGIONS, name)["labels"] if name in self._with_regions else None
-
-    def check(self, encoder: ImageTextEncoder) -> None:
-        """Raises UserError when a photo's target is missing or comes from another CLIP than `encoder`."""
-        for name in self.names:
-            width = self._store.shapes(CLIP, name)["features"][-1]
-            made_with = self._store.settings(CLIP, name)["encoder"]
-            if (width, made_with) != (encoder.dim, encoder.identity):
-                raise UserError(
-                    f"the target of {name} has {width} channels and was made with another CLIP ({made_with}) "
-                    f"than the one in use, which has {encoder.dim} ({encoder.identity}): run "
-                    f"`lang3dxl prepare` again, or give {CLIP_OPTION} the model that made the targets"
-                )
-
-    def feature_statistics(self, names: Sequence[str] | None = None, sample: int = 100) -> FeatureStatistics:
-        """Mean and deviation per channel over at most `sample` photos, evenly spaced in `names` (or all)."""
-        names = self.names if names is None else list(names)
-        names = names[:: -(-len(names) // sample)]
-        clip = _statistics(self.clip(name).features for name in names)
-        dense = (
-            _statistics(self._store.read(DENSE, name)["features"] for name in names)
-            if self._with_dense
-            else None
-        )
-        return FeatureStatistics(clip, dense)
-
-
-@dataclass
 class PreparedTargets:
     """What a preparation left behind."""
 
@@ -196,7 +118,7 @@ class PreparedTargets:
 
 @dataclass
 class _Task:
-    """What a photo needs, and the settings of the entries to be made; None where the entry is current."""
+    """What a photo needs, and the settings of the entries to be made; None where there is nothing to do."""
 
     photo: Photo
     sides: list[int]
@@ -209,6 +131,13 @@ class _Task:
     @property
     def is_done(self) -> bool:
         return self.clip is None and self.dense is None and self.regions is None
+
+    def drop_current(self, store: FeatureStore) -> None:
+        """Forget the entries that the store has by now."""
+        for kind in (CLIP, DENSE, REGIONS):
+            settings = getattr(self, kind)
+            if settings is not None and store.is_current(kind, self.photo.name, settings):
+                setattr(self, kind, None)
 
 
 def prepare(
@@ -257,28 +186,31 @@ def _plan(
     """A task per photo; photos whose file can't be read go to `left_out`."""
     clip_model = find_model(config.clip, CLIP_OPTION).identity
     dense_model = None if config.dense == "none" else find_model(config.dense, DENSE_OPTION).identity
+
+    def plan_one(photo: Photo) -> _Task | UserError:
+        try:
+            source = _source(photo)
+        except UserError as error:
+            return error
+        pixel_size = 1 / photo.width if pixel_sizes is None else pixel_sizes[photo.name]
+        sides, sizes = crop_sides(scales, pixel_size, photo.width)
+        clip = {**source, "encoder": clip_model, "crop_sides": sides, "rule": _CROP_RULE}
+        dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if dense_model else None
+        labels = None if regions is None else regions.settings(photo)
+        settings = None if labels is None else {**source, **labels}
+        task = _Task(photo, sides, sizes, clip, dense, settings, has_regions=labels is not None)
+        task.drop_current(store)
+        return task
+
     tasks = []
-    with progress("checking photos", len(photos)) as advance:
-        for photo in photos:
+    # Reading and hashing files, which threads do side by side.
+    with ThreadPoolExecutor(_CHECKERS) as pool, progress("checking photos", len(photos)) as advance:
+        for photo, planned in zip(photos, pool.map(plan_one, photos), strict=True):
             advance()
-            try:
-                source = _source(photo)
-            except UserError as error:
-                left_out[photo.name] = str(error)
-                continue
-            pixel_size = 1 / photo.width if pixel_sizes is None else pixel_sizes[photo.name]
-            sides, sizes = crop_sides(scales, pixel_size, photo.width)
-            clip = {**source, "encoder": clip_model, "crop_sides": sides, "rule": _CROP_RULE}
-            dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens}
-            labels = None if regions is None else regions.settings(photo)
-            task = _Task(photo, sides, sizes, None, None, None, has_regions=labels is not None)
-            if not store.is_current(CLIP, photo.name, clip):
-                task.clip = clip
-            if dense_model and not store.is_current(DENSE, photo.name, dense):
-                task.dense = dense
-            if labels is not None and not store.is_current(REGIONS, photo.name, {**source, **labels}):
-                task.regions = {**source, **labels}
-            tasks.append(task)
+            if isinstance(planned, UserError):
+                left_out[photo.name] = str(planned)
+            else:
+                tasks.append(planned)
     without = [task.photo.name for task in tasks if not task.has_regions]
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
@@ -301,21 +233,71 @@ def _make(
     regions: RegionSource | None,
     left_out: dict[str, str],
 ) -> None:
-    """Loads the models that are needed and writes the missing entries, photo by photo."""
+    """Writes the missing entries, photo by photo, in as many processes as asked for."""
     with_clip, with_dense = any(task.clip for task in missing), any(task.dense for task in missing)
-    clip = load_image_text_encoder(config.clip, device) if with_clip else None
-    dense = load_dense_encoder(config.dense, device, config.dense_tokens) if with_dense else None
+    maker = _Maker(config, store, regions, with_clip, with_dense)
     store.remove_leftovers()
-    _announce(missing, photos, _bytes_needed(missing, clip, dense), store)
+    _announce(missing, photos, _bytes_needed(missing, *maker.models(str(device))), config, store)
+    workers = Workers(config.workers, config.engine, config.address)
     with progress("encoding photos", len(missing)) as advance:
-        for task in missing:
-            try:
-                image = task.photo.read()  # once for all kinds
-            except UserError as error:
-                left_out[task.photo.name] = str(error)
-            else:
-                _encode(task, image.to(device), clip, dense, regions, config.crop_batch, store)
-            advance()
+        while missing:
+            busy = []
+            for task, trouble in workers.run(maker, missing, str(device)):
+                if trouble == _BUSY:
+                    busy.append(task)
+                    continue
+                if trouble:
+                    left_out[task.photo.name] = trouble
+                advance()
+            missing, workers = busy, Workers()  # the few that another command is at: wait for it here
+            if busy:
+                time.sleep(_PATIENCE_S)
+
+
+@dataclass
+class _Maker:
+    """What a worker needs to make entries."""
+
+    config: PreparationConfig
+    store: FeatureStore
+    regions: RegionSource | None
+    with_clip: bool
+    with_dense: bool
+    _models: tuple[ImageTextEncoder | None, DenseEncoder | None] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_models": None}  # every process loads its own
+
+    def models(self, device: str) -> tuple[ImageTextEncoder | None, DenseEncoder | None]:
+        """The encoders that are needed; loaded once."""
+        if self._models is None:
+            c = self.config
+            clip = load_image_text_encoder(c.clip, device) if self.with_clip else None
+            dense = load_dense_encoder(c.dense, device, c.dense_tokens) if self.with_dense else None
+            self._models = clip, dense
+        return self._models
+
+    def start(self, device: str) -> Callable[[_Task], str | None]:
+        """As `workers.Maker.start`. The work returns why a photo can't be used, or that another process is
+        at it, or None."""
+        clip, dense = self.models(device)
+
+        def work(task: _Task) -> str | None:
+            with self.store.claim(task.photo.name) as is_ours:
+                if not is_ours:
+                    return _BUSY
+                task.drop_current(self.store)  # another process may have made it meanwhile
+                if task.is_done:
+                    return None
+                try:
+                    image = task.photo.read()  # once for all kinds
+                except UserError as error:
+                    return str(error)
+                batch = self.config.crop_batch
+                _encode(task, image.to(device), clip, dense, self.regions, batch, self.store)
+                return None
+
+        return work
 
 
 def _encode(
@@ -356,9 +338,11 @@ def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: 
     return total
 
 
-def _announce(missing: list[_Task], photos: int, needed: int, store: FeatureStore) -> None:
-    """Says what is going to be made. Raises UserError when the disk is too small for it."""
-    store.root.mkdir(parents=True, exist_ok=True)
+def _announce(
+    missing: list[_Task], photos: int, needed: int, config: PreparationConfig, store: FeatureStore
+) -> None:
+    """Says what is going to be made, and what it takes. Raises UserError when the disk is too small."""
+    store.make_folder()
     free = shutil.disk_usage(store.root).free
     if needed > free:
         raise UserError(
@@ -370,22 +354,19 @@ def _announce(missing: list[_Task], photos: int, needed: int, store: FeatureStor
         f"preparing {len(missing)} photos ({photos - len(missing)} of {photos} are ready): "
         f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free"
     )
+    memory = config.workers * _memory_needed([task.photo for task in missing], config.crop_batch)
+    say(
+        f"memory beside the encoders: about {_gigabytes(memory)}"
+        + (f" in {config.workers} processes" if config.workers > 1 else "")
+        + ", whatever the number of photos"
+    )
 
 
-def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:
-    """Statistics over all pixels of all maps, merged map by map in float64 (Chan, Golub & LeVeque 1983)."""
-    count, mean, squares = 0, torch.zeros(()), torch.zeros(())
-    for values in maps:
-        pixels = values.flatten(0, 1).double()
-        variance, own_mean = torch.var_mean(pixels, dim=0, correction=0)
-        both = count + len(pixels)
-        step = own_mean - mean
-        mean = mean + step * len(pixels) / both
-        squares = squares + variance * len(pixels) + step**2 * count * len(pixels) / both
-        count = both
-    std = (squares / count).sqrt()
-    floor = max(_STD_FLOOR * float(std.mean()), torch.finfo(torch.float32).eps)
-    return ChannelStatistics(mean.float(), std.clamp_min(floor).float())
+def _memory_needed(photos: Sequence[Photo], crop_batch: int) -> int:
+    """Of one process, about: the largest photo in float32, thrice (as read, padded, cut into windows), and a
+    batch of crops with the first layers' activations, a dozen times its size."""
+    largest = max(photo.width * photo.height for photo in photos)
+    return 3 * 4 * (3 * largest + 12 * crop_batch * _CROP_PIXELS)
 
 
 def _gigabytes(size: int) -> str:

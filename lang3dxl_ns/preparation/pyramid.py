@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lang3dxl_ns.memory import with_less_memory
+
 
 @dataclass
 class ClipTarget:
@@ -111,9 +113,14 @@ def _encode_scale(
     crop_size: int,
     batch_size: int,
 ) -> Float[Tensor, "c+1 ny nx"]:
-    """The embeddings of one scale as a grid, with the valid fraction as a last channel."""
-    batches = iterate_crops(photo, side, crop_size, batch_size)
-    features = torch.cat([encode(crops).float() for crops in batches])
+    """The embeddings of one scale as a grid, with the valid fraction as a last channel; in smaller batches
+    where memory doesn't suffice."""
+    features = with_less_memory(
+        lambda batch: torch.cat(
+            [encode(crops).float() for crops in iterate_crops(photo, side, crop_size, batch)]
+        ),
+        batch_size,
+    )
     valid = valid_fractions(photo.shape[0], photo.shape[1], side).to(features)
     return torch.cat([features.T.unflatten(1, valid.shape), valid[None]])
 

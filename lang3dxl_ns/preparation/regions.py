@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from functools import cached_property
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -153,7 +154,7 @@ def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
         else:
             with Image.open(path) as picture:
                 labels, first = np.asarray(picture), 1
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, EOFError, MemoryError, TokenError) as error:
         raise UserError(
             f"regions of {name}: can't read {path} ({error}): make it again, or remove it"
         ) from error

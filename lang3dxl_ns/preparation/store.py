@@ -9,9 +9,9 @@ import json
 import logging
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 from torch import Tensor
@@ -22,6 +22,8 @@ from lang3dxl_ns.files import write_atomically
 logger = logging.getLogger(__name__)
 
 _HALF_MAX = torch.finfo(torch.float16).max
+_ENTRIES = (".safetensors", ".png")
+"""Targets, and masks."""
 _LEFTOVER_AGE_S = (
     3600.0  # a write takes seconds: an older temporary file belongs to a process that was killed
 )
@@ -51,14 +53,30 @@ class FeatureStore:
         from safetensors.torch import save
 
         stored = {key: _compact(tensor, f"{key} of {name} ({kind})") for key, tensor in tensors.items()}
-        content = save(stored, metadata={"settings": _canonical(settings)})
+        metadata = {"settings": _canonical(settings), "checksum": _checksum(stored)}
+        content = save(stored, metadata=metadata)
         self.write_bytes(self.path(kind, name), content, f"{name} ({kind})")
 
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
-        """Writes a file of the store, atomically. Raises UserError when the disk is full."""
-        try:
+        """Writes a file of the store, atomically. Raises UserError when the disk is full or read-only."""
+        with self._writable(what):
             write_atomically(path, content)
+
+    def make_folder(self) -> None:
+        """Raises UserError where the disk is full or read-only."""
+        with self._writable("its folder"):
+            self.root.mkdir(parents=True, exist_ok=True)
+
+    @contextlib.contextmanager
+    def _writable(self, what: str) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
+            if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+                raise UserError(
+                    f"{self.root} can't be written to ({error.strerror}): keep the targets elsewhere with "
+                    "--pipeline.datamanager.cache-dir DIR (`lang3dxl prepare`: --cache-dir DIR)"
+                ) from error
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             raise UserError(
@@ -86,18 +104,44 @@ class FeatureStore:
             return json.loads(file.metadata()["settings"])
 
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
-        """Whether the entry is there, whole, and made with these settings. A damaged one counts as absent."""
-        if not self.path(kind, name).exists():
+        """Whether the entry is there, whole, and made with these settings. A damaged one counts as absent.
+
+        Reads the whole entry where the settings agree, to compare its checksum.
+        """
+        path = self.path(kind, name)
+        if not path.exists():
             return False
         try:
-            return _canonical(self.settings(kind, name)) == _canonical(settings)
+            with _opened(path, f"{kind} of {name}") as file:
+                metadata = file.metadata()
+                if _canonical(json.loads(metadata["settings"])) != _canonical(settings):
+                    return False
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+                if metadata.get("checksum", "") not in ("", _checksum(tensors)):
+                    raise UserError(f"{path} ({kind} of {name}) is damaged: its checksum differs")
+                return True
         except (UserError, ValueError) as error:
             logger.warning("%s; it will be made again", error)
             return False
 
-    def size(self) -> int:
-        """Bytes on disk, of all entries."""
-        return sum(path.stat().st_size for path in self.root.glob("*/*.safetensors"))
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Files and bytes on disk, by kind."""
+        sizes = {}
+        for folder in sorted(path for path in self.root.glob("*") if path.is_dir()):
+            files = [path for path in folder.iterdir() if path.suffix in _ENTRIES]
+            sizes[folder.name] = (len(files), sum(path.stat().st_size for path in files))
+        return sizes
+
+    def clean(self, kinds: Collection[str], names: Iterable[str]) -> tuple[int, int]:
+        """Deletes all entries but those of these kinds and photos; returns how many, and their bytes."""
+        self.remove_leftovers()
+        keep = {self.path(kind, name).with_suffix("") for name in names for kind in kinds}
+        files, freed = 0, 0
+        for path in self.root.glob("*/*"):
+            if path.suffix in _ENTRIES and path.with_suffix("") not in keep:
+                files, freed = files + 1, freed + path.stat().st_size
+                path.unlink()
+        return files, freed
 
     def remove_leftovers(self) -> None:
         """Deletes the temporary files of processes that were killed while writing."""
@@ -105,6 +149,20 @@ class FeatureStore:
             with contextlib.suppress(FileNotFoundError):  # another process may clean up too
                 if time.time() - path.stat().st_mtime > _LEFTOVER_AGE_S:
                     path.unlink()
+
+    @contextlib.contextmanager
+    def claim(self, name: str) -> Iterator[bool]:
+        """Whether this process alone may make a photo's entries meanwhile; another may be at it.
+
+        The claim of a process that is killed ends with it: it is a lock on a byte of one file. Where the file
+        system knows no locks everybody may; then a photo may be made twice, and one of the results stands.
+        """
+        place = int(hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:12], 16)
+        self.make_folder()
+        with self._writable("its list of claims"):
+            file = (self.root / ".claims").open("ab")
+        with file:
+            yield _lock_byte(file, place)  # closing the file gives it back
 
 
 @contextlib.contextmanager
@@ -118,7 +176,7 @@ def _opened(path: Path, what: str) -> Iterator[Any]:
             yield file
     except FileNotFoundError as error:
         raise UserError(f"{what} is not prepared: {path} does not exist; run `lang3dxl prepare`") from error
-    except SafetensorError as error:
+    except (SafetensorError, ValueError) as error:
         raise UserError(
             f"{path} ({what}) is damaged ({error}): delete it and run `lang3dxl prepare`"
         ) from error
@@ -135,6 +193,28 @@ def _compact(tensor: Tensor, what: str) -> Tensor:
         )
     fits = tensor.numel() == 0 or float(tensor.abs().max()) <= _HALF_MAX
     return tensor.to(torch.float16 if fits else torch.float32)
+
+
+def _checksum(tensors: dict[str, Tensor]) -> str:
+    """Of names, shapes and contents."""
+    digest = hashlib.blake2b(digest_size=16)
+    for key, tensor in sorted(tensors.items()):
+        digest.update(f"{key} {tensor.dtype} {list(tensor.shape)}".encode())
+        digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _lock_byte(file: BinaryIO, place: int) -> bool:
+    """Lock a byte of a file until it is closed; False where another process has it."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return True
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
+    except OSError as error:
+        return error.errno not in (errno.EAGAIN, errno.EACCES)
+    return True
 
 
 def _canonical(settings: dict[str, Any]) -> str:

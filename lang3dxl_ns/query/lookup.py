@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lang3dxl_ns.memory import with_less_memory
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Decode, Queries, cosines_of_codes
 
 _ROWS_AT_ONCE = 1 << 16
@@ -193,7 +194,10 @@ def mark_cells(codes: Float[Tensor, "n d"], size: int, bounded: bool) -> Grid:
 @torch.no_grad()
 def tabulate(decode: Decode, grid: Grid) -> CodeTable:
     """The decoder at the grid's vertices."""
-    features = [F.normalize(decode(part), dim=-1).half() for part in grid.vertices.split(_ROWS_AT_ONCE)]
+    features = with_less_memory(
+        lambda rows: [F.normalize(decode(part), dim=-1).half() for part in grid.vertices.split(rows)],
+        _ROWS_AT_ONCE,
+    )
     places = grid.size, grid.bounded, grid.low, grid.extent, grid.cell_of, grid.corners
     return CodeTable(*places, torch.cat(features))
 

@@ -10,6 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.memory import with_less_memory
+
 CANONICAL = ("object", "things", "stuff", "texture")
 """Phrases that fit anything (LERF): a prompt is found where it fits better than all of these."""
 TEMPERATURE = 10.0
@@ -109,10 +111,13 @@ def cosines_of_codes(
 ) -> Float[Tensor, "n v"]:
     """Exact cosines of rendered codes, decoded a chunk at a time: no feature map of an image ever exists.
 
-    max_mb: memory of a chunk's features, about (three copies of float32 live at once).
+    max_mb: memory of a chunk's features, about (three copies of float32 live at once); less where there is
+    not that much.
     """
     chunk = max(int(max_mb * 2**20 / (3 * 4 * queries.vectors.shape[-1])), 1)
-    return torch.cat([queries.cosines(decode(part)) for part in codes.split(chunk)])
+    return with_less_memory(
+        lambda rows: torch.cat([queries.cosines(decode(part)) for part in codes.split(rows)]), chunk
+    )
 
 
 def relevancy_of_codes(

@@ -112,7 +112,7 @@ class SceneFile:
                 raise ValueError("another version wrote it")
             content["photos"] = [ScenePhoto(**photo) for photo in content["photos"]]
             return cls(**content)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(f"{path} can't be read ({error}): restore it, or train anew") from error
 
     def photo(self, name: str) -> ScenePhoto:

@@ -68,6 +68,7 @@ def test_shrinking_averages_instead_of_skipping(tmp_path):
         ("P", "png"),
         ("RGBA", "png"),
         ("CMYK", "tif"),
+        ("CMYK", "jpg"),
         ("RGB", "webp"),
     ],
 )
@@ -88,6 +89,14 @@ def test_sixteen_bits_are_scaled_not_cut(tmp_path, ending):
     Image.fromarray(ramp).save(tmp_path / f"a.{ending}")
     pixels = make_photo(tmp_path / f"a.{ending}").read()
     assert (pixels[..., 0] - torch.linspace(0, 1, 1200).view(30, 40)).abs().max() < 0.003
+
+
+@pytest.mark.parametrize("ending", ["gif", "webp", "png"])
+def test_of_an_animation_the_first_picture_is_read(tmp_path, ending):
+    first, second = Image.new("RGB", (40, 30), (255, 255, 255)), Image.new("RGB", (40, 30), (0, 0, 0))
+    first.save(tmp_path / f"a.{ending}", save_all=True, append_images=[second])
+    assert Image.open(tmp_path / f"a.{ending}").n_frames == 2
+    assert make_photo(tmp_path / f"a.{ending}").read().min() > 0.95
 
 
 def test_exif_rotation_is_ignored(tmp_path):
@@ -128,11 +137,13 @@ def test_a_file_of_another_shape_is_refused_with_both_sizes(photo, tmp_path):
 def test_unreadable_files_are_named(tmp_path, photo):
     noise = tmp_path / "noise.jpg"
     noise.write_bytes(b"not a picture")
+    empty = tmp_path / "empty.jpg"
+    empty.touch()
     half = tmp_path / "half.png"
     half.write_bytes(photo.path.read_bytes()[:600])
     floats = tmp_path / "floats.tif"
     Image.fromarray(np.zeros((30, 40), np.float32)).save(floats)
-    for path in (noise, half, floats, tmp_path):
+    for path in (noise, empty, half, floats, tmp_path):
         with pytest.raises(UserError, match=rf"{path.name}.*can't read"):
             make_photo(path).read()
     missing = make_photo(tmp_path / "missing.jpg")

@@ -46,7 +46,7 @@ def test_what_is_written_is_read_in_half_precision(store):
         assert torch.equal(tensor, written[key].half())
     assert store.settings("clip", "a.jpg") == SETTINGS
     assert store.shapes("clip", "a.jpg") == {"features": (4, 5, 8), "valid": (4, 5)}
-    assert store.size() == store.path("clip", "a.jpg").stat().st_size
+    assert store.sizes() == {"clip": (1, store.path("clip", "a.jpg").stat().st_size)}
 
 
 def test_whole_numbers_and_views_survive(store):
@@ -218,3 +218,50 @@ def test_reading_a_slice_does_not_load_the_entry(store):
     assert resident() < 8 * 2**20
     assert features.sum() == 0
     assert resident() > 60 * 2**20  # the measurement sees what is touched
+
+
+def test_a_bit_that_flipped_makes_an_entry_damaged_and_entries_without_checksum_still_count(store, caplog):
+    from safetensors.torch import save_file
+
+    store.write("clip", "a.jpg", entry(), SETTINGS)
+    path = store.path("clip", "a.jpg")
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 1
+    path.write_bytes(content)
+    assert not store.is_current("clip", "a.jpg", SETTINGS)
+    assert "its checksum differs" in caplog.text
+    save_file({"x": torch.ones(2)}, path, {"settings": '{"made": "before checksums"}'})
+    assert store.is_current("clip", "a.jpg", {"made": "before checksums"})
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_claim_is_one_processs_alone_and_ends_with_it(store):
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with store.claim("a.jpg") as ours:
+            os.write(writing, b"1" if ours else b"0")
+            time.sleep(60)
+        os._exit(0)
+    assert os.read(reading, 1) == b"1"
+    with store.claim("a.jpg") as ours:
+        assert not ours
+    with store.claim("b.jpg") as ours:
+        assert ours
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    with store.claim("a.jpg") as ours:
+        assert ours
+
+
+def test_cleaning_keeps_what_is_named_and_reports_what_went(store):
+    for kind in ("clip", "dense"):
+        for name in ("a.jpg", "b.jpg"):
+            store.write(kind, name, entry(), SETTINGS)
+    mask = store.path("foreground", "a.jpg").with_suffix(".png")
+    store.write_bytes(mask, b"mask", "a mask")
+    going = store.path("clip", "b.jpg").stat().st_size + 4
+    going += sum(store.path("dense", name).stat().st_size for name in ("a.jpg", "b.jpg"))
+    assert store.clean(["clip"], ["a.jpg"]) == (4, going)
+    assert files(store) == [store.path("clip", "a.jpg").name]
+    assert store.sizes()["dense"] == (0, 0)

@@ -1,0 +1,166 @@
+"""Work on many items at once: in this process, in several of this machine, or on a Ray cluster.
+
+Which item goes where is left to Python's process pool, or to Ray.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import get_context, parent_process
+from typing import Any, Generic, Literal, Protocol, TypeVar
+
+import torch
+
+from lang3dxl_ns.errors import UserError
+
+Item = TypeVar("Item", contravariant=True)
+Result = TypeVar("Result", covariant=True)
+
+
+class Maker(Protocol[Item, Result]):
+    """What a worker needs to begin; can be sent to another process."""
+
+    def start(self, device: str) -> Callable[[Item], Result]:
+        """Load what the work needs on a device, once per worker."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who does the work."""
+
+    count: int = 1
+    """Processes."""
+    engine: Literal["local", "ray"] = "local"
+    """Processes of this machine, or of a Ray cluster (which must see the same folders)."""
+    address: str | None = None
+    """Of the Ray cluster; None starts one on this machine."""
+
+    def run(
+        self, maker: Maker[Item, Result], items: Sequence[Item], device: str
+    ) -> Iterator[tuple[Item, Result]]:
+        """Every item with its result, as they are done. Raises what the work raises, and UserError when a
+        process dies: what is done by then is kept."""
+        if self.engine == "ray":
+            return _run_on_ray(self, maker, items, device)
+        if self.count <= 1 or len(items) <= 1:
+            return _run_here(maker, items, device)
+        return _run_in_processes(self.count, maker, items, device)
+
+
+def _run_here(maker: Maker[Item, Result], items: Sequence[Item], device: str):
+    work = maker.start(device)
+    for item in items:
+        yield item, work(item)
+
+
+# --- processes of this machine ----------------------------------------------------------------------------
+
+_work: Any = None
+"""A worker process's own."""
+
+
+def _run_in_processes(count: int, maker: Maker[Item, Result], items: Sequence[Item], device: str):
+    context = get_context("spawn")  # a forked process can't use CUDA
+    turn = context.Value("i", 0)
+    pool = ProcessPoolExecutor(
+        count, mp_context=context, initializer=_start, initargs=(maker, device, count, turn)
+    )
+    try:
+        futures = {pool.submit(_do, item): item for item in items}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BrokenProcessPool as error:
+        raise UserError(
+            f"one of the {count} processes ended before its time, perhaps because memory ran out: what they "
+            "have made is kept; run the same command again, with fewer --workers"
+        ) from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _start(maker: Maker, device: str, count: int, turn: Any) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of them; the first process decides
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with turn.get_lock():
+        number, turn.value = turn.value, turn.value + 1
+    global _work
+    _work = maker.start(_device(device, number, count))
+
+
+def _end_with_parent() -> None:
+    """A process whose parent was killed would wait for ever."""
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _do(item: Any) -> Any:
+    return _work(item)
+
+
+def _device(device: str, number: int, count: int) -> str:
+    """The worker's share of the machine: a GPU in turn, or some of the cores."""
+    if device.startswith("cuda"):
+        return f"cuda:{number % torch.cuda.device_count()}"
+    torch.set_num_threads(max(torch.get_num_threads() // count, 1))
+    return device
+
+
+# --- a Ray cluster -----------------------------------------------------------------------------------------
+
+
+class _Actor(Generic[Item, Result]):
+    """A worker on a cluster. Ray starts another one in place of one that died, and repeats its item."""
+
+    def __init__(self, maker: Maker[Item, Result], device: str) -> None:
+        self._work = maker.start(device)
+
+    def do(self, item: Item) -> Result:
+        return self._work(item)
+
+
+def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[Item], device: str):
+    try:
+        import ray
+    except ImportError as error:
+        raise UserError("--engine ray needs Ray: pip install 'lang3dxl-ns[ray]'") from error
+    started = not ray.is_initialized()
+    if started:
+        _connect(ray, workers)
+    try:
+        resources = {"num_gpus": 1} if device.startswith("cuda") else {"num_cpus": 1}
+        remote: Any = ray.remote(_Actor)
+        actor = remote.options(max_restarts=-1, max_task_retries=-1, **resources)
+        idle = [actor.remote(maker, device) for _ in range(workers.count)]
+        waiting, busy = list(reversed(items)), dict[Any, Any]()
+        while waiting or busy:
+            while waiting and idle:
+                item, worker = waiting.pop(), idle.pop()
+                busy[worker.do.remote(item)] = item, worker
+            (done,), _ = ray.wait(list(busy))
+            item, worker = busy.pop(done)
+            idle.append(worker)
+            yield item, ray.get(done)
+    finally:
+        if started:
+            ray.shutdown()
+
+
+def _connect(ray: Any, workers: Workers) -> None:
+    try:
+        # A cluster of our own listens on this machine alone.
+        own = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+        settings = {"address": workers.address} if workers.address else own
+        ray.init(log_to_driver=False, **settings)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise UserError(
+            f"no Ray cluster answers at {workers.address or 'this machine'} ({error}): give --address, or "
+            "start one with `ray start --head`"
+        ) from error

@@ -1,0 +1,192 @@
+"""Whether memory and time stay put as a scene grows: generated photos by the thousand, the real pipeline."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from lang3dxl_ns.evaluation.report import (
+    command_line,
+    describe_machine,
+    host_peak,
+    markdown_table,
+    write_report,
+)
+
+PREDICTION = """Written before measuring. *Photos*: preparation holds one photo, one batch of crops and the
+encoders: constant. Training holds the cache (here `cache_gb`), what is read ahead, the Gaussians and one
+step: it grows until the cache is full and is constant from there on, but for the model's tracks (about 100
+bytes per observation) and a few kilobytes per photo of bookkeeping, 20 MB from 200 to 2,000 photos. The time
+of a step does not depend on the number of photos; out of core it may take 10 % longer, since another thread
+decodes photos meanwhile. *Gaussians*: 62 numbers each (59 of 3D Gaussian splatting and a code of 3), with
+gradients and Adam's two moments, are 1 kB each; a step's memory grows linearly on top of a constant of the
+decoder's maps, its time linearly or less."""
+
+
+@dataclass
+class ScaleBenchmark:
+    """Prepare, train and evaluate generated scenes of ever more photos, and of ever more Gaussians."""
+
+    out: Path
+    """Folder for scale.md, scale.json and the scenes (deleted when measured)."""
+    photos: tuple[int, ...] = (200, 500, 1000, 2000)
+    """Numbers of photos."""
+    gaussians: tuple[int, ...] = (10_000, 50_000, 100_000, 400_000)
+    """Numbers of Gaussians, with the fewest photos."""
+    steps: int = 60
+    """Training steps of each run with photos."""
+    gaussian_steps: int = 5
+    """Training steps of each run with Gaussians."""
+    cache_gb: float = 0.01
+    """Memory for photos and targets: small, so that it is full with the fewest photos already."""
+    workers: int = 1
+    """Processes that prepare."""
+
+    def main(self) -> None:
+        """Each measurement has a process of its own, so that its peak memory is its own."""
+        rows: dict[str, list[dict[str, Any]]] = {"photos": [], "gaussians": []}
+        for count in self.photos:
+            scene = _Measured(
+                self.out / f"photos-{count}", count, 2_000, self.steps, self.cache_gb, self.workers
+            )
+            rows["photos"].append(_in_own_process(scene))
+            if count == min(self.photos):
+                rows["photos"][-1]["in memory"] = _in_own_process(replace(scene, cache_gb=1e3))
+            shutil.rmtree(scene.folder)
+            self._write(rows)
+        for count in self.gaussians:
+            scene = _Measured(self.out / f"gaussians-{count}", 20, count, self.gaussian_steps, self.cache_gb)
+            rows["gaussians"].append(_in_own_process(scene))
+            shutil.rmtree(scene.folder)
+            self._write(rows)
+        print(f"Wrote {self.out / 'scale.md'}")
+
+    def _write(self, rows: dict[str, list[dict[str, Any]]]) -> None:
+        write_report(self.out, "scale", markdown(self, rows), rows)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    folder: Path
+    photos: int
+    points: int
+    steps: int
+    cache_gb: float
+    workers: int = 1
+
+
+def _in_own_process(scene: _Measured) -> dict[str, Any]:
+    os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # the other check keeps forks from using CUDA
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["lang3dxl_ns.methods", "pycolmap", "transformers"])
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_measure, scene).result()
+
+
+def _measure(scene: _Measured) -> dict[str, Any]:
+    """Seconds and peak memory (bytes above the process with everything imported) of each part."""
+    from lang3dxl_ns import timing
+    from lang3dxl_ns.demo.crowd import write_crowd
+    from lang3dxl_ns.methods import run_config
+    from lang3dxl_ns.preparation.encoders import BUILTIN
+    from lang3dxl_ns.trainer import Lang3DXLTrainer
+
+    data = scene.folder / "scene"
+    if not data.exists():
+        write_crowd(data, scene.photos, scene.points)
+    config = run_config(data, scene.folder / "runs", "scale", scene.steps, BUILTIN, BUILTIN)
+    config.pipeline.datamanager.cache_gb = scene.cache_gb
+    config.pipeline.datamanager.workers = scene.workers
+    config.pipeline.datamanager.scale_mode = "relative"
+    config.pipeline.datamanager.scale_range = (0.4, 0.4)
+    config.pipeline.datamanager.dense_tokens = 16
+    config.pipeline.model.sky_gaussians = 0
+    config.pipeline.model.stop_split_at = 0  # as many Gaussians as there are points
+    config.set_timestamp()
+    config.save_config()
+    empty = host_peak(reset=True)
+    start = time.perf_counter()
+    trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    prepared, after_preparation = time.perf_counter() - start, host_peak(reset=True)
+    times: list[float] = []
+    iterate = trainer.train_iteration
+
+    def timed(step: int):
+        begin = time.perf_counter()
+        result = iterate(step)
+        times.append(time.perf_counter() - begin)
+        return result
+
+    trainer.train_iteration = timed  # type: ignore[method-assign]
+    with timing.measure() as seconds:
+        trainer.train()
+    after_training = host_peak(reset=True)
+    trainer.pipeline.get_average_eval_image_metrics()
+    store = trainer.pipeline.datamanager.cache_dir
+    return {
+        "photos": scene.photos,
+        "gaussians": trainer.pipeline.model.num_points,
+        "preparation_s": prepared,
+        "preparation_bytes": after_preparation - empty,
+        "training_bytes": after_training - empty,
+        "evaluation_bytes": host_peak() - empty,
+        "step_s": median(times[len(times) // 5 :]),  # the first steps warm caches up
+        "data_s": median(seconds["data"]),
+        "store_bytes": sum(path.stat().st_size for path in store.rglob("*") if path.is_file()),
+    }
+
+
+def markdown(settings: ScaleBenchmark, rows: dict[str, list[dict[str, Any]]]) -> str:
+    """The report."""
+    photos = [(r, f"{r['photos']:,}") for r in rows["photos"]]
+    photos += [
+        (r["in memory"], f"{r['photos']:,}, all in memory") for r in rows["photos"] if "in memory" in r
+    ]
+    return f"""# How memory and time grow
+
+    {command_line("lang3dxl benchmark scale", settings)}
+
+{describe_machine()}
+
+{PREDICTION}
+
+Memory is the peak resident set above the process with everything imported. Photos are of 120×160 to 240×160
+pixels, encoders the built-in ones.
+
+## With the number of photos
+
+{settings.steps} steps, 2,000 Gaussians, {settings.cache_gb} GB for photos and targets.
+
+{markdown_table(["photos", *_HEADER], [[name, *_row(r)] for r, name in photos])}
+
+## With the number of Gaussians
+
+20 photos, {settings.gaussian_steps} steps.
+
+{markdown_table(["Gaussians", *_HEADER], [[f"{r['gaussians']:,}", *_row(r)] for r in rows["gaussians"]])}
+"""
+
+
+_HEADER = [
+    "preparation (s)",
+    "its memory (MB)",
+    "training's memory (MB)",
+    "evaluation's memory (MB)",
+    "median step (ms)",
+    "of it waiting for data (ms)",
+    "store (MB)",
+]
+
+
+def _row(r: dict[str, Any]) -> list[str]:
+    sizes = [f"{r[f'{part}_bytes'] / 1e6:.0f}" for part in ("preparation", "training", "evaluation")]
+    step = [f"{1e3 * r['step_s']:.0f}", f"{1e3 * r['data_s']:.1f}", f"{r['store_bytes'] / 1e6:.0f}"]
+    return [f"{r['preparation_s']:.0f}", *sizes, *step]

@@ -1,0 +1,330 @@
+"""Bad input and bad luck: each ends in a logged skip or a sentence that names the file, and loses nothing."""
+
+import errno
+import os
+import pickle
+import zipfile
+from copy import deepcopy
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+import yaml
+from conftest import make_trainer
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from PIL import Image
+from scenes import write_scene
+
+from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.memory import machine_memory, with_less_memory
+from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.other_scenes import photos_of
+from lang3dxl_ns.preparation.foreground import with_foreground
+from lang3dxl_ns.preparation.prepare import PreparationConfig
+from lang3dxl_ns.preparation.pyramid import build_clip_target
+from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.query.relevancy import Queries, cosines_of_codes
+from lang3dxl_ns.saved_config import read_config
+from lang3dxl_ns.scene_loading import check_checkpoint
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A scene to be spoilt."""
+    return write_scene(tmp_path / "scene", photos=4, points=40)
+
+
+def parse(folder, **options):
+    """What the dataparser finds: its photos by name."""
+    parser = PhotoCollectionDataParserConfig(data=folder, **options).setup()
+    parser.get_dataparser_outputs(split="train")
+    return {photo.name: photo for photo in parser.photos.values()}
+
+
+def rename(folder, *names):
+    """Give the photos other names, in the model and (where they stay inside) on disk."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    for image, name in zip(sorted(model.images.values(), key=lambda image: image.name), names, strict=False):
+        old, image.name = folder / "images" / image.name, name
+        target = folder / "images" / name
+        if ".." not in name and not name.startswith("/"):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            old.rename(target)
+    model.write_binary(folder / "sparse" / "0")
+
+
+# ── what lies in the folder ─────────────────────────────────────────────────────────────────────────────
+
+
+def test_photos_that_the_model_does_not_know_are_named(folder, capsys):
+    Image.new("RGB", (8, 8)).save(folder / "images" / "stranger[1].JPG")
+    assert len(parse(folder)) == 4
+    assert "1 photos of" in (printed := capsys.readouterr().out)
+    assert "stranger[1].JPG" in printed
+
+
+@pytest.mark.parametrize("place", ["sparse", "sparse/0", "colmap/sparse/0", "dense/sparse"])
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_models_are_found_where_people_keep_them(folder, place, form):
+    import pycolmap
+
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    for path in (folder / "sparse" / "0").iterdir():
+        path.unlink()
+    (folder / place).mkdir(parents=True, exist_ok=True)
+    (model.write_binary if form == "binary" else model.write_text)(folder / place)
+    assert len(parse(folder)) == 4
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_of_several_models_the_log_says_which_is_used_and_how_large_the_others_are(folder, capsys, form):
+    import pycolmap
+
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    (folder / "sparse" / "1").mkdir()
+    (model.write_binary if form == "binary" else model.write_text)(folder / "sparse" / "1")
+    parse(folder)
+    printed = " ".join(capsys.readouterr().out.split())  # wrapped, with the place in the code at the right
+    assert "has 2 models" in printed
+    assert "4 photos" in printed
+    assert "sparse/1 with 4" in printed
+
+
+def test_names_with_dots_spaces_unicode_folders_and_one_stem_stay_apart(folder, tmp_path):
+    names = ["north side/a.b.jpg", "north side/a.b.png", "süd/ä 日本[/b].jpg", "a.b.jpg"]
+    rename(folder, *names)
+    photos = parse(folder)
+    assert set(photos) == set(names)
+    paths = {FeatureStore(tmp_path).path("clip", name) for name in names}
+    assert len(paths) == 4
+
+
+def test_a_mask_that_fits_two_photos_of_one_stem_is_named_and_the_long_form_tells_them_apart(folder):
+    rename(folder, "a.jpg", "a.png")
+    (folder / "masks").mkdir()
+    Image.new("L", (9, 7), 255).save(folder / "masks" / "a.png")  # of another size, too
+    lines = []
+
+    def masks():
+        photos = [photo for name, photo in parse(folder).items() if name[0] == "a"]
+        lines.clear()
+        with_foreground(photos, PreparationConfig(), folder, folder / "cache", "cpu", lines.append)
+        return {photo.name: photo.mask_path.name for photo in photos}
+
+    assert masks() == {"a.jpg": "a.png", "a.png": "a.png"}
+    assert "the mask of 2 photos, a.jpg, a.png" in lines[0]
+    assert "a.jpg.png" in lines[0]
+    Image.new("L", (9, 7), 255).save(folder / "masks" / "a.jpg.png")
+    assert masks() == {"a.jpg": "a.jpg.png", "a.png": "a.png"}
+    assert lines == []
+
+
+@pytest.mark.parametrize("kind", [CameraType.FISHEYE, CameraType.EQUIRECTANGULAR])
+def test_lenses_that_are_not_undistorted_are_refused_with_the_way_out(tmp_path, kind):
+    cameras = Cameras(torch.eye(4)[None, :3], 50.0, 50.0, 20.0, 15.0, 40, 30, camera_type=kind)
+    outputs = SimpleNamespace(cameras=cameras, image_filenames=[tmp_path / "a.jpg"], mask_filenames=None)
+    with pytest.raises(UserError, match=rf"a\.jpg has a {kind.name.lower()} camera.*nerfstudio-data off"):
+        photos_of(outputs, tmp_path)
+
+
+# ── names and links that lead out of a folder ───────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("name", ["../secret.jpg", "/etc/passwd", "a/../../secret.jpg"])
+def test_a_model_cannot_name_files_outside_the_photos_folder(folder, capsys, name):
+    Image.new("RGB", (96, 72)).save(folder / "secret.jpg")
+    rename(folder, name)
+    assert len(parse(folder)) == 3
+    assert "leads out of" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("what", ["images/photo_001.jpg", "masks/photo_001.png"])
+def test_a_link_out_of_a_folder_is_followed_only_when_asked(folder, tmp_path, what, capsys):
+    (folder / "masks").mkdir()
+    Image.new("RGB", (96, 72)).save(tmp_path / "elsewhere.png")
+    (folder / what).unlink(missing_ok=True)
+    (folder / what).symlink_to(tmp_path / "elsewhere.png")
+    assert "photo_001.jpg" not in parse(folder)
+    assert "--follow-links" in " ".join(capsys.readouterr().out.split())
+    assert "photo_001.jpg" in parse(folder, follow_links=True)
+
+
+def test_the_photos_folder_itself_may_be_a_link(folder, tmp_path):
+    (folder / "images").rename(tmp_path / "elsewhere")
+    (folder / "images").symlink_to(tmp_path / "elsewhere")
+    assert len(parse(folder)) == 4
+
+
+def test_other_dataparsers_cannot_name_photos_outside_the_data_either(tmp_path):
+    (tmp_path / "data").mkdir()
+    cameras = Cameras(torch.eye(4)[None, :3], 50.0, 50.0, 20.0, 15.0, 40, 30)
+    outputs = SimpleNamespace(
+        cameras=cameras, image_filenames=[tmp_path / "data" / "../a.jpg"], mask_filenames=None
+    )
+    with pytest.raises(UserError, match="lies outside"):
+        photos_of(outputs, tmp_path / "data")
+
+
+# ── disks ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES])
+def test_a_read_only_folder_says_how_to_keep_the_targets_elsewhere(tmp_path, monkeypatch, number):
+    def refuse(*_args, **_options):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(UserError, match="--cache-dir DIR"):
+        FeatureStore(tmp_path / "store").make_folder()
+    with pytest.raises(UserError, match="--cache-dir DIR"):
+        FeatureStore(tmp_path / "store").write("clip", "a.jpg", {"x": torch.ones(1)}, {})
+
+
+# ── runs ────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def damaged_checkpoint(folder, how):
+    path = folder / "step-000000007.ckpt"
+    torch.save({"step": 7, "pipeline": {"x": torch.arange(4000.0)}}, path)
+    content = bytearray(path.read_bytes())
+    if how == "cut":
+        content = content[:-500]
+    elif how == "flipped":
+        content[len(content) // 2] ^= 1
+    elif how == "empty":
+        content = bytearray()
+    path.write_bytes(content)
+    return path
+
+
+@pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
+def test_a_damaged_checkpoint_is_named_by_every_command_that_loads_it(tmp_path, how):
+    path = damaged_checkpoint(tmp_path, how)
+    with pytest.raises(UserError, match=r"step-000000007\.ckpt is damaged"):
+        check_checkpoint(path)
+    config = lang3dxl.config
+    config = type(config)(output_dir=tmp_path.parent, method_name="m", experiment_name="e", timestamp="t")
+    config.relative_model_dir = tmp_path  # where nerfstudio's commands look
+    with pytest.raises(UserError, match="is damaged"):
+        config.get_checkpoint_dir()
+
+
+def test_a_whole_checkpoint_passes(tmp_path):
+    check_checkpoint(damaged_checkpoint(tmp_path, "not"))
+    check_checkpoint(tmp_path / "none")
+
+
+class Payload:
+    """Unpickled by a careless reader, it writes a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (Path.touch, (self.path,))
+
+
+def test_a_checkpoint_that_runs_code_is_refused_and_runs_nothing(folder, tiny_clip, tiny_dense, tmp_path):
+    trap, checkpoint = tmp_path / "trap", tmp_path / "step-000000001.ckpt"
+    torch.save({"step": 1, "pipeline": Payload(trap)}, checkpoint)
+    options = {"load_checkpoint": checkpoint}
+    trainer = make_trainer(folder, tiny_clip, tiny_dense, tmp_path / "out", 4, semantics=False, **options)
+    with pytest.raises(UserError, match="no checkpoint of lang3dxl in"):
+        trainer.setup()
+    assert not trap.exists()
+    with zipfile.ZipFile(checkpoint) as archive:  # the trap would have worked
+        pickle.loads(archive.read("step-000000001/data.pkl"))
+    assert trap.exists()
+
+
+def test_a_config_of_an_older_version_takes_defaults_for_what_it_lacks_and_says_so(tmp_path, capsys):
+    text = yaml.dump(lang3dxl.config)
+    lines = [line for line in text.splitlines() if "cache_gb:" not in line and "max_skipped" not in line]
+    lines.insert(1, "option_of_old: 3")
+    (tmp_path / "config.yml").write_text("\n".join(lines))
+    config = read_config(tmp_path / "config.yml")
+    assert config.max_skipped_steps == 20
+    assert config.pipeline.datamanager.cache_gb is None
+    printed = capsys.readouterr().out
+    assert "max_skipped_steps = 20 (new)" in printed
+    assert "option_of_old (gone" in printed
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "!!python/object/apply:os.system ['touch {trap}']",
+        "!!python/object/apply:nerfstudio.utils.scripts.run_command ['touch {trap}']",
+        "!!python/object/new:subprocess.Popen [['touch', '{trap}']]",
+        "!!python/name:os.system ''",
+        "!!python/module:os ''",
+        "a: 1",
+        "{{",
+    ],
+)
+def test_a_config_that_asks_for_more_than_settings_is_refused(tmp_path, text):
+    (tmp_path / "config.yml").write_text(text.format(trap=tmp_path / "trap"))
+    with pytest.raises(UserError, match=r"config\.yml"):
+        read_config(tmp_path / "config.yml")
+    assert not (tmp_path / "trap").exists()
+
+
+@pytest.mark.parametrize("machine", [{"num_devices": 2}, {"num_machines": 2}])
+def test_several_devices_are_refused_before_anything_starts(machine):
+    config = deepcopy(lang3dxl.config)
+    vars(config.machine).update(machine)
+    with pytest.raises(UserError, match="training runs on one device"):
+        config.set_timestamp()
+
+
+def test_servers_listen_on_this_machine_alone():
+    assert lang3dxl.config.viewer.websocket_host == "127.0.0.1"
+
+
+# ── memory ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def short_of_memory(limit, work):
+    """`work`, failing as a GPU without memory does for more than `limit` rows."""
+
+    def run(rows):
+        if len(rows) > limit:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return work(rows)
+
+    return run
+
+
+def test_decoding_takes_smaller_chunks_when_memory_runs_out():
+    codes, weights = torch.randn(1000, 3), torch.randn(3, 8)
+    queries = Queries.of([torch.randn(1, 8)], torch.randn(4, 8))
+    expected = cosines_of_codes(lambda part: part @ weights, codes, queries)
+    found = cosines_of_codes(short_of_memory(70, lambda part: part @ weights), codes, queries)
+    torch.testing.assert_close(found, expected)
+
+
+def test_encoding_takes_smaller_batches_when_memory_runs_out():
+    photo = torch.rand(64, 80, 3)
+    arguments = ([16, 32], [0.2, 0.4])
+
+    def encode(crops):
+        return crops.flatten(1)[:, :6]
+
+    expected = build_clip_target(photo, *arguments, encode, 8, 64).features
+    found = build_clip_target(photo, *arguments, short_of_memory(5, encode), 8, 64).features
+    torch.testing.assert_close(found, expected)
+
+
+def test_what_does_not_fit_even_one_by_one_is_an_error_and_others_are_not_hidden():
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        with_less_memory(lambda rows: short_of_memory(0, len)(range(rows)), 8)
+    with pytest.raises(RuntimeError, match="size"):
+        with_less_memory(lambda rows: torch.zeros(2) @ torch.zeros(3), 8)
+
+
+def test_memory_is_that_of_the_container():
+    assert 2**28 < machine_memory() < 2**50
