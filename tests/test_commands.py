@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 pytestmark = pytest.mark.slow
 
@@ -74,26 +75,39 @@ def test_resume(run, scene, tiny_clip, tiny_dense, folder):
     assert "Resuming at iteration 30 of 40" in output
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("interpolate", "--interpolation-steps", "2", "--rendered-output-names", "rgb", "bottleneck"),
-        ("dataset", "--split", "test", "--rendered-output-names", "rgb", "bottleneck"),
-    ],
-)
-def test_render(run, folder, words):
-    target = folder / ("video.mp4" if words[0] == "interpolate" else "pictures")
+@pytest.fixture
+def camera_path(folder) -> Path:
+    """As the viewer saves it."""
+    pose = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 1]
+    frames = [{"camera_to_world": pose, "fov": 60.0, "aspect": 1.5}] * 2
+    path = {"camera_type": "perspective", "render_width": 48, "render_height": 32, "seconds": 0.1}
+    (folder / "path.json").write_text(json.dumps({**path, "camera_path": frames, "crop": None}))
+    return folder / "path.json"
+
+
+@pytest.mark.parametrize("views", ["interpolate", "dataset", "camera-path"])
+def test_render_shows_what_is_asked_for(run, folder, camera_path, monkeypatch, views):
+    monkeypatch.setenv("LANG3DXL_QUERY", "rose window; dome")
+    target = folder / f"rendered-{views}"
+    words = {
+        "interpolate": ("--interpolation-steps", 2, "--output-format", "images"),
+        "dataset": ("--split", "test"),
+        "camera-path": ("--camera-path-filename", camera_path, "--output-format", "images"),
+    }[views]
     command(
-        "ns-render",
-        words[0],
-        "--load-config",
-        run / "config.yml",
-        "--output-path",
-        target,
-        *words[1:],
+        *("ns-render", views, "--load-config", run / "config.yml", "--output-path", target, *words),
+        *("--rendered-output-names", "rgb", "relevancy_0", "relevancy_1", "overlay", "bottleneck"),
         cwd=folder,
     )
-    assert target.exists()
+    pictures = sorted(path.relative_to(target) for path in target.rglob("*.jpg"))
+    if views == "dataset":  # a folder per output
+        outputs = {"rgb", "relevancy_0", "relevancy_1", "overlay", "bottleneck"}
+        assert {path.parts[1] for path in pictures} == outputs
+    else:  # the outputs side by side
+        with Image.open(target / pictures[0]) as picture:
+            assert picture.width % 5 == 0 and picture.width > picture.height
+    if views == "camera-path":
+        assert len(pictures) == 2 and picture.size == (5 * 48, 32)
 
 
 def test_export_splat(run, folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -196,7 +197,7 @@ class Conversation:
         """What there is to say about the answer, where something is odd about it."""
         if self.found is None or any(found.viewpoints for found in self.found):
             return None
-        words = " or ".join(shortened(found.prompt.text) for found in self.found)
+        words = " or ".join(plain(shortened(found.prompt.text)) for found in self.found)
         return (
             f"Nothing in the scene looks like {words} by the threshold of {self.display.threshold:.2f}. "
             f"Lower it, or try other words: the CLIP of this run may not know these."
@@ -221,6 +222,11 @@ class Conversation:
         if s.text is not None:
             parts.insert(-1, f"{s.text * 1e3:.0f} ms per text")
         return " · ".join(parts)
+
+
+def plain(text: str) -> str:
+    """A text as Markdown that says just that."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
 def shortened(text: str, most: int = 40) -> str:

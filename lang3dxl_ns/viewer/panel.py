@@ -19,7 +19,7 @@ from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.query.scene import Found
 from lang3dxl_ns.query.scene_file import ScenePhoto
 from lang3dxl_ns.rendering import Camera
-from lang3dxl_ns.viewer.conversation import Conversation, shortened
+from lang3dxl_ns.viewer.conversation import Conversation, plain, shortened
 from lang3dxl_ns.viewer.flight import Stand, Tour, box_lines, flight, overview, stand_of
 from lang3dxl_ns.viewer.frustums import draw_frustums
 from lang3dxl_ns.viewer.worker import Worker
@@ -179,9 +179,9 @@ class AskPanel(ViewerControl):
             try:
                 job()
             except UserError as error:
-                self._say(str(error))
+                self._say(plain(str(error)))
             except Exception as error:
-                self._say(f"That went wrong, the terminal says where: {error!r}")
+                self._say(plain(f"That went wrong, the terminal says where: {error!r}"))
                 CONSOLE.print_exception()
 
         return guarded
@@ -217,7 +217,7 @@ class AskPanel(ViewerControl):
         for one in found:
             count, best = len(one.viewpoints), max((v.score for v in one.viewpoints), default=0.0)
             where = f"{count} good views, best {best:.2f}" if count else "nowhere"
-            lines.append(f"**{shortened(one.prompt.text)}**: {where}")
+            lines.append(f"**{plain(shortened(one.prompt.text))}**: {where}")
         if max(len(one.prompt.text) for one in found) > LONG_TEXT:
             lines.append("Only the beginning of a long text counts: CLIP reads about 60 words.")
         return "  \n".join(lines)
@@ -324,7 +324,7 @@ class AskPanel(ViewerControl):
         """To the best viewpoint (`step` 0), or that many further on."""
         self._tour = tour
         viewpoint = tour.best() if step == 0 else tour.move(step)
-        self._place.content = str(tour)
+        self._place.content = plain(str(tour))
         target = None if tour.found.box is None else tour.found.box.centre
         for one in [client] if client is not None else self.viser_server.get_clients().values():
             self._fly_camera(one, viewpoint.camera, target)

@@ -1,5 +1,6 @@
 """The panel in nerfstudio's viewer, without a browser: what is typed, what is shown, where it flies."""
 
+import threading
 import time
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -70,10 +71,14 @@ def type_in(panel, text: str, negatives: str = "") -> str:
 
 
 def frame(viewer) -> dict[str, torch.Tensor]:
-    """What a frame of the viewer consists of."""
-    camera = as_nerfstudio(viewer.pipeline.panel._photos[0].camera)
+    """What a frame of the viewer consists of, rendered as its threads do it."""
+    camera, model = as_nerfstudio(viewer.pipeline.panel._photos[0].camera), viewer.get_model()
     with viewer.train_lock, torch.no_grad():
-        return viewer.get_model().get_outputs_for_camera(camera, obb_box=None)
+        training = model.training
+        model.eval()
+        outputs = model.get_outputs_for_camera(camera, obb_box=None)
+        model.train(training)
+    return outputs
 
 
 class Client:
@@ -255,3 +260,30 @@ def test_while_the_model_learns_every_answer_is_exact_and_about_the_model_of_now
     assert trainer.pipeline.model.training
     assert trainer.train_lock.acquire(blocking=False)
     trainer.train_lock.release()
+
+
+def test_a_scene_can_be_asked_while_it_is_trained(scene, tiny_clip, tiny_dense, tmp_path):
+    changes = {"vis": "viewer", "viewer__quit_on_train_completion": True}
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path, 40, **changes)
+    trainer.setup()
+    viewer, panel = trainer.viewer_state, trainer.pipeline.panel
+    panel._threshold.value = 0.0
+    panel._take_settings()
+    seen = []
+
+    def person():
+        while trainer.training_state == "training":
+            seen.append(type_in(panel, "dome"))
+            outputs = frame(viewer)
+            assert "relevancy_0" in outputs and "still learns" in panel._status.content
+
+    person_at_the_page = threading.Thread(target=person)
+    person_at_the_page.start()
+    trainer.train()
+    person_at_the_page.join(60)
+    assert not person_at_the_page.is_alive()
+    assert seen and all("dome" in message and "good views" in message for message in seen)
+    type_in(panel, "dome")
+    frame(viewer)
+    assert "fast" in panel._status.content
+    viewer.viser_server.stop()
