@@ -64,7 +64,7 @@ def relevancies(scene: Scene, dtype: torch.dtype) -> torch.Tensor:
 @pytest.mark.parametrize(("scale", "offset"), WORLDS)
 def test_relevancy_is_the_same_in_every_world(scale, offset):
     found, expected = (relevancies(s, torch.float64) for s in (Scene().in_world(scale, offset), Scene()))
-    assert float(expected.std()) > 0.1
+    assert float(expected.std()) > 0.05
     # A code moves ten times as far as a colour, the field's slope and the temperature ten times each.
     assert float((found - expected).abs().max()) < 1e-10 * max(1, offset / scale)
 
@@ -187,4 +187,6 @@ def test_the_number_of_threads_has_no_say_beyond_rounding(train, scene):
     for name, loss in losses.items():
         assert loss.item() == pytest.approx(other_losses[name].item(), rel=1e-5), name
     for name, gradient in gradients.items():
-        assert float((gradient - other_gradients[name]).norm()) <= 1e-4 * float(gradient.norm()), name
+        # At least 1e-9: the downsampler's last bias shifts all logits alike, its gradient is rounding alone.
+        bound = 1e-9 + 1e-4 * float(gradient.norm())
+        assert float((gradient - other_gradients[name]).norm()) <= bound, name
