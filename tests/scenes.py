@@ -24,22 +24,29 @@ def write_scene(
     mixed: bool = False,
     distortion: tuple[float, ...] | None = None,
     image_ext: str = "jpg",
+    shuffled: bool = False,
+    duplicates: int = 0,
 ) -> Path:
     """Write `folder`/images/photo_000.jpg … and `folder`/sparse/0/*.bin; returns `folder`.
 
     The cameras stand on an arc in front of the box, 3.5 to 4.5 units away. `mixed` gives every photo its own
     size, focal length and principal point, every third one portrait; otherwise all share one camera.
-    `distortion` is OpenCV's k1 k2 p1 p2. Every point has a track of at least two photos that see it unhidden.
+    `distortion` is OpenCV's k1 k2 p1 p2. `shuffled` lists the photos in another order in the model. The last
+    `duplicates` photos are the first once more. Every point has a track of at least two photos that see it
+    unhidden.
     """
     import pycolmap
 
     rng = np.random.default_rng(seed)
     model = pycolmap.Reconstruction()
+    ids = np.random.default_rng(1).permutation(photos) + 1 if shuffled else np.arange(photos) + 1
     cameras = [_camera(pycolmap, i + 1, size, distortion, rng if mixed else None) for i in range(photos)]
-    for camera in cameras if mixed else cameras[:1]:
+    for camera in cameras[: photos - duplicates] if mixed else cameras[:1]:
         model.add_camera_with_trivial_rig(camera)
     poses = [_pose(fraction, rng) for fraction in (np.arange(photos) + 0.5) / photos - 0.5]
 
+    first = photos - duplicates
+    cameras, poses = (kind[:first] + kind[:1] * duplicates for kind in (cameras, poses))
     surface = _surface_points(points, rng)
     seen = [_project(camera, pose, surface) for camera, pose in zip(cameras, poses, strict=True)]
     tracked = np.sum([visible for _, visible in seen], axis=0) >= 2
@@ -52,7 +59,7 @@ def write_scene(
             name=name,
             keypoints=pixels[visible & tracked],
             camera_id=camera.camera_id if mixed else 1,
-            image_id=i + 1,
+            image_id=int(ids[i]),
         )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
 
@@ -60,7 +67,7 @@ def write_scene(
         track = pycolmap.Track()
         for i, (_, visible) in enumerate(seen):
             if visible[index]:
-                track.add_element(i + 1, int(np.count_nonzero((visible & tracked)[:index])))
+                track.add_element(int(ids[i]), int(np.count_nonzero((visible & tracked)[:index])))
         model.add_point3D(
             surface[index], track, np.round(texture(surface[index][None])[0] * 255).astype(np.uint8)
         )

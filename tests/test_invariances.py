@@ -7,6 +7,7 @@ import pytest
 import torch
 from scenes import write_scene
 
+from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.evaluation.numerics.physical_scale import in_world
 from lang3dxl_ns.evaluation.numerics.rasteriser import Scene
@@ -18,6 +19,7 @@ from lang3dxl_ns.preparation.physical_scale import (
     propose_scale_range,
     read_reconstruction,
 )
+from lang3dxl_ns.query.relevancy import relevancy
 from lang3dxl_ns.rendering import Camera, Gaussians, rasterize
 
 WORLDS = [(1.0, 0.0), (1e3, 0.0), (1e-3, 0.0), (1.0, 1e5), (1e3, 1e5), (1e-3, 1e5)]
@@ -47,6 +49,30 @@ def test_the_image_is_the_same_in_every_world(scale, offset):
 def test_the_image_is_the_same_at_every_scale_in_single_precision(scale):
     found, expected = (render(scene, torch.float32) for scene in (Scene().in_world(scale), Scene()))
     assert float((found - expected).abs().max()) < 1e-5
+
+
+def relevancies(scene: Scene, dtype: torch.dtype) -> torch.Tensor:
+    """Of the rendered channels, taken for codes, to two prompts."""
+    generator = torch.Generator().manual_seed(0)
+    field = SemanticField(SemanticFieldConfig(preset="short"), 32, generator=generator).to(dtype)
+    with torch.no_grad():
+        field.grid.table.mul_(300)  # as loud as after training
+        features = field.decode_clip(10 * render(scene, dtype) - 5)
+    return relevancy(features, *torch.randn(6, 32, generator=generator).to(dtype).split([2, 4]))
+
+
+@pytest.mark.parametrize(("scale", "offset"), WORLDS)
+def test_relevancy_is_the_same_in_every_world(scale, offset):
+    found, expected = (relevancies(s, torch.float64) for s in (Scene().in_world(scale, offset), Scene()))
+    assert float(expected.std()) > 0.05
+    # A code moves ten times as far as a colour, the field's slope and the temperature ten times each.
+    assert float((found - expected).abs().max()) < 1e-10 * max(1, offset / scale)
+
+
+def test_relevancy_is_the_same_at_another_scale_in_single_precision():
+    found, expected = (relevancies(s, torch.float32) for s in (Scene().in_world(1e3), Scene()))
+    assert float((found - expected).abs().max()) < 1e-2
+    assert float((found - expected).abs().mean()) < 1e-5
 
 
 @pytest.fixture(scope="module")
@@ -130,3 +156,37 @@ def project(cameras, index: int, points: torch.Tensor) -> torch.Tensor:
     camera = points @ view[:3, :3].T + view[:3, 3]
     focal = torch.stack([cameras.fx[index, 0], cameras.fy[index, 0]])
     return focal * camera[:, :2] / camera[:, 2:]
+
+
+def test_the_order_in_which_the_model_lists_photos_has_no_say(train, tmp_path):
+    runs = []
+    for name, shuffled in (("listed", False), ("shuffled", True)):
+        folder = write_scene(tmp_path / name, photos=6, points=100, mixed=True, shuffled=shuffled)
+        runs.append(train(folder, iterations=6))
+    first, second = (dict(run.pipeline.model.named_parameters()) for run in runs)
+    for name in first:
+        assert torch.equal(first[name], second[name]), name
+
+
+def test_the_number_of_threads_has_no_say_beyond_rounding(train, scene):
+    trainer = train(scene, iterations=8, steps_per_eval_image=0)
+    model, datamanager = trainer.pipeline.model.train(), trainer.pipeline.datamanager
+    camera, batch = datamanager.next_train(0)
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 4):
+            torch.set_num_threads(count)
+            model.zero_grad()
+            losses = model.get_loss_dict(model.get_outputs(camera), batch)
+            sum(losses.values()).backward()
+            gradients = {n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None}
+            found.append((losses, gradients))
+    finally:
+        torch.set_num_threads(threads)
+    (losses, gradients), (other_losses, other_gradients) = found
+    for name, loss in losses.items():
+        assert loss.item() == pytest.approx(other_losses[name].item(), rel=1e-5), name
+    for name, gradient in gradients.items():
+        # At least 1e-9: the downsampler's last bias shifts all logits alike, its gradient is rounding alone.
+        bound = 1e-9 + 1e-4 * float(gradient.norm())
+        assert float((gradient - other_gradients[name]).norm()) <= bound, name

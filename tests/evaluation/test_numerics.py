@@ -10,6 +10,7 @@ from lang3dxl_ns.evaluation.numerics import catalogue, command
 from lang3dxl_ns.evaluation.numerics.catalogue import GROUPS
 from lang3dxl_ns.evaluation.numerics.command import measure_all
 from lang3dxl_ns.evaluation.numerics.measure import Bounds, Case, Problem, measure
+from lang3dxl_ns.evaluation.numerics.optimisation import Run, runs
 
 BOUNDS = {"float32": Bounds(), "bf16": Bounds(1e-2, 1e-2, 1e-2, 1e-2)}
 
@@ -74,23 +75,47 @@ def test_flipped_pixels_are_counted_and_left_out_of_the_gradient():
     assert any("flipped" in miss for miss in row.misses)
 
 
+def test_long_and_stiff_optimisations_stay_finite_and_do_not_drift():
+    assert [(run.name, run.misses) for run in runs(quick=True) if run.misses] == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "miss"),
+    [
+        ({"finite": False}, "not finite"),
+        ({"losses": [1.0, 0.5, 0.6]}, "loss 0.600, was 0.500"),
+        ({"losses": [1.0, 0.5, float("nan")]}, "loss nan"),
+        ({"codes": [1.0, 5.0, 90.0]}, "largest code 90.0 > 25"),
+    ],
+)
+def test_an_optimisation_that_drifts_misses(changes, miss):
+    good = {"losses": [1.0, 0.6, 0.5], "codes": [1.0, 2.0, 3.0]}
+    assert Run("a run", 30, True, **good).misses == []
+    assert any(miss in found for found in Run("a run", 30, True, **good | changes).misses)
+
+
 def test_a_miss_is_reported_in_words_and_makes_the_exit_code_1(tmp_path, monkeypatch, capsys):
     wrong = squares(lambda out: out * torch.where(out > 0.9, torch.inf, 1.001))
     monkeypatch.setattr(command, "all_cases", lambda quick, device: [wrong, squares()])
+    broken = Run("fast", 30, True, losses=[1.0] * 10, codes=[1.0] * 10, finite=False)
+    monkeypatch.setattr(command, "runs", lambda quick: [broken])
     with pytest.raises(SystemExit) as stop:
         cli.main(["numerics", "--out", str(tmp_path), "--quick"])
     assert stop.value.code == 1
-    assert "MISS squares, a case, float32: not finite" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "MISS squares, a case, float32: not finite" in said
+    assert "MISS optimisation, fast: not finite" in said
     rows = json.loads((tmp_path / "numerics.json").read_text())["rows"]
     assert [bool(row["misses"]) for row in rows] == [True, True, False, False]
     report = (tmp_path / "numerics.md").read_text()
-    assert "**2 of 4 rows pass.**" in report
+    assert "**2 of 5 rows pass.**" in report
     assert f"`lang3dxl numerics --out {tmp_path} --quick`" in report
     assert (tmp_path / "numerics.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_catalogue_holds_every_group():
     components = {case.component for case in catalogue.all_cases(quick=True, device="cpu")}
+    assert {"appearance", "relevancy", "lookup"} <= components
     assert {"rasteriser, torch", "hash grid", "decoder", "downsampler", "physical scale"} <= components
     on_gpu = {case.component for case in catalogue.all_cases(quick=True, device="cuda")}
     assert "rasteriser, gsplat" in on_gpu
