@@ -87,8 +87,8 @@ def score_predictions(
     """Figures of every labelled photo, by its name, and the protocol that they go by.
 
     photos: those to score, by the names of photos or labels; all that have a label without it. masks: folder
-    of foreground masks, white = keep; predictions are 0 elsewhere. temperature: that the maps were made with (see `MapScorer.variants`). Raises
-    UserError for a missing map.
+    of foreground masks, white = keep; predictions are 0 elsewhere. temperature: that the maps were made with
+    (see `MapScorer.variants`). Raises UserError for a missing map.
     """
     scorer, predicted = MapScorer(truth), PredictedMaps(maps, truth.categories)
     keys = truth.labelled if photos is None else [_key(truth, photo) for photo in photos]
