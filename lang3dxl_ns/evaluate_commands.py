@@ -47,18 +47,23 @@ class EvaluateMaps:
     """Text file with the names of the photos to score, one per line (default: all that have a label)."""
     masks: Path | None = None
     """Folder of foreground masks, white = keep: predictions count as 0 elsewhere."""
+    temperature: float = 1.0
+    """Steepness of the relevancy that the maps hold: 10 for those of `lang3dxl query`, as in LERF's code. The
+    published processing is of temperature 1, to which they are brought back for it."""
     scene: str | None = None
     """Name in the report (default: the ground truth's folder)."""
     out: Path
     """Folder for the report."""
 
     def main(self) -> None:
+        if not self.temperature > 0:
+            raise UserError(f"--temperature is {self.temperature}: give a number above 0")
         truth = GroundTruth(self.ground_truth, self.layout)
         names = None if self.photos is None else read_names(self.photos)
-        photos, protocol = score_predictions(truth, self.maps, names, self.masks)
+        photos, protocol = score_predictions(truth, self.maps, names, self.masks, self.temperature)
         results = average(list(photos.values()), with_deviation=True)
         results |= {"protocol": protocol, "photos": photos}
-        _write(self.out, self.scene or truth.folder.absolute().name, results)
+        _write(self.out, self.scene or _scene_name(truth.folder.absolute()), results)
 
 
 @dataclass(kw_only=True)
@@ -186,6 +191,11 @@ def _read_results(path: Path) -> tuple[str, dict[str, Any]]:
         raise UserError(
             f"{path} is no report of `lang3dxl evaluate` or `ns-eval` ({error!r}): make it again"
         ) from error
+
+
+def _scene_name(folder: Path) -> str:
+    """Ground truth is in a folder of the scene's name, or in one inside it."""
+    return folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
 
 
 def _write(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu") -> None:

@@ -134,10 +134,14 @@ class Lang3DXLPipeline(VanillaPipeline):
     def evaluate(self) -> Iterator[EvaluatedPhoto]:
         """Render the photos to evaluate and compare, one at a time, with a progress bar."""
         self.eval()
-        photos = self._evaluated_photos()
+        photos, warm = self._evaluated_photos(), False
         with progress_bar() as bar:
             for camera, batch in bar.track(photos, total=len(photos), description="evaluating"):
-                yield self._evaluate_photo(camera, batch, photos.dataset.photos[batch["image_idx"]])
+                photo = photos.dataset.photos[batch["image_idx"]]
+                if not warm:  # the first photo loads kernels, which is no photo's time
+                    self._evaluate_photo(camera, batch, photo)
+                    warm = True
+                yield self._evaluate_photo(camera, batch, photo)
         self.train()
 
     def _evaluated_photos(self) -> EvalPhotos:

@@ -1,6 +1,7 @@
 """What `ns-eval` writes, and the photos it looks at; held-out photos by list."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from PIL import Image
 from lang3dxl_ns import cli
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
 
 
 def label(scene, folder, numbers):
@@ -128,3 +130,14 @@ def test_listed_photos_and_no_others_are_held_out(scene, tmp_path):
 def test_a_listed_photo_that_is_not_there_is_named(scene, tmp_path):
     with pytest.raises(UserError, match="names photo_099, as 0 photos"):
         split(scene, "photo_099\n", tmp_path)
+
+
+def test_folders_of_pt_ovs_are_read_as_published(scene, tmp_path):
+    """brandenburg_gate/dense/{images,sparse} and label/brandenburg_gate/<photo>.json beside it."""
+    data = tmp_path / "brandenburg_gate"
+    shutil.copytree(scene / "images", data / "dense" / "images")
+    shutil.copytree(scene / "sparse" / "0", data / "dense" / "sparse")
+    write_labels(tmp_path / "label" / data.name, "photo_000", [box_object("column", 5, 5, 30, 30)])
+    outputs = PhotoCollectionDataParserConfig(data=data).setup().get_dataparser_outputs("test")
+    truth = GroundTruth(find_ground_truth(data))
+    assert [truth.key(photo.name) for photo in outputs.metadata["photos"]] == ["photo_000", None]

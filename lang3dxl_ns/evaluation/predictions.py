@@ -82,11 +82,13 @@ def score_predictions(
     maps: Path,
     photos: Sequence[str] | None = None,
     masks: Path | None = None,
+    temperature: float = 1.0,
 ) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
     """Figures of every labelled photo, by its name, and the protocol that they go by.
 
     photos: those to score, by the names of photos or labels; all that have a label without it. masks: folder
-    of foreground masks, white = keep; predictions are 0 elsewhere. Raises UserError for a missing map.
+    of foreground masks, white = keep; predictions are 0 elsewhere. temperature: that the maps were made with
+    (see `MapScorer.variants`). Raises UserError for a missing map.
     """
     scorer, predicted = MapScorer(truth), PredictedMaps(maps, truth.categories)
     keys = truth.labelled if photos is None else [_key(truth, photo) for photo in photos]
@@ -98,7 +100,7 @@ def score_predictions(
             truths = truth.truths(key, size)
             found: Maps = {category: predicted.read(category, key, size) for category in truths}
             figures[key] = {}
-            for prefix, variant in scorer.variants(found, keeps[key]).items():
+            for prefix, variant in scorer.variants(found, keeps[key], temperature).items():
                 figures[key] |= scorer.scores(key, variant, prefix, truths)
     masked = sum(keep is not None for keep in keeps.values())
     statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"

@@ -189,6 +189,14 @@ def test_the_list_of_photos_to_hold_out_is_a_list_of_photos_to_score(scene, tmp_
         cli.main(["evaluate", "maps", *common, "--out", str(tmp_path / "out")])
 
 
+def test_the_temperature_of_maps_matters_to_the_published_processing_alone(scene):
+    truth, maps = scene
+    steep, _ = score_predictions(GroundTruth(truth), maps, ["0002"], temperature=10)
+    plain, _ = score_predictions(GroundTruth(truth), maps, ["0002"])
+    differ = {name for name in plain["0002"] if plain["0002"][name] != steep["0002"][name]}
+    assert "authors_ap_rose window" in differ and all(name.startswith("authors_") for name in differ)
+
+
 def test_holyscenes_masks_are_scored_at_half_their_size(tmp_path, mask):
     write_holyscenes(tmp_path / "truth", "domes", "0001", mask, quality=95)
     write_map(tmp_path / "maps", "domes", "0001", mask[::2, ::2].astype(np.float32))
