@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.trainer import Lang3DXLTrainerConfig
 
 _TIMED_PHOTOS = 3
-_WORST_FIGURES = ("num_rays_per_sec", "fps")
+_UNWANTED = ("num_rays_per_sec", "fps")
 
 
 @dataclass(frozen=True)
@@ -84,20 +85,22 @@ class ScoredRuns:
         """
         path = self._path(run)
         path.parent.mkdir(parents=True, exist_ok=True)
-        work = self.folder / "work"
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            try:
-                figures = pool.submit(
-                    _in_process, run, self.settings, work, path.with_suffix(".log")
-                ).result()
-            except BrokenProcessPool as error:
-                raise UserError("killed, most likely for want of memory") from error
-            except (RuntimeError, MemoryError) as error:
-                raise UserError(f"{error} (see {path.with_suffix('.log')})") from error
-        shutil.rmtree(work / "runs", ignore_errors=True)
+        figures = self._submit(run, path.with_suffix(".log"))
         result = {"made_with": self._made_with(run), "figures": figures}
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False) + "\n")
         return figures
+
+    def _submit(self, run: Run, log: Path) -> dict[str, float]:
+        work = self.folder / "work"
+        try:
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                return pool.submit(_in_process, run, self.settings, work, log).result()
+        except BrokenProcessPool as error:
+            raise UserError(f"killed, most likely for want of memory (see {log})") from error
+        except (RuntimeError, MemoryError) as error:
+            raise UserError(f"{error} (see {log})") from error
+        finally:
+            shutil.rmtree(work / "runs", ignore_errors=True)
 
     def _path(self, run: Run) -> Path:
         return self.folder / "results" / run.label / run.row.name / f"seed{run.seed}.json"
@@ -192,7 +195,7 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     seconds = time.perf_counter() - start
     peak = _peak()
     figures = average([photo.metrics for photo in trainer.pipeline.evaluate()])
-    figures = {name: value for name, value in figures.items() if name not in _WORST_FIGURES}
+    figures = {name: value for name, value in figures.items() if name not in _UNWANTED}
     return figures | {
         "setup_seconds": set_up,
         "train_seconds": seconds,
@@ -221,7 +224,7 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
         return {}
     pipeline.eval()
     times: dict[str, list[float]] = {"render_ms": [], "answer_ms": []}
-    for (camera, _), _ in zip(pipeline.datamanager.fixed_indices_eval_dataloader, range(_TIMED_PHOTOS)):
+    for camera, _ in islice(pipeline.datamanager.fixed_indices_eval_dataloader, _TIMED_PHOTOS):
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()

@@ -19,7 +19,7 @@ class Row:
     name: str
     group: str
     label: str
-    changes: Mapping[str, Any] = field(default_factory=dict)
+    changes: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Values by their dotted path in the run's configuration."""
     published: str = ""
     """What Lang3D-XL prints for the same comparison, on HolyScenes."""
@@ -84,9 +84,8 @@ def choose_rows(names: Iterable[str], short_run: bool, has_regions: bool) -> lis
     """
     known = {row.name for row in ROWS}
     if unknown := [name for name in names if name not in known]:
-        raise UserError(
-            f"there is no row {', '.join(unknown)}: choose of {', '.join(row.name for row in ROWS)}"
-        )
+        choices = ", ".join(row.name for row in ROWS)
+        raise UserError(f"there is no row {', '.join(unknown)}: choose of {choices}")
     same = {"both" if short_run else "hash", "regions" if has_regions else "no-regions"}
     wanted = set(names) or known - same
     return [row for row in ROWS if row.name in wanted]
