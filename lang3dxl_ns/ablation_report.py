@@ -106,8 +106,8 @@ Held-out photos of {len(scenes)} scene(s): {", ".join(scenes)}. Mean ± deviatio
 
 mAP: mean over the categories of the average precision of relevancy maps, blurred by 2.5 pixels at half the
 photo's size. "train" has no preparation of targets in it; "answer" decodes a rendered view and compares it
-with all prompts, without a lookup table. The last column is what Lang3D-XL prints for HolyScenes: other photos,
-another CLIP, other lengths of training. Compare its order with this one, not its figures.
+with all prompts, without a lookup table. The last column is what Lang3D-XL prints for HolyScenes: other
+photos, another CLIP, other lengths of training. Compare its order with this one, not its figures.
 
 ## mAP by scene
 

@@ -13,6 +13,7 @@ import tyro
 from lang3dxl_ns.ablation import Ablation
 from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.demo_run import Demo
+from lang3dxl_ns.error_vs_time import ErrorVsTime
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
 from lang3dxl_ns.evaluation.numerics.command import Numerics
@@ -87,6 +88,7 @@ Benchmark = (
     | Annotated[TrainingBenchmark, tyro.conf.subcommand("training")]
     | Annotated[LookupBenchmark, tyro.conf.subcommand("lookup")]
     | Annotated[Ablation, tyro.conf.subcommand("ablation")]
+    | Annotated[ErrorVsTime, tyro.conf.subcommand("error-vs-time")]
 )
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]

@@ -10,6 +10,7 @@ from lang3dxl_ns.errors import UserError
 
 FULL, TEACHER, CLIPSEG = "full", "teacher", "clipseg"
 _FIELD, _DATA = "pipeline.model.semantic_field.", "pipeline.datamanager."
+_OF_TARGETS = ("scale_mode", "scale_range", "single_scale", "dense_tokens")
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Row:
     @property
     def own_targets(self) -> bool:
         """Whether the targets differ from those of the other rows."""
-        return any(path.removeprefix(_DATA) in ("scale_mode", "single_scale") for path in self.changes)
+        return any(path.removeprefix(_DATA) in _OF_TARGETS for path in self.changes)
 
 
 def _encoder(name: str, label: str, published: str = "") -> Row:
