@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,6 +100,8 @@ def make_all(runs, store: ScoredRuns, report) -> tuple[dict[Run, dict[str, float
                 figures[run] = store.make(run)
             except UserError as reason:
                 failed[run] = str(reason)
+            except KeyboardInterrupt:
+                sys.exit(f"\nStopped. Finished runs are in {store.folder}; the same command goes on.")
             bar.advance(task)
             report(figures, failed)
     return figures, failed

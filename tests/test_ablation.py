@@ -61,6 +61,28 @@ def test_a_run_that_fails_says_why_and_is_tried_again_and_others_go_on(tmp_path)
     assert made == ["here/clipseg/0", "here/full/0", "here/clipseg/0"]
 
 
+def test_a_stopped_run_is_no_result(tmp_path, monkeypatch):
+    made: list[str] = []
+    store = Counting(tmp_path, made)
+
+    def stop(run, log):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(store, "_submit", stop)
+    (run,) = runs_of(FULL)
+    with pytest.raises(SystemExit, match="goes on"):
+        make_all([run], store, lambda *_: None)
+    assert store.finished(run) is None
+
+
+def test_a_figure_that_is_not_finite_is_no_result(tmp_path, monkeypatch):
+    store = Counting(tmp_path, [])
+    monkeypatch.setattr(store, "_submit", lambda run, log: {"map": float("nan"), "psnr": 20.0})
+    (run,) = runs_of(FULL)
+    _, failed = make_all([run], store, lambda *_: None)
+    assert "not finite: map" in failed[run]
+
+
 def test_rows_change_one_setting_each_of_those_that_a_run_has():
     from lang3dxl_ns.methods import lang3dxl
 
@@ -154,7 +176,7 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     assert [bool(row["mean"]) for row in rows] == [True, True, False, True]
     assert all(0 < row["mean"]["map"]["mean"] <= 1 for row in rows if row["mean"])
     assert rows[2]["not_run"]
-    assert not list((out / "work").glob("runs/*"))
+    assert not (out / "work").exists()
     stamp = (out / "results/scene/full/seed0.json").stat().st_mtime_ns
     Ablation((scene,), out, seeds=1, steps=4, dense_tokens=8, rows=names, clipseg=str(tmp_path / "no")).main()
     assert (out / "results/scene/full/seed0.json").stat().st_mtime_ns == stamp
