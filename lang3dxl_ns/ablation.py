@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,6 @@ from lang3dxl_ns.ablation_report import write_ablation
 from lang3dxl_ns.baselines.rows import CLIPSEG, FULL, TEACHER, Row, choose_rows
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.report import command_line, progress_bar
-from lang3dxl_ns.model_config import SHORT_FIELD_RUN
 from lang3dxl_ns.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 
 
@@ -51,7 +51,7 @@ class Ablation(ComparisonSettings):
     """Train and score the method, the systems that it is compared with, and the method without each of its
     parts, everything else equal.
 
-    A finished run is not made again: the command can be stopped at any moment, and given again, also with
+    A finished run is not made again: the command can be stopped at any moment and given again, also with
     more rows, seeds or scenes. The report is written after every run.
     """
 
@@ -61,6 +61,8 @@ class Ablation(ComparisonSettings):
     """CLIPSeg: a Hugging Face name or a folder. Where it can't be had, its row says "not run here"."""
 
     def main(self) -> None:
+        from lang3dxl_ns.model_config import SHORT_FIELD_RUN
+
         scenes = scene_labels(self.scene)
         with_regions = any((scene / "regions").is_dir() for scene in scenes.values())
         rows = choose_rows(self.rows, self.steps < SHORT_FIELD_RUN, with_regions)
@@ -98,6 +100,8 @@ def make_all(runs, store: ScoredRuns, report) -> tuple[dict[Run, dict[str, float
                 figures[run] = store.make(run)
             except UserError as reason:
                 failed[run] = str(reason)
+            except KeyboardInterrupt:
+                sys.exit(f"\nStopped. Finished runs are in {store.folder}; the same command goes on.")
             bar.advance(task)
             report(figures, failed)
     return figures, failed

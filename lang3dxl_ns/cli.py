@@ -14,6 +14,7 @@ from lang3dxl_ns.ablation import Ablation
 from lang3dxl_ns.demo.scene_writer import DemoScene
 from lang3dxl_ns.demo_run import Demo
 from lang3dxl_ns.doctor import Doctor
+from lang3dxl_ns.error_vs_time import ErrorVsTime
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluate_commands import Evaluate
 from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
@@ -102,6 +103,7 @@ Benchmark = (
     | Annotated[ScaleBenchmark, tyro.conf.subcommand("scale")]
     | Annotated[LookupBenchmark, tyro.conf.subcommand("lookup")]
     | Annotated[Ablation, tyro.conf.subcommand("ablation")]
+    | Annotated[ErrorVsTime, tyro.conf.subcommand("error-vs-time")]
 )
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]

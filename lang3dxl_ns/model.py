@@ -100,7 +100,8 @@ class Lang3DXLModel(AnsweringModel):
             clip, dense = statistics.clip.std, statistics.dense
             std = clip if dense is None else torch.cat([clip, dense.std])
             self.semantic_field.set_output_statistics(torch.cat([clip_mean, dense_mean]), std)
-            self.semantic_field.learn_targets(self.kwargs["metadata"]["clip_targets"])
+            with part("learn targets"):
+                self.semantic_field.learn_targets(self.kwargs["metadata"]["clip_targets"])
         self.downsampler = AttenuatedDownsampler(c.downsampler, len(clip_mean))
         codes = self.semantic_field.initial_codes(self.num_points)
         if codes is not None:

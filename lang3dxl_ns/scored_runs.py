@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shlex
 import shutil
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.trainer import Lang3DXLTrainerConfig
 
 _TIMED_PHOTOS = 3
-_WORST_FIGURES = ("num_rays_per_sec", "fps")
+_UNWANTED = ("num_rays_per_sec", "fps")
 
 
 @dataclass(frozen=True)
@@ -86,20 +87,24 @@ class ScoredRuns:
         """
         path = self._path(run)
         path.parent.mkdir(parents=True, exist_ok=True)
-        work = self.folder / "work"
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            try:
-                figures = pool.submit(
-                    _in_process, run, self.settings, work, path.with_suffix(".log")
-                ).result()
-            except BrokenProcessPool as error:
-                raise UserError("killed, most likely for want of memory") from error
-            except (RuntimeError, MemoryError) as error:
-                raise UserError(f"{error} (see {path.with_suffix('.log')})") from error
-        shutil.rmtree(work / "runs", ignore_errors=True)
+        figures = self._submit(run, path.with_suffix(".log"))
+        if broken := [name for name, value in figures.items() if not math.isfinite(value)]:
+            raise UserError(f"not finite: {', '.join(broken)} (see {path.with_suffix('.log')})")
         result = {"made_with": self._made_with(run), "figures": figures}
         write_atomically(path, json.dumps(result, indent=1, allow_nan=False) + "\n")
         return figures
+
+    def _submit(self, run: Run, log: Path) -> dict[str, float]:
+        work = self.folder / "work"
+        try:
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                return pool.submit(_in_process, run, self.settings, work, log).result()
+        except BrokenProcessPool as error:
+            raise UserError(f"killed, most likely for want of memory (see {log})") from error
+        except (RuntimeError, MemoryError) as error:
+            raise UserError(f"{error} (see {log})") from error
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
 
     def _path(self, run: Run) -> Path:
         return self.folder / "results" / run.label / run.row.name / f"seed{run.seed}.json"
@@ -143,8 +148,8 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
         config = tyro.cli(type(config), args=shlex.split(settings.flags), default=config)
         data = config.pipeline.datamanager
     if run.row.own_targets:
-        # Else rows would overwrite each other's targets.
-        data.cache_dir = work / "targets" / run.label / run.row.name
+        # Else rows would overwrite each other's targets. Made anew in every run, and timed.
+        data.cache_dir = work / "targets"
     config.machine.seed = run.seed
     data.train_cameras_sampling_seed = run.seed
     apply_changes(config, run.row.changes)
@@ -171,14 +176,12 @@ def _in_process(run: Run, settings: RunSettings, work: Path, log: Path) -> dict[
         sys.stdout.flush()
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    return (
-        _score_clipseg(run, settings, work)
-        if run.row.name == CLIPSEG
-        else _train_and_score(run, settings, work)
-    )
+    work_on = _score_clipseg if run.row.name == CLIPSEG else _train_and_score
+    return work_on(run, settings, work)
 
 
 def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
+    from lang3dxl_ns import timing
     from lang3dxl_ns.evaluation.aggregate import average
     from lang3dxl_ns.trainer import Lang3DXLTrainer
 
@@ -186,18 +189,21 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     torch.manual_seed(run.seed)
     trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
     start = time.perf_counter()
-    trainer.setup()
-    set_up = time.perf_counter() - start
+    with timing.measure() as parts:
+        trainer.setup()
+    set_up, learned = time.perf_counter() - start, sum(parts.get("learn targets", ()))
     _reset_peak()
     start = time.perf_counter()
     trainer.train()
+    if trainer.interrupted:  # it ends in good order, but what it has learned is no result
+        raise KeyboardInterrupt
     seconds = time.perf_counter() - start
     peak = _peak()
     figures = average([photo.metrics for photo in trainer.pipeline.evaluate()])
-    figures = {name: value for name, value in figures.items() if name not in _WORST_FIGURES}
+    figures = {name: value for name, value in figures.items() if name not in _UNWANTED}
     return figures | {
-        "setup_seconds": set_up,
-        "train_seconds": seconds,
+        "setup_seconds": set_up - learned,
+        "train_seconds": learned + seconds,
         "train_peak_mb": peak / 2**20,
         "gaussians": trainer.pipeline.model.num_points,
         **_time_answers(trainer.pipeline),

@@ -34,7 +34,11 @@ print(json.dumps(sorted({{m.split(".")[0] for m in sys.modules}})))
 
 def test_lower_layers_import_neither_nerfstudio_nor_cuda_code():
     loaded = json.loads(
-        run(IMPORT_ALL.format(names=modules("components", "rendering", "preparation", "query", "evaluation")))
+        run(
+            IMPORT_ALL.format(
+                names=modules("components", "rendering", "preparation", "query", "evaluation", "baselines")
+            )
+        )
     )
     assert not {"nerfstudio", "gsplat", "tinycudann"} & set(loaded)
 

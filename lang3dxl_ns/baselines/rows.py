@@ -10,6 +10,7 @@ from lang3dxl_ns.errors import UserError
 
 FULL, TEACHER, CLIPSEG = "full", "teacher", "clipseg"
 _FIELD, _DATA = "pipeline.model.semantic_field.", "pipeline.datamanager."
+_OF_TARGETS = ("scale_mode", "scale_range", "single_scale", "dense_tokens")
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Row:
     name: str
     group: str
     label: str
-    changes: Mapping[str, Any] = field(default_factory=dict)
+    changes: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Values by their dotted path in the run's configuration."""
     published: str = ""
     """What Lang3D-XL prints for the same comparison, on HolyScenes."""
@@ -32,7 +33,7 @@ class Row:
     @property
     def own_targets(self) -> bool:
         """Whether the targets differ from those of the other rows."""
-        return any(path.removeprefix(_DATA) in ("scale_mode", "single_scale") for path in self.changes)
+        return any(path.removeprefix(_DATA) in _OF_TARGETS for path in self.changes)
 
 
 def _encoder(name: str, label: str, published: str = "") -> Row:
@@ -84,9 +85,8 @@ def choose_rows(names: Iterable[str], short_run: bool, has_regions: bool) -> lis
     """
     known = {row.name for row in ROWS}
     if unknown := [name for name in names if name not in known]:
-        raise UserError(
-            f"there is no row {', '.join(unknown)}: choose of {', '.join(row.name for row in ROWS)}"
-        )
+        choices = ", ".join(row.name for row in ROWS)
+        raise UserError(f"there is no row {', '.join(unknown)}: choose of {choices}")
     same = {"both" if short_run else "hash", "regions" if has_regions else "no-regions"}
     wanted = set(names) or known - same
     return [row for row in ROWS if row.name in wanted]

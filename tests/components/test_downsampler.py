@@ -389,3 +389,23 @@ def test_the_ablations_resize_to_the_other_grid_and_keep_a_ramp():
     high = upsample_target(low, (30, 40))
     assert high.shape == ramp.shape
     torch.testing.assert_close(high[:, 2:-2], ramp[:, 2:-2])
+
+
+def test_features_and_target_meet_on_the_grid_that_is_asked_for():
+    features, target, sides = seeded(24, 32, 4), seeded(6, 8, 4), (0.2,)
+    for match, grid in (("attenuated", (6, 8)), ("resize-features", (6, 8)), ("resize-target", (24, 32))):
+        module = AttenuatedDownsampler(DownsamplerConfig(hidden=3, match=match), 4)
+        found, wanted, weight = module.match(features, target.to(features), sides)
+        assert found.shape == wanted.shape == (*grid, 4)
+        assert weight.shape == grid
+        assert (module.network is None) is (match != "attenuated")
+
+
+def test_resized_features_are_those_inside_the_mask():
+    module = AttenuatedDownsampler(DownsamplerConfig(match="resize-features"), 2)
+    features = torch.full((12, 12, 2), 3.0)
+    mask = torch.ones(12, 12, dtype=torch.bool)
+    features[:, :5], mask[:, :5] = 100.0, False
+    found, _, weight = module.match(features, torch.zeros(5, 5, 2), (0.3,), mask)
+    torch.testing.assert_close(found[weight > 0], torch.full_like(found[weight > 0], 3.0))
+    assert (found[weight == 0] == 0).all() and (weight == 0).any()

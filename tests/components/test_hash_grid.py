@@ -208,7 +208,21 @@ def test_initial_entries_are_small_and_follow_the_generator():
     assert 0.9e-4 < first.table.abs().max() <= 1e-4
 
 
-@pytest.mark.parametrize("dim", [1, 5])
+@pytest.mark.parametrize("dim", [1, 7])
 def test_other_dimensions_are_refused(dim):
     with pytest.raises(ValueError, match="input_dim"):
         HashGrid(dim, 4, 2, 8, 4, 24)
+
+
+def test_a_grid_of_no_levels_has_no_features():
+    grid = HashGrid(3, 0, 4, 8, 4, 24)
+    assert grid(torch.rand(5, 3)).shape == (5, 0)
+    assert grid.output_dim == 0
+
+
+def test_six_dimensions_interpolate_between_distinct_vertices():
+    grid = make_grid(6, levels=1, lowest=6, highest=6, log2_table_size=16)
+    x = torch.full((2, 6), 0.3)
+    x[1, 5] = 0.8
+    assert not torch.equal(*grid(x))
+    torch.testing.assert_close(grid(x[:1] + 1e-7), grid(x[:1]), rtol=0, atol=1e-8)

@@ -269,15 +269,17 @@ def test_the_config_has_every_setting():
 def test_wrong_settings_are_explained():
     with pytest.raises(UserError, match="choose one of auto, default, short, paper, official"):
         SemanticFieldConfig("large").resolved()
-    with pytest.raises(UserError, match="2 to 3"):
-        SemanticFieldConfig("official", code_dim=4).resolved()
-    with pytest.raises(UserError, match="2 to 4"):
-        SemanticFieldConfig("short", code_dim=5).resolved()
+    with pytest.raises(UserError, match="2 to 5"):
+        SemanticFieldConfig("official", code_dim=6).resolved()
+    with pytest.raises(UserError, match="2 to 6"):
+        SemanticFieldConfig("short", code_dim=7).resolved()
+    with pytest.raises(UserError, match="fourier_frequencies"):
+        SemanticFieldConfig("short", levels=0, fourier_frequencies=0).resolved()
     with pytest.raises(UserError, match="at least one"):
         SemanticFieldConfig("short", hidden_layers=0).resolved()
 
 
-@pytest.mark.parametrize("code_dim", [2, 4])
+@pytest.mark.parametrize("code_dim", [2, 4, 6])
 def test_other_code_sizes_decode(code_dim):
     assert make_field("short", code_dim=code_dim).decode_clip(make_codes(3, code_dim)).shape == (3, 512)
 
@@ -343,3 +345,18 @@ def test_a_grid_keeps_at_least_one_level_and_not_more_than_it_has():
     assert grid.levels_in(len(grid.table)) == 8 and grid.levels_in(3) is None
     with pytest.raises(ValueError, match="8 levels"):
         grid.keep_levels(9)
+
+
+def test_fourier_features_alone_decode_and_teach_the_codes():
+    field = make_field("short", levels=0)
+    codes = make_codes(5).requires_grad_()
+    field(codes)[0].square().sum().backward()
+    assert codes.grad.abs().max() > 0
+    field.set_progress(0.5)
+
+
+def test_a_picture_has_three_channels_whatever_the_code():
+    for code_dim in (2, 3, 6):
+        picture = make_field("short", code_dim=code_dim).picture(make_codes(4, code_dim).reshape(2, 2, -1))
+        assert picture.shape == (2, 2, 3)
+        assert picture.min() >= 0 and picture.max() <= 1

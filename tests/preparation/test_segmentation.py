@@ -69,6 +69,8 @@ def test_clipsegs_mask_is_where_its_probability_is_a_half(models):
     clipseg = load_text_segmenter(find_text_segmenter(models["clipseg"], ""), "cpu")
     mask = clipseg.segment(image.permute(1, 2, 0), ["tower"])
     assert torch.equal(mask, logits.reshape(32, 32).sigmoid() >= 0.5)
+    (probability,) = clipseg.probabilities(image.permute(1, 2, 0), ["tower"])
+    torch.testing.assert_close(probability, logits.reshape(32, 32).sigmoid())
 
 
 def test_boxes_are_those_of_transformers_own_postprocessing(models):

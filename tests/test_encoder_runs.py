@@ -1,0 +1,78 @@
+"""Runs with the encoders that the method is compared with, through the trainer."""
+
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+
+from lang3dxl_ns.baselines.encoders import EncoderConfig
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+
+
+def run(train, scene, name, **changes):
+    encoder = EncoderConfig(name, autoencoder_steps=20)
+    return train(scene, iterations=6, pipeline__model__encoder=encoder, **changes)
+
+
+@pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "langsplat", "direct", "lifting"])
+def test_an_encoder_trains_gives_features_of_the_targets_width_and_is_the_same_once_loaded(
+    train, scene, name
+):
+    trainer = run(train, scene, name)
+    model = trainer.pipeline.model.eval()
+    camera, batch = next(iter(trainer.pipeline.datamanager.fixed_indices_eval_dataloader))
+    metrics, images = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
+    assert model.semantic_field.decode_clip(model.rendered_codes).shape[-1] == batch["clip_target"].shape[-1]
+    assert images["semantics"].shape[-1] == 3
+    assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is (name != "langsplat")
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
+    loaded = pipeline.model.eval()
+    loaded.get_outputs_for_camera(camera)
+    torch.testing.assert_close(loaded.rendered_codes, model.rendered_codes)
+
+
+@pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "direct"])
+def test_what_an_encoder_trains_moves_and_geometry_is_left_to_the_colours(train, scene, name):
+    alone = train(scene, iterations=6, semantics=False).pipeline.model
+    model = run(train, scene, name).pipeline.model
+    torch.testing.assert_close(model.means, alone.means)
+    if "codes" in model.gauss_params:
+        assert model.codes.abs().max() > 0
+    trained = [p for group in model.semantic_field.parameter_groups().values() for p in group]
+    assert all(p.grad is not None and p.grad.abs().max() > 0 for p in trained)
+
+
+def test_only_fmgs_has_an_alignment_loss(train, scene):
+    for name in ("lang3dxl", "fmgs"):
+        trainer = run(train, scene, name)
+        assert ("alignment" in trainer.pipeline.last_losses) is (name == "fmgs")
+
+
+def test_lifting_comes_near_the_targets_and_learns_nothing_semantic_before(train, scene):
+    trainer = run(train, scene, "lifting")
+    assert set(trainer.pipeline.last_losses) == {"rgb"}
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    assert metrics["clip_l1"] < metrics["clip_l1_of_mean"] * 1.5
+    assert not trainer.pipeline.model.codes.requires_grad
+
+
+@pytest.mark.parametrize(
+    "field", [SemanticFieldConfig("short", levels=0), SemanticFieldConfig("short", code_dim=6)]
+)
+def test_fields_of_the_ablation_train(train, scene, field):
+    trainer = train(scene, iterations=3, pipeline__model__semantic_field=field)
+    assert torch.isfinite(trainer.pipeline.last_losses["clip"])
+
+
+@pytest.mark.parametrize("match", ["resize-features", "resize-target"])
+def test_without_the_downsampler_codes_learn_all_the_same(train, scene, match):
+    trainer = train(scene, iterations=3, pipeline__model__downsampler__match=match)
+    assert trainer.pipeline.model.codes.grad.abs().max() > 0
+    assert trainer.pipeline.model.downsampler.network is None
+
+
+def test_crops_of_one_size_are_the_middle_of_the_range(train, scene, tmp_path):
+    options = {"scale_mode": "relative", "scale_range": (0.4, 0.9), "single_scale": True}
+    options["cache_dir"] = tmp_path / "targets"
+    trainer = train(scene, iterations=2, **{f"pipeline__datamanager__{k}": v for k, v in options.items()})
+    _, batch = trainer.pipeline.datamanager.next_train(0)
+    assert batch["crop_sides"] == [pytest.approx(0.6, abs=0.02)]
