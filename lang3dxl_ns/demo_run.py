@@ -152,7 +152,7 @@ class Demo:
         return config
 
     def _report(self, photos: list[EvaluatedPhoto], trainer: Lang3DXLTrainer) -> dict[str, Any]:
-        from lang3dxl_ns.pipeline import average
+        from lang3dxl_ns.evaluation.aggregate import average
 
         means = average([photo.metrics for photo in photos], with_deviation=True)
         report: dict[str, Any] = {

@@ -16,7 +16,7 @@ from scenes import write_scene
 
 from lang3dxl_ns import presets
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.holyscenes import GroundTruth
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.preparation.companions import companion, inside
 from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.preparation.physical_scale import read_reconstruction
