@@ -58,7 +58,7 @@ def address(run):
         subprocess.Popen([*command, *options], stdout=output, stderr=subprocess.STDOUT) as server,
     ):
         try:
-            for _ in range(300):
+            for _ in range(900):
                 assert server.poll() is None, log.read_text()[-3000:]
                 if "Only this machine can open" in log.read_text():
                     break
@@ -79,7 +79,7 @@ def page(address):
     with playwright.sync_playwright() as p:
         browser = p.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
         page = browser.new_page(viewport={"width": 1100, "height": 700})
-        page.set_default_timeout(120_000)
+        page.set_default_timeout(240_000)
         page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(address)
@@ -96,14 +96,14 @@ def picture(page) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 
-def settled(page, unlike: np.ndarray | None = None, seconds: float = 60) -> np.ndarray:
-    """The view once it stays as it is, and differs from another."""
+def settled(page, unlike: np.ndarray | None = None, seconds: float = 240) -> np.ndarray:
+    """The view once it shows something, stays as it is, and differs from another."""
     last = picture(page)
     for _ in range(int(seconds)):
         time.sleep(1)
         now = picture(page)
         differs = unlike is None or (np.abs(now - unlike).max(2) > 40).mean() > 0.02
-        if differs and np.abs(now - last).mean() < 0.5:
+        if differs and now.std() > 5 and np.abs(now - last).mean() < 0.5:
             return now
         last = now
     raise AssertionError("the view doesn't settle, or hasn't changed")
@@ -122,7 +122,7 @@ def box(page, label: str):
 
 def test_from_a_typed_word_to_where_it_is(page):
     plain = settled(page)
-    assert plain.std() > 5 and heat(plain) < 0.01
+    assert heat(plain) < 0.01
     # CLIP has random weights here: with a threshold of 0 something is found for sure.
     threshold = box(page, "Threshold")
     threshold.fill("0")
