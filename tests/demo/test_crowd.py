@@ -20,7 +20,7 @@ def test_a_crowd_is_a_scene_of_mixed_sizes_with_tracks_and_depends_on_its_seed_a
     assert {(photo.width, photo.height) for photo in model.photos.values()} == set(SIZES)
     for photo in model.photos.values():
         assert len(photo.points) >= 20
-        x, y, z = photo.camera_from_world @ np.column_stack([photo.points, np.ones(len(photo.points))]).T
+        x, _y, z = photo.camera_from_world @ np.column_stack([photo.points, np.ones(len(photo.points))]).T
         assert np.allclose(photo.fx * x / z + photo.cx, photo.pixels[:, 0], atol=1e-3)
         with Image.open(scenes[0] / "images" / photo.name) as image:
             assert image.size == (photo.width, photo.height)
