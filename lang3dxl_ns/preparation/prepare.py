@@ -44,8 +44,6 @@ _CHECKERS = 4
 _PATIENCE_S = 1.0
 """Between looks at photos that another process is making."""
 _BUSY = "another process is making it"
-_CROP_PIXELS = 224**2
-"""Of a crop as CLIP takes it."""
 
 
 @dataclass
@@ -237,7 +235,9 @@ def _make(
     with_clip, with_dense = any(task.clip for task in missing), any(task.dense for task in missing)
     maker = _Maker(config, store, regions, with_clip, with_dense)
     store.remove_leftovers()
-    _announce(missing, photos, _bytes_needed(missing, *maker.models(str(device))), config, store)
+    clip, dense = maker.models(str(device))
+    crop_size = clip.crop_size if clip else 0
+    _announce(missing, photos, _bytes_needed(missing, clip, dense), crop_size, config, store)
     workers = Workers(config.workers, config.engine, config.address)
     with progress("encoding photos", len(missing)) as advance:
         while missing:
@@ -339,7 +339,12 @@ def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: 
 
 
 def _announce(
-    missing: list[_Task], photos: int, needed: int, config: PreparationConfig, store: FeatureStore
+    missing: list[_Task],
+    photos: int,
+    needed: int,
+    crop_size: int,
+    config: PreparationConfig,
+    store: FeatureStore,
 ) -> None:
     """Says what is going to be made, and what it takes. Raises UserError when the disk is too small."""
     store.make_folder()
@@ -354,7 +359,9 @@ def _announce(
         f"preparing {len(missing)} photos ({photos - len(missing)} of {photos} are ready): "
         f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free"
     )
-    memory = config.workers * _memory_needed([task.photo for task in missing], config.crop_batch)
+    memory = config.workers * _memory_needed(
+        [task.photo for task in missing], config.crop_batch * crop_size**2
+    )
     say(
         f"memory beside the encoders: about {_gigabytes(memory)}"
         + (f" in {config.workers} processes" if config.workers > 1 else "")
@@ -362,11 +369,11 @@ def _announce(
     )
 
 
-def _memory_needed(photos: Sequence[Photo], crop_batch: int) -> int:
+def _memory_needed(photos: Sequence[Photo], crop_pixels: int) -> int:
     """Of one process, about: the largest photo in float32, thrice (as read, padded, cut into windows), and a
     batch of crops with the first layers' activations, a dozen times its size."""
     largest = max(photo.width * photo.height for photo in photos)
-    return 3 * 4 * (3 * largest + 12 * crop_batch * _CROP_PIXELS)
+    return 3 * 4 * (3 * largest + 12 * crop_pixels)
 
 
 def _gigabytes(size: int) -> str:

@@ -159,7 +159,7 @@ def _connect(ray: Any, workers: Workers) -> None:
         own = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
         settings = {"address": workers.address} if workers.address else own
         ray.init(log_to_driver=False, **settings)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except Exception as error:  # Ray raises this very class where its processes don't start in time
         raise UserError(
             f"no Ray cluster answers at {workers.address or 'this machine'} ({error}): give --address, or "
             "start one with `ray start --head`"

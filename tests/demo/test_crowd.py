@@ -1,0 +1,42 @@
+"""Scenes for measuring: as many photos as asked for, of mixed sizes, with tracks, the same for one seed."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from lang3dxl_ns.demo.crowd import SIZES, write_crowd
+from lang3dxl_ns.preparation.physical_scale import read_reconstruction
+from lang3dxl_ns.scale_benchmark import ScaleBenchmark, markdown
+
+
+def test_a_crowd_is_a_scene_of_mixed_sizes_with_tracks_and_depends_on_its_seed_alone(tmp_path):
+    scenes = [
+        write_crowd(tmp_path / str(i), photos=12, points=100, seed=seed) for i, seed in enumerate((1, 1, 2))
+    ]
+    model = read_reconstruction(scenes[0] / "sparse" / "0")
+    assert len(model.photos) == 12
+    assert len(model.points) == 100
+    assert {(photo.width, photo.height) for photo in model.photos.values()} == set(SIZES)
+    for photo in model.photos.values():
+        assert len(photo.points) >= 20
+        x, _y, z = photo.camera_from_world @ np.column_stack([photo.points, np.ones(len(photo.points))]).T
+        assert np.allclose(photo.fx * x / z + photo.cx, photo.pixels[:, 0], atol=1e-3)
+        with Image.open(scenes[0] / "images" / photo.name) as image:
+            assert image.size == (photo.width, photo.height)
+    first, again, other = ([p.read_bytes() for p in sorted(s.rglob("*.jpg"))] for s in scenes)
+    assert first == again != other
+
+
+def test_the_report_holds_a_row_per_measurement_and_the_prediction():
+    row = dict.fromkeys(("preparation_s", "step_s", "data_s"), 0.25)
+    row |= dict.fromkeys(
+        (f"{part}_bytes" for part in ("preparation", "training", "evaluation", "store")), 3e8
+    )
+    row |= {"photos": 1234, "gaussians": 56789}
+    report = markdown(
+        ScaleBenchmark(out=Path("x")), {"photos": [row | {"in memory": row}], "gaussians": [row]}
+    )
+    assert "1,234, all in memory | 0 | 300 | 300 | 300 | 250" in report
+    assert "| 56,789 |" in report
+    assert "Written before measuring" in report
