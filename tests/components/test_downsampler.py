@@ -394,8 +394,8 @@ def test_the_ablations_resize_to_the_other_grid_and_keep_a_ramp():
 def test_features_and_target_meet_on_the_grid_that_is_asked_for():
     features, target, sides = seeded(24, 32, 4), seeded(6, 8, 4), (0.2,)
     for match, grid in (("attenuated", (6, 8)), ("resize-features", (6, 8)), ("resize-target", (24, 32))):
-        module = AttenuatedDownsampler(DownsamplerConfig(hidden=3, match=match), 4)
-        found, wanted, weight = module.match(features, target.to(features), sides)
+        module = AttenuatedDownsampler(DownsamplerConfig(hidden=3, match=match), 4).double()
+        found, wanted, weight = module.match(features, target, sides)
         assert found.shape == wanted.shape == (*grid, 4)
         assert weight.shape == grid
         assert (module.network is None) is (match != "attenuated")

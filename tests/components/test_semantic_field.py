@@ -349,7 +349,7 @@ def test_a_grid_keeps_at_least_one_level_and_not_more_than_it_has():
 
 def test_fourier_features_alone_decode_and_teach_the_codes():
     field = make_field("short", levels=0)
-    codes = make_codes(5).requires_grad_()
+    codes = make_codes(5, 3).requires_grad_()
     field(codes)[0].square().sum().backward()
     assert codes.grad.abs().max() > 0
     field.set_progress(0.5)
