@@ -79,11 +79,12 @@ class PhotoCollectionDataParser(ColmapDataParser):
             self._read_collection()
             self._mention_what_is_not_used()
         # The parent would demand a mask for every photo; ours are optional and found per photo.
-        masks, self.config.masks_path = self.config.masks_path, None
+        masks, scaled = self.config.masks_path, self.config.auto_scale_poses
+        self.config.masks_path, self.config.auto_scale_poses = None, scaled and self._cameras_are_apart
         try:
             outputs = super()._generate_dataparser_outputs(split, **kwargs)
         finally:
-            self.config.masks_path = masks
+            self.config.masks_path, self.config.auto_scale_poses = masks, scaled
         outputs.metadata["photos"] = [self.photos[path] for path in outputs.image_filenames]
         # From here on the transform is again that of the model's own coordinates.
         transform = outputs.dataparser_transform.double()
@@ -139,6 +140,15 @@ class PhotoCollectionDataParser(ColmapDataParser):
         if self.config.center_method == "none":
             return np.zeros(3)
         return np.mean([geometry.centre for geometry in self.reconstruction.photos.values()], axis=0)
+
+    @property
+    def _cameras_are_apart(self) -> bool:
+        """Whether there is a distance between cameras that the scene can be scaled by."""
+        assert self.reconstruction is not None
+        centres = np.array([geometry.centre for geometry in self.reconstruction.photos.values()])
+        distances = np.linalg.norm(self.reconstruction.points - centres.mean(axis=0), axis=1)
+        typical = np.median(distances) if len(distances) else 0.0
+        return bool(np.ptp(centres, axis=0).max() > 1e-6 * typical)
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: torch.Tensor, scale_factor: float) -> dict:
         """The model's points in the scene's frame, with their colours."""

@@ -65,9 +65,8 @@ def optimise(
 ) -> Run:
     """Adam as in training (epsilon 1e-15) at constant rates, on pixels that show a few kinds of things."""
     generator = torch.Generator().manual_seed(0)
-    config = SemanticFieldConfig(
-        preset="short", log2_table_size=9
-    )  # small: a step takes a millisecond or two
+    # A small table: a step then takes a millisecond or two.
+    config = SemanticFieldConfig(preset="short", log2_table_size=9)
     model = SemanticField(config, CHANNELS, generator=generator)
     kinds = torch.randn(KINDS, CHANNELS, generator=generator)
     targets = kinds[torch.randint(KINDS, (PIXELS,), generator=generator)]
