@@ -108,7 +108,7 @@ def _plain(row: Row | Run) -> dict[str, Any]:
 
 def _markdown(rows: list[Row], optimisations: list[Run], command: str, machine: str) -> str:
     total = len(rows) + len(optimisations)
-    passed = sum(not row.misses for row in (*rows, *optimisations))
+    passed = sum(not row.misses for row in rows) + sum(not run.misses for run in optimisations)
     components = list(dict.fromkeys(row.component for row in rows))
     tables = "\n\n".join(_section([row for row in rows if row.component == name]) for name in components)
     return f"""# Numerics: error against run time on stiff and extreme cases
@@ -210,7 +210,7 @@ def _cells(row: Row) -> list[str | None]:
 
 
 def _figure(value: float | None) -> str:
-    return "–" if value is None else "0" if value == 0 else f"{value:.0e}"
+    return "–" if value is None or math.isnan(value) else "0" if value == 0 else f"{value:.0e}"
 
 
 def _plot(rows: list[Row]) -> bytes:
@@ -231,6 +231,9 @@ def _plot(rows: list[Row]) -> bytes:
         "#7f8c8d",
         "#d98880",
         "#117864",
+        "#f1c40f",
+        "#ff6fb5",
+        "#5dade2",
     )
     colours = {name: palette[i % len(palette)] for i, name in enumerate(components)}
     markers = {"float32": "o", "float64": "s", "bf16": "^", "fp16": "v", "tf32": "D"}

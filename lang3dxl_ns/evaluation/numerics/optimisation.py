@@ -71,9 +71,12 @@ def optimise(
     kinds = torch.randn(KINDS, CHANNELS, generator=generator)
     targets = kinds[torch.randint(KINDS, (PIXELS,), generator=generator)]
     codes = model.initial_codes(PIXELS, generator).requires_grad_()
-    groups = [([codes], code_rate), (model.encoding_parameters(), grid_rate)]
-    groups += [(model.decoder_parameters(), decoder_rate)]
-    adam = torch.optim.Adam([{"params": list(p), "lr": rate} for p, rate in groups], eps=1e-15, fused=True)
+    groups: list[tuple[list[Tensor], float]] = [
+        ([codes], code_rate),
+        ([*model.encoding_parameters()], grid_rate),
+        ([*model.decoder_parameters()], decoder_rate),
+    ]
+    adam = torch.optim.Adam([{"params": p, "lr": rate} for p, rate in groups], eps=1e-15, fused=True)
     weight = torch.ones(1, BATCH)
 
     def step() -> float:

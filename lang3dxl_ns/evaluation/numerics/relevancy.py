@@ -88,7 +88,8 @@ def _problem(
         return {"relevancy": found}
 
     def reference(given: Maps) -> Maps:
-        return {"relevancy": relevancy_reference(*given.values(), temperature)}
+        vectors = given["features"], given["queries"], given["canonical"]
+        return {"relevancy": relevancy_reference(*vectors, temperature)}
 
     constants = frozenset(leaves) if outputs_only else frozenset[str]()
     # A feature along a phrase has no slope towards it.
