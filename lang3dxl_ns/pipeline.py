@@ -255,7 +255,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         queries = scene.queries(scene.prompts(self.query))
         CONSOLE.log(f"Looking for {self.query}; lookup table: {scene.lookup}")
         colours = ClipColours.of(scene.decode, scene.rendered_codes())
-        return Asked(scene.scorer(), queries, scene.config.min_alpha, colours=colours)
+        return Asked(scene.scorer(), queries, min_alpha=scene.config.min_alpha, colours=colours)
 
     def finish_training(self) -> None:
         """What is left to do when the last iteration is: lift features, where the encoder learns none."""

@@ -71,6 +71,8 @@ class Asked:
     scorer: CodeScorer
     """Through the lookup table, or exact."""
     queries: Queries = NOTHING
+    confining: int = 0
+    """How many of the last queries say where the others may be found at all, instead of what to show."""
     min_alpha: float = 0.3
     """Coverage below which a pixel shows nothing."""
     highest: float | None = None
@@ -95,6 +97,9 @@ class Asked:
         if len(prompts):
             maps = codes.new_zeros(len(prompts), *keep.shape)
             maps[:, keep] = prompts.relevancy_of_cosines(cosines, self.scorer.temperature)
+            if self.confining:
+                maps, within = maps.tensor_split([-self.confining])
+                maps = maps * (within.amax(0) > 0.5)
             found = relevancy_outputs(image, maps.unbind(), self.display, self.highest)
         if self.colours is not None:
             found["clip_pca"] = torch.zeros_like(image)

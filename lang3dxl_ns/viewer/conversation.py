@@ -41,7 +41,15 @@ class Question:
     """Prompts and their vectors."""
 
     prompts: tuple[Prompt, ...] = ()
+    foreground: str = ""
+    """Prompts outside of which nothing is found."""
     queries: Queries = field(default=NOTHING)
+    """Of the prompts, then of the foreground."""
+
+    @property
+    def confining(self) -> int:
+        """How many queries are the foreground's."""
+        return len(self.queries) - len(self.prompts)
 
 
 class Conversation:
@@ -87,18 +95,20 @@ class Conversation:
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
-    def ask(self, text: str, negatives: str = "") -> Question:
-        """Take up a question: prompts as `parse_prompts` reads them, and phrases that all of them must beat,
-        separated by commas or semicolons. Raises UserError where nothing is asked for, or can be."""
+    def ask(self, text: str, negatives: str = "", foreground: str = "") -> Question:
+        """Take up a question: prompts as `parse_prompts` reads them; phrases that all of them must beat,
+        separated by commas or semicolons; and prompts outside of which nothing is found, if any. Raises
+        UserError where nothing is asked for, or can be."""
         scene = self._scene_now()
         phrases = [" ".join(phrase.split()) for phrase in negatives.replace(";", ",").split(",")]
         extra = tuple(phrase for phrase in phrases if phrase)
         prompts = tuple(replace(p, negatives=p.negatives + extra) for p in scene.prompts(text))
         start = time.perf_counter()
-        queries = scene.queries(prompts)
+        foreground = foreground.strip()
+        queries = scene.queries([*prompts, *(scene.prompts(foreground) if foreground else ())])
         self.seconds.text = time.perf_counter() - start
         self.found = None
-        self.question = Question(prompts, queries)
+        self.question = Question(prompts, foreground, queries)
         return self.question
 
     def forget(self) -> None:
@@ -109,7 +119,7 @@ class Conversation:
         """Where in the scene each prompt is found. Looks at the scene and makes the lookup table first, which
         takes long once per checkpoint."""
         question, scene = self.question, self._scene_now()
-        scene.config.threshold = self.display.threshold
+        scene.config.threshold, scene.config.foreground = self.display.threshold, question.foreground
         exact = self.exact or not self.prepare(scene)
         found = scene.find(question.prompts, exact=exact)
         if question is self.question:
@@ -172,6 +182,7 @@ class Conversation:
         asked = Asked(
             CodeScorer(field_.decode_clip, table),
             self.question.queries,
+            self.question.confining,
             highest=self._highest(),
             colours=self._colours_of(field_.decode_clip, codes, alpha) if in_colour else None,
             display=self.display,

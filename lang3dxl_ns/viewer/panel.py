@@ -102,8 +102,9 @@ class AskPanel(ViewerControl):
         gui = self._gui
         self._question = gui.add_text("Look for", "", hint="Several prompts are separated by ;")
         self._negatives = gui.add_text("But not", "", hint="Things that it is not: arcades, doors")
+        self._foreground = gui.add_text("Only on", "", hint="What it has to be a part of: building")
         button = gui.add_button("Ask", icon=viser.Icon.SEARCH)
-        for box in (self._question, self._negatives):
+        for box in (self._question, self._negatives, self._foreground):
             box.on_update(lambda _: self._asker.submit(self._guarded(self._ask), _TYPING))
         button.on_click(lambda _: self._asker.submit(self._guarded(self._ask)))
         self._message = gui.add_markdown(INVITATION)
@@ -195,7 +196,7 @@ class AskPanel(ViewerControl):
             self._say(INVITATION)
             return
         self._say("…")
-        self.conversation.ask(text, self._negatives.value)
+        self.conversation.ask(text, self._negatives.value, self._foreground.value)
         self._show_output("overlay")
         self._finder.submit(self._guarded(self._find))
 

@@ -61,9 +61,9 @@ def panel(viewer):
     type_in(panel, "")
 
 
-def type_in(panel, text: str, negatives: str = "") -> str:
+def type_in(panel, text: str, negatives: str = "", foreground: str = "") -> str:
     """The panel's message once a text is dealt with."""
-    panel._negatives.value, panel._question.value = negatives, text
+    panel._negatives.value, panel._foreground.value, panel._question.value = negatives, foreground, text
     panel._asker.submit(panel._guarded(panel._ask))
     time.sleep(0.05)  # setting a box tells the panel in a thread of viser's
     assert panel._asker.wait() and panel._finder.wait()
@@ -140,6 +140,17 @@ def test_where_nothing_matches_the_panel_says_what_to_do(panel):
     panel._take_settings()
     assert "Lower it, or try other words" in type_in(panel, "xyzzy")
     assert panel._results is None
+
+
+def test_nothing_is_found_outside_the_foreground(panel, viewer):
+    type_in(panel, "dome")
+    alone = frame(viewer)["relevancy_0"]
+    type_in(panel, "dome; tower", foreground="tower")
+    both = frame(viewer)
+    inside = both["relevancy_1"] > 0.5
+    assert "relevancy_2" not in both and inside.any() and not inside.all()
+    torch.testing.assert_close(both["relevancy_0"], alone * inside)
+    assert panel.conversation.question.foreground == "tower"
 
 
 def test_negatives_count_for_every_prompt(panel):
