@@ -142,13 +142,14 @@ def _summary(rows: list[Row], components: Iterable[str]) -> str:
         own = [row for row in rows if row.component == name]
         single = [row for row in own if row.mode in ("float32", "float64")]
         best = [row for row in single if row.mode == "float32"] or single
+        slopes = [row.gradient_rms for row in best if row.gradient_rms is not None]
         table.append(
             [
                 name,
                 len(own),
                 sum(not row.misses for row in own),
                 _figure(_median(row.output_rms for row in best)),
-                _figure(_median(row.gradient_rms for row in best if row.gradient_rms is not None)),
+                _figure(_median(slopes) if slopes else None),
                 f"{_median(row.ms for row in best):.2g}",
             ]
         )
@@ -210,7 +211,7 @@ def _cells(row: Row) -> list[str | None]:
 
 
 def _figure(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else "0" if value == 0 else f"{value:.0e}"
+    return "–" if value is None else "0" if value == 0 else f"{value:.0e}"
 
 
 def _plot(rows: list[Row]) -> bytes:
