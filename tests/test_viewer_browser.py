@@ -117,7 +117,7 @@ def heat(pixels: np.ndarray) -> float:
 
 def box(page, label: str):
     """The input beside a label."""
-    return page.locator(f"label:has-text('{label}')").locator("xpath=following::input[1]")
+    return page.locator(f"label:has-text('{label}')").locator("xpath=following::input[not(@type='hidden')][1]")
 
 
 def test_from_a_typed_word_to_where_it_is(page):
