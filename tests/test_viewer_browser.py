@@ -110,33 +110,33 @@ def settled(page, unlike: np.ndarray | None = None, seconds: float = 240) -> np.
 
 
 def heat(pixels: np.ndarray) -> float:
-    """Share of the pixels in the reds of the heat map, which the scene has none of."""
-    red, green, blue = pixels[..., 0], pixels[..., 1], pixels[..., 2]
-    return float(((red > 110) & (red > 2 * green) & (red > 2 * blue)).mean())
+    """Share of the pixels in colours as strong as the heat map's."""
+    return float((np.ptp(pixels, axis=2) > 100).mean())
 
 
 def box(page, label: str):
     """The input beside a label."""
-    return page.locator(f"label:has-text('{label}')").locator("xpath=following::input[1]")
+    return page.locator(f"label:has-text('{label}')").locator(
+        "xpath=following::input[not(@type='hidden')][1]"
+    )
 
 
 def test_from_a_typed_word_to_where_it_is(page):
     plain = settled(page)
-    assert heat(plain) < 0.01
     # CLIP has random weights here: with a threshold of 0 something is found for sure.
     threshold = box(page, "Threshold")
     threshold.fill("0")
     threshold.press("Enter")
     box(page, "Look for").fill("dome; door")
     with_heat = settled(page, unlike=plain)
-    assert heat(with_heat) > 0.02
+    assert heat(with_heat) > heat(plain) + 0.05
     fly = page.get_by_role("button", name="dome")
     fly.wait_for()
     fly.click()
-    page.get_by_text(re.compile("1 of ")).wait_for()
+    page.get_by_text(re.compile(r"^1 of \d+:")).wait_for()
     there = settled(page, unlike=with_heat)
     page.get_by_role("button", name="Next").click()
-    page.get_by_text(re.compile("2 of ")).wait_for()
+    page.get_by_text(re.compile(r"^2 of \d+:")).wait_for()
     settled(page, unlike=there)
 
 
