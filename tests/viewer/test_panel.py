@@ -70,9 +70,11 @@ def type_in(panel, text: str, negatives: str = "", foreground: str = "") -> str:
     return panel._message.content
 
 
-def frame(viewer) -> dict[str, torch.Tensor]:
-    """What a frame of the viewer consists of, rendered as its threads do it."""
-    camera, model = as_nerfstudio(viewer.pipeline.panel._photos[0].camera), viewer.get_model()
+def frame(viewer, photo: str | None = None) -> dict[str, torch.Tensor]:
+    """What a frame of the viewer consists of, rendered as its threads do it; of the first photo's camera."""
+    panel, model = viewer.pipeline.panel, viewer.get_model()
+    chosen = next(p for p in panel._photos if photo in (None, p.name))
+    camera = as_nerfstudio(chosen.camera)
     with viewer.train_lock, torch.no_grad():
         training = model.training
         model.eval()
@@ -143,14 +145,18 @@ def test_where_nothing_matches_the_panel_says_what_to_do(panel):
 
 
 def test_nothing_is_found_outside_the_foreground(panel, viewer):
-    type_in(panel, "dome")
-    alone = frame(viewer)["relevancy_0"]
-    type_in(panel, "dome; tower", foreground="tower")
-    both = frame(viewer)
-    inside = both["relevancy_1"] > 0.5
-    assert "relevancy_2" not in both and inside.any() and not inside.all()
-    torch.testing.assert_close(both["relevancy_0"], alone * inside)
-    assert panel.conversation.question.foreground == "tower"
+    type_in(panel, "dome; tower")
+    alone = frame(viewer)
+    type_in(panel, "dome", foreground="tower; arch")
+    confined = frame(viewer)
+    assert "relevancy_1" not in confined
+    type_in(panel, "tower; arch")
+    parts = frame(viewer)
+    inside = torch.maximum(parts["relevancy_0"], parts["relevancy_1"]) > 0.5
+    torch.testing.assert_close(confined["relevancy_0"], alone["relevancy_0"] * inside)
+    type_in(panel, "dome", foreground="dome")
+    itself = frame(viewer)["relevancy_0"]
+    torch.testing.assert_close(itself, alone["relevancy_0"] * (alone["relevancy_0"] > 0.5))
 
 
 def test_negatives_count_for_every_prompt(panel):
@@ -161,15 +167,17 @@ def test_negatives_count_for_every_prompt(panel):
 
 def test_settings_change_what_is_shown(panel, viewer):
     type_in(panel, "dome")
-    before = frame(viewer)["overlay"]
+    # Where something else than the scene's highest relevancy is the view's own.
+    least = min(panel.conversation.found[0].viewpoints, key=lambda v: v.score).name
+    before = frame(viewer, least)["overlay"]
     for name, value in (("opacity", 0.2), ("colour_map", "magma"), ("stretch", PER_SCENE)):
         setting = getattr(panel, f"_{name}")
         kept, setting.value = setting.value, value
         panel._take_settings()
-        assert not torch.equal(frame(viewer)["overlay"], before), name
+        assert not torch.equal(frame(viewer, least)["overlay"], before), name
         setting.value = kept
     panel._take_settings()
-    torch.testing.assert_close(frame(viewer)["overlay"], before)
+    torch.testing.assert_close(frame(viewer, least)["overlay"], before)
 
 
 def test_the_look_of_a_photo_can_be_chosen(panel, viewer):
