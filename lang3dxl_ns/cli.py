@@ -10,23 +10,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from lang3dxl_ns.ablation import Ablation
+from lang3dxl_ns.benchmarks.ablation import Ablation
+from lang3dxl_ns.benchmarks.error_vs_time import ErrorVsTime
+from lang3dxl_ns.benchmarks.lookup import LookupBenchmark
+from lang3dxl_ns.benchmarks.rasterizer import RasterizerBenchmark
+from lang3dxl_ns.benchmarks.scale import ScaleBenchmark
+from lang3dxl_ns.benchmarks.training import TrainingBenchmark
+from lang3dxl_ns.commands.demo import Demo
+from lang3dxl_ns.commands.doctor import Doctor
+from lang3dxl_ns.commands.evaluate import Evaluate
+from lang3dxl_ns.commands.query import Export, Query
+from lang3dxl_ns.commands.view import View
 from lang3dxl_ns.demo.scene_writer import DemoScene
-from lang3dxl_ns.demo_run import Demo
-from lang3dxl_ns.doctor import Doctor
-from lang3dxl_ns.error_vs_time import ErrorVsTime
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluate_commands import Evaluate
-from lang3dxl_ns.evaluation.benchmark_rasterizer import RasterizerBenchmark
 from lang3dxl_ns.evaluation.numerics.command import Numerics
-from lang3dxl_ns.lookup_benchmark import LookupBenchmark
 from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.presets import Preset
-from lang3dxl_ns.query_commands import Export, Query
-from lang3dxl_ns.scale_benchmark import ScaleBenchmark
-from lang3dxl_ns.training_benchmark import TrainingBenchmark
-from lang3dxl_ns.viewer.command import View
 
 if TYPE_CHECKING:
     from lang3dxl_ns.datamanager import Lang3DXLDataManager

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from lang3dxl_ns.benchmarks.scale import ScaleBenchmark, markdown
 from lang3dxl_ns.demo.crowd import SIZES, write_crowd
 from lang3dxl_ns.preparation.physical_scale import read_reconstruction
-from lang3dxl_ns.scale_benchmark import ScaleBenchmark, markdown
 
 
 def test_a_crowd_is_a_scene_of_mixed_sizes_with_tracks_and_depends_on_its_seed_alone(tmp_path):

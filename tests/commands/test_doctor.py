@@ -5,8 +5,8 @@ import sys
 import pytest
 import torch
 
-from lang3dxl_ns import doctor
 from lang3dxl_ns.cli import main
+from lang3dxl_ns.commands import doctor
 
 
 def test_all_that_is_not_fine_comes_with_a_remedy_and_nothing_secret(tmp_path, monkeypatch, capsys):

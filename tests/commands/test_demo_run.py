@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from lang3dxl_ns.demo_run import Demo
+from lang3dxl_ns.commands.demo import Demo
 from lang3dxl_ns.errors import UserError
 
 pytestmark = pytest.mark.slow

@@ -9,8 +9,8 @@ from painted_scene import CODES, painted_scene, render
 from PIL import Image
 
 from lang3dxl_ns import cli, scene_loading
+from lang3dxl_ns.commands.query import file_names
 from lang3dxl_ns.files import slugs
-from lang3dxl_ns.query_commands import file_names
 
 
 @pytest.fixture

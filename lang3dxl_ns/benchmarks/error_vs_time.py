@@ -9,9 +9,10 @@ from typing import Any
 
 import torch
 
-from lang3dxl_ns.ablation import ComparisonSettings, make_all
-from lang3dxl_ns.ablation_report import Figures, spread
 from lang3dxl_ns.baselines.rows import ROWS, Row
+from lang3dxl_ns.benchmarks.ablation import ComparisonSettings, make_all
+from lang3dxl_ns.benchmarks.ablation_report import Figures, spread
+from lang3dxl_ns.benchmarks.scored_runs import Run, ScoredRuns, scene_labels
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.report import (
     command_line,
@@ -20,7 +21,6 @@ from lang3dxl_ns.evaluation.report import (
     write_atomically,
     write_report,
 )
-from lang3dxl_ns.scored_runs import Run, ScoredRuns, scene_labels
 
 DEFAULT = Row("default", "train", "as it is")
 STAGES = {"prepare": "setup_seconds", "train": "train_seconds", "query": "query_seconds"}

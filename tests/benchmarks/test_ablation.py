@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from lang3dxl_ns.ablation import Ablation, make_all, teacher_figures
-from lang3dxl_ns.ablation_report import spread, table_of_runs, write_ablation
 from lang3dxl_ns.baselines.rows import CLIPSEG, FULL, ROWS, TEACHER, Row, choose_rows
+from lang3dxl_ns.benchmarks.ablation import Ablation, make_all, teacher_figures
+from lang3dxl_ns.benchmarks.ablation_report import spread, table_of_runs, write_ablation
+from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, apply_changes, scene_labels
 from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.scored_runs import Run, RunSettings, ScoredRuns, apply_changes, scene_labels
 
 BY_NAME = {row.name: row for row in ROWS}
 

@@ -6,11 +6,11 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from lang3dxl_ns.ablation_report import write_ablation
 from lang3dxl_ns.baselines.rows import CLIPSEG, FULL, TEACHER, Row, choose_rows
+from lang3dxl_ns.benchmarks.ablation_report import write_ablation
+from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.report import command_line, progress_bar
-from lang3dxl_ns.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 
 
 @dataclass

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from lang3dxl_ns.error_vs_time import DEFAULT, ErrorVsTime, mark_front, stage_points
-from lang3dxl_ns.scored_runs import Run, apply_changes
+from lang3dxl_ns.benchmarks.error_vs_time import DEFAULT, ErrorVsTime, mark_front, stage_points
+from lang3dxl_ns.benchmarks.scored_runs import Run, apply_changes
 
 
 def test_every_knob_is_a_setting_of_a_run_and_has_a_name_of_its_own():

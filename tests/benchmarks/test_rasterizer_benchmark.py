@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation import benchmark_rasterizer as benchmark
-from lang3dxl_ns.evaluation.benchmark_rasterizer import (
+from lang3dxl_ns.benchmarks import rasterizer as benchmark
+from lang3dxl_ns.benchmarks.rasterizer import (
     DENSE,
     OURS,
     RasterizerBenchmark,
@@ -18,6 +17,7 @@ from lang3dxl_ns.evaluation.benchmark_rasterizer import (
     forward_backward,
     pass_costs,
 )
+from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.evaluation.dense_rasterizer import count_pairs, render_dense
 from lang3dxl_ns.evaluation.rasterizer_scenes import Case, make_problem, synthetic_cloud
 

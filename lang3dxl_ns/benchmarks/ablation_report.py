@@ -10,8 +10,8 @@ from statistics import mean, stdev
 from typing import Any
 
 from lang3dxl_ns.baselines.rows import FULL, TEACHER, Row
+from lang3dxl_ns.benchmarks.scored_runs import Run
 from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, write_atomically, write_report
-from lang3dxl_ns.scored_runs import Run
 
 FIGURES = {
     "map": ("mAP", ".3f"),

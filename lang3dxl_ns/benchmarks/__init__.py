@@ -1,0 +1,1 @@
+"""What `lang3dxl benchmark` runs: error beside time and memory."""

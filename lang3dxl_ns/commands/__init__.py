@@ -1,0 +1,1 @@
+"""What people type after `lang3dxl`."""
