@@ -296,7 +296,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             if index in self._left_out:
                 continue
             try:
-                camera, batch = self._batch(self.train_dataset, index, self.train_dataset.read(index))
+                camera, batch = self._batch(self.train_dataset, index, self._read(self.train_dataset, index))
             except UserError as reason:
                 CONSOLE.log(f"[yellow]{photo.name} is left out: {reason}")
                 continue

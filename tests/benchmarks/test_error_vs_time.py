@@ -13,13 +13,16 @@ from lang3dxl_ns.benchmarks.scored_runs import Run, apply_changes
 def test_every_knob_is_a_setting_of_a_run_and_has_a_name_of_its_own():
     from lang3dxl_ns.methods import lang3dxl
 
-    rows = ErrorVsTime((Path("s"),), Path("o")).rows()
+    settings = ErrorVsTime((Path("s"),), Path("o"))
+    rows, default = settings.rows(), deepcopy(lang3dxl.config)
+    data = default.pipeline.datamanager
+    data.camera_res_scale_factor, data.dense_tokens = settings.scale, settings.dense_tokens
     assert len({row.name for row in rows}) == len(rows)
     assert {row.group for row in rows} == {"prepare", "train", "query"}
     for row in rows[1:]:
-        config = deepcopy(lang3dxl.config)
+        config = deepcopy(default)
         apply_changes(config, row.changes)
-        assert config != lang3dxl.config, row.name
+        assert config != default, row.name
     assert len(ErrorVsTime((Path("s"),), Path("o"), quick=True).rows()) < len(rows)
 
 
