@@ -23,7 +23,7 @@ def lift_features(model: Lang3DXLModel, photos: Iterable[tuple[Cameras, dict]]) 
 
     def composite(camera: Cameras, carried: Parameter) -> Float[Tensor, "h w d"]:
         model.gauss_params["codes"] = carried
-        return model.get_outputs(camera)["bottleneck"]
+        return model.get_outputs(camera)["codes"]
 
     def views():
         for camera, batch in photos:

@@ -134,7 +134,7 @@ class Lang3DXLTrainerConfig(ReadsOlder, TrainerConfig):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """As config.yml is read: tell the data manager where the run is, which only this class knows."""
-        self.__dict__.update(state)
+        super().__setstate__(state)
         if self.timestamp != "{timestamp}":
             self.pipeline.datamanager.run = self.get_base_dir()
 

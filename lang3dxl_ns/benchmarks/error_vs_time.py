@@ -39,7 +39,7 @@ _KNOBS: dict[str, tuple[str, Sequence[Any]]] = {
     "decode size": (f"{_MODEL}decode_size", ((32, 40), (80, 120))),
     "downsampler width": (f"{_MODEL}downsampler.hidden", (0, 64)),
     "16-bit": ("mixed_precision", (True,)),
-    "dense tokens": (f"{_DATA}dense_tokens", (24, 48, 64)),
+    "dense tokens": (f"{_DATA}dense_tokens", (24, 64)),
     "crops of one size": (f"{_DATA}single_scale", (True,)),
 }
 _STEPS = (1 / 8, 1 / 4, 1 / 2, 2)

@@ -153,13 +153,17 @@ def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[It
             ray.shutdown()
 
 
-def _connect(ray: Any, workers: Workers) -> None:
+def _connect(ray: Any, workers: Workers, attempts: int = 2) -> None:
+    """Ray gives its processes half a minute to start; the second attempt finds them in the disk's cache."""
+    # A cluster of our own listens on this machine alone.
+    own = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    settings = {"address": workers.address} if workers.address else own
     try:
-        # A cluster of our own listens on this machine alone.
-        own = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-        settings = {"address": workers.address} if workers.address else own
         ray.init(log_to_driver=False, **settings)
     except Exception as error:  # Ray raises this very class where its processes don't start in time
+        ray.shutdown()
+        if attempts > 1:
+            return _connect(ray, workers, attempts - 1)
         raise UserError(
             f"no Ray cluster answers at {workers.address or 'this machine'} ({error}): give --address, or "
             "start one with `ray start --head`"

@@ -52,8 +52,13 @@ def test_a_process_that_is_killed_ends_in_a_sentence_and_keeps_what_was_done(tmp
 
 
 @pytest.mark.slow
-def test_on_a_ray_cluster_a_worker_that_is_killed_is_replaced_and_the_job_ends_complete(tmp_path):
+def test_on_a_ray_cluster_a_worker_that_is_killed_is_replaced_and_the_job_ends_complete(
+    tmp_path, monkeypatch
+):
     pytest.importorskip("ray")
+    # The cluster's processes have to find this file.
+    paths = (str(Path(__file__).parent), os.environ.get("PYTHONPATH", ""))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
     maker = Squares(tmp_path, deadly=5)
     try:
         found = dict(Workers(2, "ray").run(maker, range(12), "cpu"))
