@@ -22,7 +22,7 @@ def test_an_encoder_trains_gives_features_of_the_targets_width_and_is_the_same_o
     camera, batch = next(iter(trainer.pipeline.datamanager.fixed_indices_eval_dataloader))
     metrics, images = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
     assert model.semantic_field.decode_clip(model.rendered_codes).shape[-1] == batch["clip_target"].shape[-1]
-    assert images["semantics"].shape[-1] == 3
+    assert images["bottleneck"].shape[-1] == 3
     assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is (name != "langsplat")
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
     loaded = pipeline.model.eval()
