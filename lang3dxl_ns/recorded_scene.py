@@ -10,7 +10,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.query.scene_file import SCENE_FILE, SceneFile
 
 
@@ -31,10 +30,7 @@ class RecordedSceneDataParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         scene = SceneFile.read(self.config.run / SCENE_FILE)
         chosen = [photo for photo in scene.photos if (photo.split == "train") == (split == "train")]
-        folder = Path(scene.data)
-        photos = [
-            Photo(p.name, folder / p.name, None, p.width, p.height, p.fx, p.fy, p.cx, p.cy) for p in chosen
-        ]
+        photos = [photo.photo(Path(scene.data)) for photo in chosen]
         cameras = Cameras(
             camera_to_worlds=torch.tensor([p.camera_to_world for p in chosen]),
             fx=torch.tensor([p.fx for p in chosen]),

@@ -58,13 +58,13 @@ class ScenePhoto:
             self.height,
         )
 
-    def foreground(self) -> Bool[Tensor, "h w"] | None:
-        """Where the photo counts; None where all of it does, as where its mask is no longer there."""
-        path = None if self.mask is None else Path(self.mask)
-        photo = Photo(
+    def photo(self, folder: Path = Path()) -> Photo:
+        """The photo in its folder, without its mask where that is no longer there."""
+        mask = None if self.mask is None else Path(self.mask)
+        return Photo(
             name=self.name,
-            path=Path(),
-            mask_path=path if path is not None and path.is_file() else None,
+            path=folder / self.name,
+            mask_path=mask if mask is not None and mask.is_file() else None,
             width=self.width,
             height=self.height,
             fx=self.fx,
@@ -74,7 +74,10 @@ class ScenePhoto:
             distortion=tuple(self.distortion),
             fisheye=self.fisheye,
         )
-        return photo.read_mask()
+
+    def foreground(self) -> Bool[Tensor, "h w"] | None:
+        """Where the photo counts; None where all of it does, as where its mask is no longer there."""
+        return self.photo().read_mask()
 
 
 @dataclass(frozen=True)

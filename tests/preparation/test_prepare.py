@@ -7,10 +7,6 @@ import contextlib
 import errno
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -420,62 +416,6 @@ def test_what_another_process_is_making_is_waited_for_and_not_made_twice(
     assert run(photos, config, store).reader.names == NAMES
     assert (calls["clip"], calls["dense"]) == (2, 2)
     assert asked == [*NAMES, NAMES[1]]
-
-
-PREPARE = """
-import sys
-from lang3dxl_ns.preparation import prepare as module
-from lang3dxl_ns.preparation.photo import Photo
-from pathlib import Path
-from lang3dxl_ns.preparation.store import FeatureStore
-folder, clip = Path(sys.argv[1]), sys.argv[2]
-paths = sorted((folder / "images").glob("*.png"))
-photos = [Photo(p.name, p, None, 100, 80, 90.0, 90.0, 50.0, 40.0) for p in paths]
-made, build = [], module.build_clip_target
-module.build_clip_target = lambda *arguments: made.append(1) or build(*arguments)
-config = module.PreparationConfig(clip=clip, dense="none", workers=int(sys.argv[3]), engine=sys.argv[4])
-targets = module.prepare(photos, None, config, [0.4, 0.8], FeatureStore(folder / "store"), "cpu")
-print("names", len(targets.reader.names), "made", len(made))
-"""
-
-
-@pytest.mark.slow
-def test_two_commands_on_one_folder_share_the_work_and_one_that_is_killed_loses_nothing(tmp_path, models):
-    photos = [make_photo(tmp_path, f"{i:03d}.png", i) for i in range(40)]
-    words = [sys.executable, "-c", PREPARE, str(tmp_path), models["clip"], "1", "local"]
-    first, second = (subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(2))
-    clip = tmp_path / "store" / "clip"
-    while not (clip.is_dir() and len(list(clip.glob("*.safetensors"))) >= 4):
-        assert second.poll() is None
-        time.sleep(0.02)
-    first.send_signal(signal.SIGKILL)
-    output = second.communicate(timeout=300)[0]
-    assert "names 40" in output
-    by_second = int(output.split()[-1])
-    first.wait()
-    store = FeatureStore(tmp_path / "store")
-    assert all(store.read("clip", photo.name) for photo in photos)
-    assert by_second <= 40  # and what the first had made was not made again:
-    assert len(list(clip.glob("*.safetensors"))) == 40
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["local", "ray"])
-def test_several_workers_make_what_one_makes(tmp_path, models, engine):
-    if engine == "ray":
-        pytest.importorskip("ray")
-    for i in range(6):
-        make_photo(tmp_path, f"{i}.png", i)
-    found = {}
-    for workers, how in (("1", "local"), ("2", engine)):
-        words = [sys.executable, "-c", PREPARE, str(tmp_path), models["clip"], workers, how]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=500)
-        assert "names 6" in done.stdout, done.stdout + done.stderr
-        store = FeatureStore(tmp_path / "store")
-        found[workers] = [store.read("clip", f"{i}.png")["features"].clone() for i in range(6)]
-        shutil.rmtree(tmp_path / "store")
-    for one, several in zip(found["1"], found["2"], strict=True):
-        torch.testing.assert_close(one, several)
 
 
 def test_the_configuration_is_a_command_line(models):
