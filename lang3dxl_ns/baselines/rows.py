@@ -10,7 +10,8 @@ from lang3dxl_ns.errors import UserError
 
 FULL, TEACHER, CLIPSEG = "full", "teacher", "clipseg"
 _FIELD, _DATA = "pipeline.model.semantic_field.", "pipeline.datamanager."
-_OF_TARGETS = ("scale_mode", "scale_range", "single_scale", "dense_tokens")
+OF_TARGETS = ("scale_mode", "scale_range", "scales", "dense_tokens")
+"""Settings of the data manager that decide what the targets are."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Row:
     @property
     def own_targets(self) -> bool:
         """Whether the targets differ from those of the other rows."""
-        return any(path.removeprefix(_DATA) in _OF_TARGETS for path in self.changes)
+        return any(path.removeprefix(_DATA) in OF_TARGETS for path in self.changes)
 
 
 def _encoder(name: str, label: str, published: str = "") -> Row:
@@ -61,7 +62,7 @@ ROWS = (
     Row("alpha", "field", "codes divided by coverage", {"pipeline.model.divide_codes_by_alpha": True}),
     Row("lerf", "supervision", "LERF's pyramid instead of physical scales",
         {f"{_DATA}scale_mode": "relative"}, "windows AP .64"),
-    Row("single-scale", "supervision", "crops of one size", {f"{_DATA}single_scale": True}),
+    Row("single-scale", "supervision", "crops of one size", {f"{_DATA}scales": 1}),
     Row("no-ad-lr", "supervision", "without attenuated downsampler (LR)",
         {"pipeline.model.downsampler.match": "resize-features"}, "windows AP .53"),
     Row("no-ad-hr", "supervision", "without attenuated downsampler (HR)",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +39,8 @@ class ComparisonSettings:
     """Dense features per side of a photo."""
     ns_train: str = ""
     """More flags of `ns-train lang3dxl`, for all rows."""
+    workers: int = 1
+    """Runs at a time. They slow each other down: where seconds matter, leave it at 1."""
 
     def run_settings(self, clipseg: str = "") -> RunSettings:
         """The part of it that decides what a run gives."""
@@ -74,7 +78,9 @@ class Ablation(ComparisonSettings):
             for row in rows
             if row.trains or (row.name == CLIPSEG and seed == 0)
         ]
-        figures, failed = make_all(runs, store, lambda *found: self._write(rows, list(scenes), *found))
+        figures, failed = make_all(
+            runs, store, lambda *found: self._write(rows, list(scenes), *found), self.workers
+        )
         print(f"Wrote {self.out / 'ablation.md'} ({len(figures)} runs, {len(failed)} not run)")
 
     def _write(
@@ -86,24 +92,32 @@ class Ablation(ComparisonSettings):
         )
 
 
-def make_all(runs, store: ScoredRuns, report) -> tuple[dict[Run, dict[str, float]], dict[Run, str]]:
+def make_all(
+    runs: Sequence[Run],
+    store: ScoredRuns,
+    report: Callable[[Mapping[Run, dict], Mapping[Run, str]], None],
+    workers: int = 1,
+) -> tuple[dict[Run, dict[str, float]], dict[Run, str]]:
     """Figures of all runs and reasons of those that failed; `report` gets both after each that was made."""
     figures = {run: found for run in runs if (found := store.finished(run)) is not None}
     failed: dict[Run, str] = {}
     missing = [run for run in runs if run not in figures]
     report(figures, failed)
-    with progress_bar() as bar:
+    with progress_bar() as bar, ThreadPoolExecutor(workers) as threads:
         task = bar.add_task("training", total=len(missing))
-        for run in missing:
-            bar.update(task, description=run.name)
-            try:
-                figures[run] = store.make(run)
-            except UserError as reason:
-                failed[run] = str(reason)
-            except KeyboardInterrupt:
-                sys.exit(f"\nStopped. Finished runs are in {store.folder}; the same command goes on.")
-            bar.advance(task)
-            report(figures, failed)
+        made: dict[Future, Run] = {threads.submit(store.make, run): run for run in missing}
+        try:
+            for future in as_completed(made):
+                run = made[future]
+                try:
+                    figures[run] = future.result()
+                except UserError as reason:
+                    failed[run] = str(reason)
+                bar.update(task, advance=1, description=run.name)
+                report(figures, failed)
+        except KeyboardInterrupt:
+            threads.shutdown(cancel_futures=True)
+            sys.exit(f"\nStopped. Finished runs are in {store.folder}; the same command goes on.")
     return figures, failed
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from lang3dxl_ns.baselines.rows import ROWS, Row
+from lang3dxl_ns.baselines.rows import OF_TARGETS, ROWS, Row
 from lang3dxl_ns.benchmarks.ablation import ComparisonSettings, make_all
 from lang3dxl_ns.benchmarks.ablation_report import Figures, spread
 from lang3dxl_ns.benchmarks.scored_runs import Run, ScoredRuns, scene_labels
@@ -22,7 +22,8 @@ from lang3dxl_ns.evaluation.report import (
     write_report,
 )
 
-DEFAULT = Row("default", "train", "as it is")
+DEFAULT = ROWS[0]
+"""The method as it is: the same runs as in the ablation, which the two share in one folder."""
 STAGES = {"prepare": "setup_seconds", "train": "train_seconds", "query": "query_seconds"}
 """The time that a stage's knobs are held against."""
 QUALITIES = {"map": ("mAP", 1), "clip_l1": ("CLIP L1", -1), "psnr": ("PSNR, dB", 1)}
@@ -30,7 +31,6 @@ QUALITIES = {"map": ("mAP", 1), "clip_l1": ("CLIP L1", -1), "psnr": ("PSNR, dB",
 
 _MODEL, _DATA = "pipeline.model.", "pipeline.datamanager."
 _KNOBS: dict[str, tuple[str, Sequence[Any]]] = {
-    "photo size": (f"{_DATA}camera_res_scale_factor", (0.25, 0.35, 0.75)),
     "densify above": (f"{_MODEL}densify_grad_thresh", (5e-4, 1e-3, 1.0)),
     "hash levels": (f"{_MODEL}semantic_field.levels", (4, 12)),
     "hash features": (f"{_MODEL}semantic_field.features_per_level", (2, 8)),
@@ -40,10 +40,12 @@ _KNOBS: dict[str, tuple[str, Sequence[Any]]] = {
     "downsampler width": (f"{_MODEL}downsampler.hidden", (0, 64)),
     "16-bit": ("mixed_precision", (True,)),
     "dense tokens": (f"{_DATA}dense_tokens", (24, 64)),
-    "crops of one size": (f"{_DATA}single_scale", (True,)),
+    "crop sizes": (f"{_DATA}scales", (1, 3)),
 }
 _STEPS = (1 / 8, 1 / 4, 1 / 2, 2)
 """Multiples of the run's length."""
+_SIZES = (1 / 2, 0.7, 1.5)
+"""Multiples of the photos' size in training."""
 
 
 @dataclass
@@ -67,26 +69,32 @@ class ErrorVsTime(ComparisonSettings):
         ((label, path),) = scenes.items()
         runs = [Run(row, path, label, seed) for seed in range(self.seeds) for row in self.rows()]
         store = ScoredRuns(self.out, self.run_settings())
-        figures, failed = make_all(runs, store, self._write)
+        figures, failed = make_all(runs, store, self._write, self.workers)
         print(f"Wrote {self.out / 'error_vs_time.md'} ({len(figures)} runs, {len(failed)} not run)")
 
     def rows(self) -> list[Row]:
         """The default, the other settings of every knob, and the encoders to compare with."""
         rows = [DEFAULT]
-        multiples = (_STEPS[0], _STEPS[-1]) if self.quick else _STEPS
-        for multiple in multiples:
-            steps = max(round(self.steps * multiple), 1)
+        made_anew = {f"{_DATA}dense_tokens": self.dense_tokens}  # as it is, but with targets of its own
+        rows.append(Row("targets", "prepare", "as it is", made_anew))
+        for steps in (max(round(self.steps * multiple), 1) for multiple in self._some(_STEPS)):
             rows.append(Row(f"steps-{steps}", "train", f"{steps} iterations", {"max_num_iterations": steps}))
-        for knob, (path, values) in _KNOBS.items():
-            if knob == "16-bit" and not torch.cuda.is_available():
-                continue  # nerfstudio has it on GPUs alone
-            stage = "prepare" if path.removeprefix(_DATA) in ("dense_tokens", "single_scale") else "train"
-            for value in (values[0], values[-1]) if self.quick and len(values) > 1 else values:
+        sizes = [round(self.scale * multiple, 4) for multiple in _SIZES]
+        knobs = {"photo size": (f"{_DATA}camera_res_scale_factor", sizes), **_KNOBS}
+        if not torch.cuda.is_available():
+            del knobs["16-bit"]  # nerfstudio has it on GPUs alone
+        for knob, (path, values) in knobs.items():
+            stage = "prepare" if path.removeprefix(_DATA) in OF_TARGETS else "train"
+            for value in self._some(values):
                 text = "–".join(map(str, value)) if isinstance(value, tuple) else str(value)
                 rows.append(Row(f"{knob}-{text}".replace(" ", "-"), stage, f"{knob} {text}", {path: value}))
         return rows + [
             Row(row.name, "query", row.label, row.changes) for row in ROWS if row.group == "encoder"
         ]
+
+    def _some(self, values: Sequence[Any]) -> Sequence[Any]:
+        """The extremes, with `quick`."""
+        return (values[0], values[-1]) if self.quick and len(values) > 1 else values
 
     def _write(self, figures: Figures, failed: Mapping[Run, str]) -> None:
         points = stage_points(self.rows(), figures)

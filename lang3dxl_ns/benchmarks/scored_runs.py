@@ -15,6 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from itertools import islice
 from multiprocessing import get_context
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -95,9 +96,9 @@ class ScoredRuns:
         return figures
 
     def _submit(self, run: Run, log: Path) -> dict[str, float]:
-        work = self.folder / "work"
+        work = self.folder / "work" / run.name.replace("/", "-")
         try:
-            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            with ProcessPoolExecutor(1, mp_context=_processes()) as pool:
                 return pool.submit(_in_process, run, self.settings, work, log).result()
         except BrokenProcessPool as error:
             raise UserError(f"killed, most likely for want of memory (see {log})") from error
@@ -111,7 +112,19 @@ class ScoredRuns:
 
     def _made_with(self, run: Run) -> dict[str, Any]:
         made_with = {"scene": str(run.scene), "changes": dict(run.row.changes), **asdict(self.settings)}
+        if run.row.name != CLIPSEG:
+            del made_with["clipseg"]
         return json.loads(json.dumps(made_with))
+
+
+def _processes() -> BaseContext:
+    """How a run's process starts. Without a GPU as a copy of one that has loaded the libraries, which takes ten
+    seconds; what has seen a GPU can't be copied."""
+    if torch.cuda.is_available():
+        return get_context("spawn")
+    processes = get_context("forkserver")
+    processes.set_forkserver_preload(["lang3dxl_ns.trainer", "lang3dxl_ns.methods"])
+    return processes
 
 
 def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:

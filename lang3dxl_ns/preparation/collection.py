@@ -59,14 +59,14 @@ def plan_crops(
         )
     if config.scale_mode == "relative" or not len(reconstruction.points):
         scales = relative_scales() if config.scale_range is None else relative_scales(7, *config.scale_range)
-        scales = _kept(scales, config)
+        scales = _resampled(scales, config)
         reasons = [f"crops of {_listed(scales)} of the photo's width"]
         if config.scale_mode != "relative":
             reasons.insert(0, "the scene has no 3D points: crops have no size in the world")
         return CropPlan(scales, None, None, reasons)
     sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
     chosen = _scale_range(config, reconstruction, sizes)
-    scales = _kept(physical_scales(chosen.smallest, chosen.largest), config)
+    scales = _resampled(physical_scales(chosen.smallest, chosen.largest), config)
     reasons = [
         f"{chosen.reason}; crop sides: {_listed(scales)} (--pipeline.datamanager.scale-range overrides)"
     ]
@@ -121,8 +121,17 @@ def _scale_range(
     return ScaleRange(smallest, largest, f"crops of {smallest:.3g}–{largest:.3g} world units, as asked")
 
 
-def _kept(scales: list[float], config: PreparationConfig) -> list[float]:
-    return [math.sqrt(scales[0] * scales[-1])] if config.single_scale else scales
+def _resampled(scales: list[float], config: PreparationConfig) -> list[float]:
+    """As many sizes as are asked for, evenly over the same range (by ratio); the middle, of one."""
+    if config.scales is None:
+        return scales
+    if config.scales < 1:
+        raise UserError(
+            f"crops of {config.scales} sizes are none: pass --pipeline.datamanager.scales 1 or more"
+        )
+    if config.scales == 1:
+        return [math.sqrt(scales[0] * scales[-1])]
+    return np.geomspace(scales[0], scales[-1], config.scales).tolist()
 
 
 def _listed(values: Sequence[float]) -> str:

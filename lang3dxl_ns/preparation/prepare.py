@@ -63,8 +63,9 @@ class PreparationConfig:
     scale_mode: Literal["auto", "physical", "relative"] = "auto"
     """Whether crops have one size in the world or one size in the photo. In the world, the crop that fits a
     window fits it in near and far photos; `auto`: in the world, unless the photos agree in scale anyway."""
-    single_scale: bool = False
-    """Crops of one size alone, the (geometric) middle of the range."""
+    scales: int | None = None
+    """Number of crop sizes in the range; 1 is its (geometric) middle alone. Left out: two per doubling, or 7
+    where crops have no size in the world."""
     pixel_distance: DistanceRule = "median"
     """How far a photo's subject is: the camera's distance to the median of its tracked points, to their mean,
     or to the mean of those away from the edges ("mean-inner", the paper's text)."""

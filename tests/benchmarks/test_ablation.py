@@ -3,6 +3,7 @@
 import csv
 import json
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,25 @@ def test_a_stopped_run_is_no_result(tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match="goes on"):
         make_all([run], store, lambda *_: None)
     assert store.finished(run) is None
+
+
+def test_runs_at_a_time_give_what_one_after_the_other_gives(tmp_path):
+    runs = runs_of(FULL, "fmgs", CLIPSEG, seeds=3)
+    one, many = (
+        make_all(runs, Counting(tmp_path / str(n), [], fails=(CLIPSEG,)), lambda *_: None, workers=n)
+        for n in (1, 4)
+    )
+    assert one == many and len(one[0]) == 6
+
+
+def test_clipsegs_folder_decides_about_its_own_row_alone(tmp_path):
+    made: list[str] = []
+    runs = runs_of(FULL, CLIPSEG)
+    for folder in ("here", "there"):
+        store = Counting(tmp_path, made)
+        store.settings = replace(store.settings, clipseg=folder)
+        make_all(runs, store, lambda *_: None)
+    assert made == ["here/full/0", "here/clipseg/0", "here/clipseg/0"]
 
 
 def test_a_figure_that_is_not_finite_is_no_result(tmp_path, monkeypatch):

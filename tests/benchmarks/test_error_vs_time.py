@@ -18,8 +18,10 @@ def test_every_knob_is_a_setting_of_a_run_and_has_a_name_of_its_own():
     data = default.pipeline.datamanager
     data.camera_res_scale_factor, data.dense_tokens = settings.scale, settings.dense_tokens
     assert len({row.name for row in rows}) == len(rows)
-    assert {row.group for row in rows} == {"prepare", "train", "query"}
+    assert {row.group for row in rows[1:]} == {"prepare", "train", "query"}
     for row in rows[1:]:
+        if row.name == "targets":  # the default's
+            continue
         config = deepcopy(default)
         apply_changes(config, row.changes)
         assert config != default, row.name
@@ -40,7 +42,7 @@ def test_on_the_front_is_what_nothing_else_beats_in_time_and_quality():
 def test_a_row_counts_in_the_stages_that_it_measures():
     sweep = ErrorVsTime((Path("s"),), Path("o"))
     rows = sweep.rows()
-    tokens = next(row for row in rows if "dense_tokens" in str(row.changes))
+    tokens = next(row for row in rows if row.name == "dense-tokens-24")
     measured = {"map": 0.5, "clip_l1": 0.3, "psnr": 20.0, "setup_seconds": 9.0, "train_seconds": 60.0}
     figures = {
         Run(row, Path("s"), "s", seed): measured | {"render_ms": 20.0, "answer_ms": 80.0 + 40 * seed}
