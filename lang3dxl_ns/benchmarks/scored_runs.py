@@ -96,7 +96,7 @@ class ScoredRuns:
         return figures
 
     def _submit(self, run: Run, log: Path) -> dict[str, float]:
-        work = self.folder / "work" / run.name.replace("/", "-")
+        work = self.folder / f"work-{run.label}-{run.row.name}-{run.seed}"
         try:
             with ProcessPoolExecutor(1, mp_context=_processes()) as pool:
                 return pool.submit(_in_process, run, self.settings, work, log).result()
@@ -118,8 +118,8 @@ class ScoredRuns:
 
 
 def _processes() -> BaseContext:
-    """How a run's process starts. Without a GPU as a copy of one that has loaded the libraries, which takes ten
-    seconds; what has seen a GPU can't be copied."""
+    """How a run's process starts: without a GPU as a copy of one that has loaded the libraries, which takes
+    ten seconds; what has seen a GPU can't be copied."""
     if torch.cuda.is_available():
         return get_context("spawn")
     processes = get_context("forkserver")
