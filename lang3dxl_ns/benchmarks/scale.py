@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lang3dxl_ns.evaluation.report import (
     command_line,
@@ -19,6 +20,11 @@ from lang3dxl_ns.evaluation.report import (
     markdown_table,
     write_report,
 )
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.trainer import Lang3DXLTrainerConfig
+
+Found = TypeVar("Found")
 
 PREDICTION = """Written before measuring. *Photos*: preparation holds one photo, one batch of crops and the
 encoders: constant. Training holds the cache (here `cache_gb`), what is read ahead, the Gaussians and one
@@ -39,49 +45,53 @@ class ScaleBenchmark:
     photos: tuple[int, ...] = (200, 500, 1000, 2000)
     """Numbers of photos."""
     gaussians: tuple[int, ...] = (10_000, 50_000, 100_000, 400_000)
-    """Numbers of Gaussians, with the fewest photos."""
-    steps: int = 60
+    """Numbers of Gaussians, with few photos."""
+    steps: int = 200
     """Training steps of each run with photos."""
     gaussian_steps: int = 5
     """Training steps of each run with Gaussians."""
+    pairs: int = 3
+    """Runs with the fewest photos, out of core and all in memory in turn, to compare their steps."""
+    workers: tuple[int, ...] = (1, 2)
+    """Numbers of processes that prepare the fewest photos, one after the other."""
     cache_gb: float = 0.01
     """Memory for photos and targets: small, so that it is full with the fewest photos already."""
-    workers: int = 1
-    """Processes that prepare."""
     encoders: str = "builtin"
     """CLIP and dense encoder; none measures photos alone."""
 
     def main(self) -> None:
         """Each measurement has a process of its own, so that its peak memory is its own."""
-        rows: dict[str, list[dict[str, Any]]] = {"photos": [], "gaussians": []}
-        for count in self.photos:
+        rows: dict[str, list[dict[str, Any]]] = {"photos": [], "pairs": [], "workers": [], "gaussians": []}
+        for count in sorted(self.photos):
             scene = _Measured(
-                self.out / f"photos-{count}",
-                count,
-                2_000,
-                self.steps,
-                self.cache_gb,
-                self.workers,
-                self.encoders,
+                self.out / f"photos-{count}", count, 2_000, self.steps, self.cache_gb, self.encoders
             )
-            rows["photos"].append(_in_own_process(scene))
+            rows["photos"].append(_in_own_process(_measure, scene))
             if count == min(self.photos):
-                rows["photos"][-1]["in memory"] = _in_own_process(replace(scene, cache_gb=1e3))
+                self._measure_variants(scene, rows)
             shutil.rmtree(scene.folder)
             self._write(rows)
         for count in self.gaussians:
             scene = _Measured(
-                self.out / f"gaussians-{count}",
-                20,
-                count,
-                self.gaussian_steps,
-                self.cache_gb,
-                encoders=self.encoders,
+                self.out / f"gaussians-{count}", 20, count, self.gaussian_steps, self.cache_gb, self.encoders
             )
-            rows["gaussians"].append(_in_own_process(scene))
+            rows["gaussians"].append(_in_own_process(_measure, scene))
             shutil.rmtree(scene.folder)
             self._write(rows)
         print(f"Wrote {self.out / 'scale.md'}")
+
+    def _measure_variants(self, scene: _Measured, rows: dict[str, list[dict[str, Any]]]) -> None:
+        for _ in range(self.pairs):
+            pair = {
+                "out of core": _in_own_process(_measure, scene),
+                "in memory": _in_own_process(_measure, replace(scene, cache_gb=1e3)),
+            }
+            rows["pairs"].append(pair)
+        for workers in self.workers if self.encoders != "none" else ():
+            seconds = _in_own_process(_prepare, replace(scene, workers=workers))
+            rows["workers"].append(
+                {"workers": workers, "seconds": seconds, "photos_per_second": scene.photos / seconds}
+            )
 
     def _write(self, rows: dict[str, list[dict[str, Any]]]) -> None:
         write_report(self.out, "scale", markdown(self, rows), rows)
@@ -94,37 +104,24 @@ class _Measured:
     points: int
     steps: int
     cache_gb: float
+    encoders: str
     workers: int = 1
-    encoders: str = "builtin"
 
 
-def _in_own_process(scene: _Measured) -> dict[str, Any]:
+def _in_own_process(measure: Callable[[_Measured], Found], scene: _Measured) -> Found:
     os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # the other check keeps forks from using CUDA
     context = get_context("forkserver")
     context.set_forkserver_preload(["lang3dxl_ns.methods", "pycolmap", "transformers"])
     with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_measure, scene).result()
+        return pool.submit(measure, scene).result()
 
 
 def _measure(scene: _Measured) -> dict[str, Any]:
     """Seconds and peak memory (bytes above the process with everything imported) of each part."""
     from lang3dxl_ns import timing
-    from lang3dxl_ns.demo.crowd import write_crowd
-    from lang3dxl_ns.methods import run_config
     from lang3dxl_ns.trainer import Lang3DXLTrainer
 
-    data = scene.folder / "scene"
-    if not data.exists():
-        write_crowd(data, scene.photos, scene.points)
-    config = run_config(data, scene.folder / "runs", "scale", scene.steps, scene.encoders, scene.encoders)
-    config.pipeline.datamanager.cache_gb = scene.cache_gb
-    config.pipeline.datamanager.workers = scene.workers
-    config.pipeline.datamanager.scale_mode = "relative"
-    config.pipeline.datamanager.scale_range = (0.4, 0.4)
-    config.pipeline.datamanager.dense_tokens = 16
-    config.pipeline.model.sky_gaussians = 0
-    config.pipeline.model.stop_split_at = 0  # as many Gaussians as there are points
-    config.set_timestamp()
+    config = _configuration(scene)
     config.save_config()
     empty = host_peak(reset=True)
     start = time.perf_counter()
@@ -159,12 +156,38 @@ def _measure(scene: _Measured) -> dict[str, Any]:
     }
 
 
+def _prepare(scene: _Measured) -> float:
+    """Seconds to prepare all photos anew, the start of the processes included."""
+    data = _configuration(scene).pipeline.datamanager
+    data.cache_dir = scene.folder / f"targets-{scene.workers}"
+    start = time.perf_counter()
+    assert data.setup(device="cpu", test_mode="val").targets is not None
+    return time.perf_counter() - start
+
+
+def _configuration(scene: _Measured) -> Lang3DXLTrainerConfig:
+    from lang3dxl_ns.demo.crowd import write_crowd
+    from lang3dxl_ns.methods import run_config
+
+    data = scene.folder / "scene"
+    if not data.exists():
+        write_crowd(data, scene.photos, scene.points)
+    config = run_config(data, scene.folder / "runs", "scale", scene.steps, scene.encoders, scene.encoders)
+    config.pipeline.datamanager.cache_gb = scene.cache_gb
+    config.pipeline.datamanager.workers = scene.workers
+    config.pipeline.datamanager.scale_mode = "relative"
+    config.pipeline.datamanager.scale_range = (0.4, 0.4)
+    config.pipeline.datamanager.dense_tokens = 16
+    config.pipeline.model.sky_gaussians = 0
+    config.pipeline.model.stop_split_at = 0  # as many Gaussians as there are points
+    config.set_timestamp()
+    return config
+
+
 def markdown(settings: ScaleBenchmark, rows: dict[str, list[dict[str, Any]]]) -> str:
     """The report."""
     photos = [(r, f"{r['photos']:,}") for r in rows["photos"]]
-    photos += [
-        (r["in memory"], f"{r['photos']:,}, all in memory") for r in rows["photos"] if "in memory" in r
-    ]
+    photos += [(r, f"{r['photos']:,}, {name}") for pair in rows["pairs"] for name, r in pair.items()]
     return f"""# How memory and time grow
 
     {command_line("lang3dxl benchmark scale", settings)}
@@ -182,12 +205,31 @@ pixels, encoders: {settings.encoders}.
 
 {markdown_table(["photos", *_HEADER], [[name, *_row(r)] for r, name in photos])}
 
+{_comparison(rows["pairs"])}{_workers(rows["workers"])}
 ## With the number of Gaussians
 
 20 photos, {settings.gaussian_steps} steps.
 
 {markdown_table(["Gaussians", *_HEADER], [[f"{r['gaussians']:,}", *_row(r)] for r in rows["gaussians"]])}
 """
+
+
+def _comparison(pairs: list[dict[str, Any]]) -> str:
+    ratios = sorted(pair["out of core"]["step_s"] / pair["in memory"]["step_s"] for pair in pairs)
+    if not ratios:
+        return ""
+    return (
+        f"A step out of core takes {median(ratios):.3f} of the time of one in memory (median of "
+        f"{len(ratios)} pairs, {ratios[0]:.3f} to {ratios[-1]:.3f}).\n"
+    )
+
+
+def _workers(rows: list[dict[str, Any]]) -> str:
+    if not rows:
+        return ""
+    lines = [[str(r["workers"]), f"{r['seconds']:.0f}", f"{r['photos_per_second']:.1f}"] for r in rows]
+    table = markdown_table(["processes", "seconds", "photos per second"], lines)
+    return f"\n## With the number of processes that prepare\n\n{table}\n"
 
 
 _HEADER = [

@@ -34,9 +34,14 @@ def test_the_report_holds_a_row_per_measurement_and_the_prediction():
         (f"{part}_bytes" for part in ("preparation", "training", "evaluation", "store")), 3e8
     )
     row |= {"photos": 1234, "gaussians": 56789}
-    report = markdown(
-        ScaleBenchmark(out=Path("x")), {"photos": [row | {"in memory": row}], "gaussians": [row]}
-    )
-    assert "1,234, all in memory | 0 | 300 | 300 | 300 | 250" in report
+    pairs = [
+        {"out of core": row | {"step_s": 0.1 * n}, "in memory": row | {"step_s": 0.1}} for n in (1, 3, 2)
+    ]
+    workers = [{"workers": 2, "seconds": 50.0, "photos_per_second": 4.0}]
+    rows = {"photos": [row], "pairs": pairs, "workers": workers, "gaussians": [row]}
+    report = markdown(ScaleBenchmark(out=Path("x")), rows)
+    assert "1,234, in memory | 0 | 300 | 300 | 300 | 100" in report
+    assert "2.000 of the time of one in memory (median of 3 pairs, 1.000 to 3.000)" in report
+    assert "| 2 | 50 | 4.0 |" in report
     assert "| 56,789 |" in report
     assert "Written before measuring" in report
