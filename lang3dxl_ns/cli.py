@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -127,9 +130,29 @@ Command = (
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `lang3dxl` command."""
     try:
-        tyro.cli(Command, args=arguments, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)).main()
+        with _terminable():
+            tyro.cli(Command, args=arguments, description=__doc__, config=(tyro.conf.OmitArgPrefixes,)).main()
     except UserError as error:
         sys.exit(f"Error: {error}")
+    except KeyboardInterrupt:
+        print("\nStopped; what was finished is kept.", file=sys.stderr)
+        sys.exit(130)
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Let a SIGTERM stop the command as Ctrl-C does: tidily, instead of on the spot."""
+    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+        yield
+        return
+    import numpy  # noqa: F401 (before pycolmap, see demo/crowd.py)
+    import pycolmap  # noqa: F401 (as it loads, it makes SIGTERM print a stack trace and kill: ours comes after)
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from multiprocessing import active_children
 from pathlib import Path
 
 from lang3dxl_ns.baselines.rows import CLIPSEG, FULL, TEACHER, Row, choose_rows
@@ -116,6 +117,8 @@ def make_all(
                 bar.update(task, advance=1, description=run.name)
                 report(figures, failed)
         except KeyboardInterrupt:
+            for process in active_children():  # Ctrl-C has reached them, another signal has not
+                process.terminate()
             threads.shutdown(cancel_futures=True)
             sys.exit(f"\nStopped. Finished runs are in {store.folder}; the same command goes on.")
     return figures, failed

@@ -34,16 +34,5 @@ def cosine_decay(x: float, peak: float, end: float, power: float = 1.0) -> float
     return end + 0.5 * (peak - end) * (1 + math.cos(math.pi * _fraction(x) ** float(power)))
 
 
-def warm_then_cosine(
-    x: float, start: float, peak: float, end: float, warm_fraction: float, power: float = 1.0
-) -> float:
-    """Log-linear from start to peak during the first `warm_fraction` of the run, then a cosine to end."""
-    if x < warm_fraction:
-        return log_linear(x / warm_fraction, start, peak)
-    return cosine_decay(
-        (x - warm_fraction) / (1 - warm_fraction) if warm_fraction < 1 else 0.0, peak, end, power
-    )
-
-
 def _fraction(x: float) -> float:
     return min(max(float(x), 0.0), 1.0)

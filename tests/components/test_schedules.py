@@ -10,7 +10,6 @@ from lang3dxl_ns.components.schedules import (
     exponential_ramp,
     log_linear,
     semantic_ramp,
-    warm_then_cosine,
 )
 
 X = [i / 100 for i in range(101)]
@@ -46,29 +45,10 @@ def test_a_cosine_falls_from_peak_to_end_without_turning(power):
     assert cosine_decay(0.5 ** (1 / power), 5e-4, 5e-6, power) == pytest.approx((5e-4 + 5e-6) / 2)
 
 
-@pytest.mark.parametrize("warm_fraction", [0.0, 0.3, 0.5, 1.0])
-def test_a_warm_up_is_log_linear_then_a_cosine_and_never_jumps(warm_fraction):
-    def rate(x):
-        return warm_then_cosine(x, 5e-5, 5e-4, 5e-6, warm_fraction, 2)
-
-    if warm_fraction > 0:
-        assert rate(0) == pytest.approx(5e-5)
-        assert rate(warm_fraction / 2) == pytest.approx(math.sqrt(5e-5 * 5e-4))
-    assert rate(warm_fraction) == pytest.approx(5e-4)
-    if warm_fraction < 1:
-        assert rate(1) == pytest.approx(5e-6)
-        half = warm_fraction + (1 - warm_fraction) * math.sqrt(0.5)
-        assert rate(half) == pytest.approx((5e-4 + 5e-6) / 2)
-    for x in X[:-1]:
-        assert abs(rate(x + 0.01) - rate(x)) < 0.1 * 5e-4
-
-
 def test_beyond_its_range_a_schedule_keeps_the_nearer_end():
     for schedule in (lambda x: log_linear(x, 1, 2), lambda x: cosine_decay(x, 2, 1, 2), semantic_ramp):
         assert schedule(-1) == schedule(0)
         assert schedule(2) == schedule(1)
-    assert warm_then_cosine(-1, 1, 2, 1, 0.5, 2) == warm_then_cosine(0, 1, 2, 1, 0.5, 2)
-    assert warm_then_cosine(2, 1, 2, 1, 0.5, 2) == warm_then_cosine(1, 1, 2, 1, 0.5, 2)
 
 
 @pytest.mark.parametrize("x", [0.0, 0.3, 0.9, 1.0])
@@ -79,6 +59,5 @@ def test_numpy_scalars_never_leak_out(x):
         exponential_ramp(x, one, one, one),
         semantic_ramp(x),
         cosine_decay(x, one, one, one),
-        warm_then_cosine(x, one, one, one, 0.5 * one, one),
     ]
     assert {type(value) for value in values} == {float}
