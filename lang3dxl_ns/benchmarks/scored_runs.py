@@ -201,16 +201,17 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     config = run_configuration(run, settings, work)
     torch.manual_seed(run.seed)
     trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
-    start = time.perf_counter()
+    start, clock = _now(), time.perf_counter()
     with timing.measure() as parts:
         trainer.setup()
-    set_up, learned = time.perf_counter() - start, sum(parts.get("learn targets", ()))
+    set_up = _now() - start
+    learned = set_up * sum(parts.get("learn targets", ())) / (time.perf_counter() - clock)
     _reset_peak()
-    start = time.perf_counter()
+    start = _now()
     trainer.train()
     if trainer.interrupted:  # it ends in good order, but what it has learned is no result
         raise KeyboardInterrupt
-    seconds = time.perf_counter() - start
+    seconds = _now() - start
     peak = _peak()
     figures = average([photo.metrics for photo in trainer.pipeline.evaluate()])
     figures = {name: value for name, value in figures.items() if name not in _UNWANTED}
@@ -254,8 +255,11 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
 
 
 def _now() -> float:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
+    """Seconds: of the clock with a GPU, of the processor (all threads) without one, where other programs, or
+    other runs at a time, would be counted in by the clock."""
+    if not torch.cuda.is_available():
+        return time.process_time()
+    torch.cuda.synchronize()
     return time.perf_counter()
 
 
