@@ -49,7 +49,7 @@ def test_the_quick_demo_finds_words_in_photos_that_it_has_never_seen(demo_output
     assert report["teacher"]["mAP"] > 0.5
     assert report["field"]["mAP"] > 0.35
     assert report["features"]["clip_l1"] < 0.8 * report["features"]["clip_l1_of_mean"]
-    assert f"ns-viewer --load-config {run_folder / 'config.yml'}" in demo_output.replace("\n", " ")
+    assert f"lang3dxl view --load-config {run_folder / 'config.yml'}" in demo_output.replace("\n", " ")
 
 
 def test_questions_from_the_shell(demo_output, folder):

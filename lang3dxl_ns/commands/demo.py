@@ -102,10 +102,7 @@ class Demo:
         say(self.markdown(report), soft_wrap=True, highlight=False, markup=False)
         say(f"\nReport and picture: {folder / 'report.md'}, {folder / 'report.png'}", soft_wrap=True)
         config_path = shlex.quote(str(folder / "config.yml"))
-        say(
-            f"Walk through it: ns-viewer --load-config {config_path} --viewer.websocket-host 127.0.0.1",
-            soft_wrap=True,
-        )
+        say(f"Walk through it: lang3dxl view --load-config {config_path}", soft_wrap=True)
 
     def _scene(self, out: Path) -> Path:
         """The scene in `out`, made unless it is there. Raises UserError when another one is."""

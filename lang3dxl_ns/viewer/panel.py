@@ -132,7 +132,10 @@ class AskPanel(ViewerControl):
     def _who_may_look(self) -> str:
         host = self.viewer.config.websocket_host
         if host in ("127.0.0.1", "localhost", "::1"):
-            return "Only this machine can open the viewer. `--viewer.websocket-host 0.0.0.0` lets others in."
+            return (
+                "Only this machine can open the viewer. `--viewer.websocket-host 0.0.0.0` (`--host` of `lang3dxl "
+                "view`) lets others in."
+            )
         return f"Others can open the viewer ({host}). `--viewer.websocket-host 127.0.0.1` keeps it here."
 
     def _leave_out_logo(self) -> None:
