@@ -132,10 +132,8 @@ class AskPanel(ViewerControl):
     def _who_may_look(self) -> str:
         host = self.viewer.config.websocket_host
         if host in ("127.0.0.1", "localhost", "::1"):
-            return (
-                "Only this machine can open the viewer. `--viewer.websocket-host 0.0.0.0` (`--host` of `lang3dxl "
-                "view`) lets others in."
-            )
+            others = "`--viewer.websocket-host 0.0.0.0` (in `lang3dxl view`: `--host`) lets others in."
+            return f"Only this machine can open the viewer. {others}"
         return f"Others can open the viewer ({host}). `--viewer.websocket-host 127.0.0.1` keeps it here."
 
     def _leave_out_logo(self) -> None:
