@@ -204,16 +204,12 @@ def plot(points: Sequence[Mapping[str, Any]]) -> bytes:
             axes.spines[["top", "right"]].set_visible(False)
             for point in shown:
                 place = (point["seconds"]["mean"], point[name]["mean"])
-                default = point["row"] == DEFAULT.name
-                axes.plot(
-                    *place,
-                    "*" if default else "o",
-                    color="C3" if default else "C0",
-                    markersize=10 if default else 4,
-                )
-                axes.annotate(
-                    point["label"].split(":")[0], place, (3, 3), textcoords="offset points", fontsize=6
-                )
+                default, on_front = point["row"] == DEFAULT.name, name in point["front"]
+                colour = "C3" if default else "C0" if on_front else "0.7"
+                axes.plot(*place, "*" if default else "o", color=colour, markersize=10 if default else 4)
+                if default or on_front:  # all names would hide each other
+                    label = point["label"].split(":")[0]
+                    axes.annotate(label, place, (3, 3), textcoords="offset points", fontsize=6)
             front = sorted((p["seconds"]["mean"], p[name]["mean"]) for p in shown if name in p["front"])
             if front:
                 axes.plot(*zip(*front, strict=True), color="0.6", linewidth=1, zorder=0)

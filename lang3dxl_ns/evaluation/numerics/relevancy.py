@@ -14,8 +14,8 @@ from lang3dxl_ns.query.relevancy import relevancy
 CHANNELS = 64
 BOUNDS = {"float32": Bounds(2e-6, 1e-6, 1e-5, 5e-6), "float64": EXACT}
 FAR = {"float32": Bounds(4e-6, 2e-6, 1e-5, 5e-6), "float64": EXACT}
-"""Where relevancy is small it is e^(−10 d), whose relative error is ten times the error of d, the difference of
-two cosines near 1: their rounding alone is 6e-8 each, and that of their two lengths as much again."""
+"""Where relevancy is small it is e^(−10 d), and its relative error ten times the error of d, the difference
+of two cosines near 1: their rounding alone is 6e-8 each, and that of their two lengths as much again."""
 HALF = {"bf16": Bounds(3e-2, 2e-2, 1.0, 0.3), "fp16": Bounds(5e-3, 2e-3, 0.3, 5e-2)}
 
 
