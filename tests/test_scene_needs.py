@@ -11,6 +11,7 @@ from PIL import Image
 
 from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.demo.scene_writer import DemoScene, write_scene
+from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.preparation.collection import plan_crops
 from lang3dxl_ns.preparation.photometry import measure_photometry
 from lang3dxl_ns.preparation.prepare import PreparationConfig
@@ -84,6 +85,21 @@ def test_photos_of_one_scale_get_one_pyramid_of_fixed_size(scene):
     assert alike.pixel_sizes is None and alike.spread == pytest.approx(1.0, abs=0.05)
     asked = plan_crops(photos, seen_from_afar(reconstruction), PreparationConfig(scale_mode="physical"))
     assert asked.pixel_sizes is not None
+
+
+def test_a_number_of_crop_sizes_divides_the_same_range_evenly(scene):
+    photos, reconstruction = collection(scene)
+
+    def sizes(number):
+        return plan_crops(photos, reconstruction, PreparationConfig(scales=number)).scales
+
+    usual, three = sizes(None), sizes(3)
+    assert (three[0], three[-1]) == pytest.approx((usual[0], usual[-1]))
+    assert three[1] == pytest.approx((usual[0] * usual[-1]) ** 0.5)
+    assert sizes(1) == pytest.approx([three[1]])
+    assert sizes(len(usual)) == pytest.approx(usual)
+    with pytest.raises(UserError, match="scales 1 or more"):
+        sizes(0)
 
 
 def seen_from_afar(reconstruction):

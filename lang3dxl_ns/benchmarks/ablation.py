@@ -39,7 +39,7 @@ class ComparisonSettings:
     dense_tokens: int = 48
     """Dense features per side of a photo."""
     ns_train: str = ""
-    """More flags of `ns-train lang3dxl`, for all rows."""
+    """More flags of `ns-train lang3dxl`, for all rows, in one string: --ns-train="--pipeline.model.…"."""
     workers: int = 1
     """Runs at a time. They slow each other down: where seconds matter, leave it at 1."""
 
