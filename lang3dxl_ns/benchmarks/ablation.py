@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -100,6 +99,8 @@ def make_all(
     workers: int = 1,
 ) -> tuple[dict[Run, dict[str, float]], dict[Run, str]]:
     """Figures of all runs and reasons of those that failed; `report` gets both after each that was made."""
+    if workers < 1:
+        raise UserError(f"--workers is {workers}: at least one run has to go on at a time")
     figures = {run: found for run in runs if (found := store.finished(run)) is not None}
     failed: dict[Run, str] = {}
     missing = [run for run in runs if run not in figures]
@@ -120,7 +121,7 @@ def make_all(
             for process in active_children():  # Ctrl-C has reached them, another signal has not
                 process.terminate()
             threads.shutdown(cancel_futures=True)
-            sys.exit(f"\nStopped. Finished runs are in {store.folder}; the same command goes on.")
+            raise
     return figures, failed
 
 

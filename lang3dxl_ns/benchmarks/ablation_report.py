@@ -15,6 +15,7 @@ from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, writ
 
 FIGURES = {
     "map": ("mAP", ".3f"),
+    "seen_map": ("mAP, seen photos", ".3f"),
     "raw_map": ("mAP without blur", ".3f"),
     "localisation_accuracy": ("located", ".3f"),
     "clip_l1": ("CLIP L1", ".3f"),

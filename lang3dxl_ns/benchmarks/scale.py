@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from lang3dxl_ns.evaluation.report import (
     command_line,
     describe_machine,
     host_peak,
+    in_own_process,
     markdown_table,
     write_report,
 )
@@ -24,7 +21,7 @@ from lang3dxl_ns.evaluation.report import (
 if TYPE_CHECKING:
     from lang3dxl_ns.trainer import Lang3DXLTrainerConfig
 
-Found = TypeVar("Found")
+_LIBRARIES = ("lang3dxl_ns.methods", "pycolmap", "transformers")
 
 PREDICTION = """Written before measuring. *Photos*: preparation holds one photo, one batch of crops and the
 encoders: constant. Training holds the cache (here `cache_gb`), what is read ahead, the Gaussians and one
@@ -66,7 +63,7 @@ class ScaleBenchmark:
             scene = _Measured(
                 self.out / f"photos-{count}", count, 2_000, self.steps, self.cache_gb, self.encoders
             )
-            rows["photos"].append(_in_own_process(_measure, scene))
+            rows["photos"].append(in_own_process(_measure, scene, preload=_LIBRARIES))
             if count == min(self.photos):
                 self._measure_variants(scene, rows)
             shutil.rmtree(scene.folder)
@@ -75,7 +72,7 @@ class ScaleBenchmark:
             scene = _Measured(
                 self.out / f"gaussians-{count}", 20, count, self.gaussian_steps, self.cache_gb, self.encoders
             )
-            rows["gaussians"].append(_in_own_process(_measure, scene))
+            rows["gaussians"].append(in_own_process(_measure, scene, preload=_LIBRARIES))
             shutil.rmtree(scene.folder)
             self._write(rows)
         print(f"Wrote {self.out / 'scale.md'}")
@@ -83,12 +80,12 @@ class ScaleBenchmark:
     def _measure_variants(self, scene: _Measured, rows: dict[str, list[dict[str, Any]]]) -> None:
         for _ in range(self.pairs):
             pair = {
-                "out of core": _in_own_process(_measure, scene),
-                "in memory": _in_own_process(_measure, replace(scene, cache_gb=1e3)),
+                "out of core": in_own_process(_measure, scene, preload=_LIBRARIES),
+                "in memory": in_own_process(_measure, replace(scene, cache_gb=1e3), preload=_LIBRARIES),
             }
             rows["pairs"].append(pair)
         for workers in self.workers if self.encoders != "none" else ():
-            seconds = _in_own_process(_prepare, replace(scene, workers=workers))
+            seconds = in_own_process(_prepare, replace(scene, workers=workers), preload=_LIBRARIES)
             rows["workers"].append(
                 {"workers": workers, "seconds": seconds, "photos_per_second": scene.photos / seconds}
             )
@@ -106,14 +103,6 @@ class _Measured:
     cache_gb: float
     encoders: str
     workers: int = 1
-
-
-def _in_own_process(measure: Callable[[_Measured], Found], scene: _Measured) -> Found:
-    os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # the other check keeps forks from using CUDA
-    context = get_context("forkserver")
-    context.set_forkserver_preload(["lang3dxl_ns.methods", "pycolmap", "transformers"])
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(measure, scene).result()
 
 
 def _measure(scene: _Measured) -> dict[str, Any]:

@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from datetime import date
 from multiprocessing import get_context
+from multiprocessing.context import BaseContext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -22,6 +23,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from lang3dxl_ns.files import write_atomically
 
 MEBIBYTE = 2**20
+Result = TypeVar("Result")
 
 
 # --- who measured ---------------------------------------------------------------------------------------
@@ -122,17 +124,32 @@ def synchronize() -> None:
         torch.cuda.synchronize()
 
 
+def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence[str] = ()) -> Result:
+    """What `work(*args)` returns, from a process of its own, so that its peak memory is its own.
+
+    Without a GPU the process is a copy of one that has imported the modules of `preload`, once for all calls
+    (the first call's); what has seen a GPU can't be copied. All must be picklable.
+
+    Raises:
+        BrokenProcessPool: the process was killed, most likely for want of memory.
+    """
+    if torch.cuda.is_available():
+        context: BaseContext = get_context("spawn")
+    else:
+        context = get_context("forkserver")
+        context.set_forkserver_preload(list(preload))
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(work, *args).result()
+
+
 def peak_memory(setup: Callable[..., Callable[[], object]], *args: Any) -> int:
     """Extra bytes that `setup(*args)()` holds at its peak over what was held just before the last call.
 
     Measured in a fresh process, so nothing that ran before can lend it memory. Host memory, or the GPU's
     where `setup` starts one. `setup` and `args` must be picklable. Good to a few MiB; Linux and macOS.
     """
-    context = get_context("forkserver")
-    # Imported once, not for every measurement; torch would import sympy at the first gradient.
-    context.set_forkserver_preload(["torch", "sympy", setup.__module__])
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_measure_peak, setup, args).result()
+    # torch would import sympy at the first gradient.
+    return in_own_process(_measure_peak, setup, args, preload=("torch", "sympy", setup.__module__))
 
 
 def _measure_peak(setup: Callable[..., Callable[[], object]], args: Sequence[Any]) -> int:

@@ -71,7 +71,7 @@ def test_a_stopped_run_is_no_result(tmp_path, monkeypatch):
 
     monkeypatch.setattr(store, "_submit", stop)
     (run,) = runs_of(FULL)
-    with pytest.raises(SystemExit, match="goes on"):
+    with pytest.raises(KeyboardInterrupt):
         make_all([run], store, lambda *_: None)
     assert store.finished(run) is None
 
@@ -83,6 +83,11 @@ def test_runs_at_a_time_give_what_one_after_the_other_gives(tmp_path):
         for n in (1, 4)
     )
     assert one == many and len(one[0]) == 6
+
+
+def test_no_runs_at_a_time_is_an_error(tmp_path):
+    with pytest.raises(UserError, match="--workers is 0"):
+        make_all(runs_of(FULL), Counting(tmp_path, []), lambda *_: None, workers=0)
 
 
 def test_clipsegs_folder_decides_about_its_own_row_alone(tmp_path):
@@ -196,6 +201,9 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     assert [bool(row["mean"]) for row in rows] == [True, True, False, True]
     assert all(0 < row["mean"]["map"]["mean"] <= 1 for row in rows if row["mean"])
     assert rows[2]["not_run"]
+    seen = [row["mean"]["seen_map"]["mean"] for row in rows if row["mean"]]
+    assert all(0 < value <= 1 for value in seen)
+    assert seen != [row["mean"]["map"]["mean"] for row in rows if row["mean"]]
     assert not list(out.glob("work*"))
     stamp = (out / "results/scene/full/seed0.json").stat().st_mtime_ns
     Ablation((scene,), out, seeds=1, steps=4, dense_tokens=8, rows=names, clipseg=str(tmp_path / "no")).main()

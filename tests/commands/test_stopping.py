@@ -1,14 +1,17 @@
 """Ctrl-C and SIGTERM in the middle of a command: nothing is left by halves, and it can be given again."""
 
+import os
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 from label_sets import write_plain
 
 from lang3dxl_ns import cli
+from lang3dxl_ns.demo.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.preparation.store import FeatureStore
 
 STOPPED = """
@@ -70,3 +73,39 @@ def test_a_stopped_evaluation_leaves_the_report_that_was_there(tmp_path, number)
     before = (tmp_path / "out" / "scores.json").read_bytes()
     stop("lang3dxl_ns.evaluation.predictions", "_read_array", number, [*arguments, str(tmp_path / "out")])
     assert (tmp_path / "out" / "scores.json").read_bytes() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_comparison_ends_its_runs(tmp_path, number):
+    scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, photos=10, width=128))
+    words = [sys.executable, "-m", "lang3dxl_ns.cli", "benchmark", "ablation", "--scene", str(scene)]
+    words += ["--out", str(tmp_path), "--rows", "full", "hash", "--dense-tokens", "8", "--workers", "2"]
+    command = subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+    )
+    try:
+        wait_for(lambda: len(list(tmp_path.glob("work-*/runs/**/events.*"))) == 2)
+        command.send_signal(number)  # to it alone: its runs hear of it from the command
+        said, _ = command.communicate(timeout=60)
+        assert command.returncode == 130 and b"Stopped; what was finished is kept." in said, said
+        wait_for(lambda: not group_lives(command.pid))
+    finally:
+        if group_lives(command.pid):
+            os.killpg(command.pid, signal.SIGKILL)
+    assert not list(tmp_path.glob("work-*")) and not list(tmp_path.glob("results/**/*.json"))
+
+
+def wait_for(condition, seconds: float = 200) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.2)
+
+
+def group_lives(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
