@@ -1,6 +1,7 @@
 """What tests share: small scenes, tiny encoders, and a short training run."""
 
 import os
+from collections import Counter
 from copy import deepcopy
 from pathlib import Path
 
@@ -12,6 +13,12 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 # Nothing in a test may reach for a model hub.
 os.environ["HF_HUB_OFFLINE"] = "1"
 torch.set_num_threads(min(torch.get_num_threads(), 2))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests first: as the last, one of them would leave the other process without work."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(scope="session")

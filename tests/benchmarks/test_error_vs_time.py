@@ -66,6 +66,6 @@ def test_the_report_is_written_whatever_is_there(tmp_path):
     failed = {Run(sweep.rows()[1], Path("s"), "s", 0): "no memory"}
     sweep._write(figures, failed)
     text = (tmp_path / "error_vs_time.md").read_text()
-    assert "| Lang3D-XL | 60 | **0.500** | – | – |" in text and "no memory" in text
+    assert "| Lang3D-XL | 60 | **0.500** | – | – | – |" in text and "no memory" in text
     assert json.loads((tmp_path / "error_vs_time.json").read_text())["points"][0]["front"] == ["map"]
     assert (tmp_path / "error_vs_time.png").exists()
