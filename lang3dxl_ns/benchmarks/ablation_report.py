@@ -101,7 +101,8 @@ def markdown(data: Mapping[str, Any]) -> str:
 
     {data["command"]}
 
-Held-out photos of {len(scenes)} scene(s): {", ".join(scenes)}. Mean ± deviation over the seeds.
+Held-out photos of {len(scenes)} scene(s): {", ".join(scenes)}; "seen": the photos that training saw. Mean ±
+deviation over the seeds.
 {data["machine"]}
 
 {table}
@@ -180,7 +181,8 @@ def table_of_runs(figures: Figures) -> str:
 
 
 def plot(summary: Sequence[Mapping[str, Any]]) -> bytes:
-    """PNG: mAP of every row, with the full method's as a line."""
+    """PNG: mAP of every row, bars for held-out photos and dots for those seen in training, the full method's
+    as a line."""
     from matplotlib.figure import Figure
 
     rows = [row for row in summary if "map" in row["mean"]]
@@ -191,11 +193,16 @@ def plot(summary: Sequence[Mapping[str, Any]]) -> bytes:
         value = row["mean"]["map"]
         axes.barh(index, value["mean"], xerr=value["std"], color=f"C{groups.index(row['group'])}", height=0.7)
         axes.text(0.005, index, row["label"], va="center", color="white", fontsize=8)
+        if seen := row["mean"].get("seen_map"):
+            axes.plot(seen["mean"], index, "o", color="0.3", markersize=4)
         if row["row"] in (FULL, TEACHER):
             axes.axvline(
                 value["mean"], color="0.3", linewidth=1, linestyle="-" if row["row"] == FULL else ":"
             )
-    axes.set(yticks=[], xlabel="mAP (solid line: the method, dotted: its 2-D teacher)")
+    axes.set(
+        yticks=[],
+        xlabel="mAP held out (lines: the method, dotted its 2-D teacher); dots: in photos seen in training",
+    )
     axes.invert_yaxis()
     axes.spines[["top", "right", "left"]].set_visible(False)
     file = io.BytesIO()
