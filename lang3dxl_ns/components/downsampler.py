@@ -307,7 +307,7 @@ def _weight_network(channels: int, hidden: int, generator: torch.Generator | Non
         nn.init.zeros_(layer.bias)
     network = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
     # The map arrives channels last; weights in the same layout halve the time of the convolutions on a CPU.
-    return network.to(memory_format=torch.channels_last)
+    return nn.utils.convert_conv2d_weight_memory_format(network, torch.channels_last)
 
 
 def _divide(total: Float[Tensor, "hd wd c"], mass: Float[Tensor, "hd wd"]) -> Float[Tensor, "hd wd c"]:
