@@ -280,12 +280,13 @@ class AskPanel(ViewerControl):
             return
         self._tour = self._tours[0]
         with self._folder, self._gui.add_folder("Fly to", order=self._message.order + 0.5) as self._results:
+            # Shown last, made first: a button may be pressed as soon as it is there.
+            self._place = self._gui.add_markdown("", order=1e9)
             for tour in self._tours:
                 button = self._gui.add_button(shortened(tour.found.prompt.text), icon=viser.Icon.PLANE)
                 button.on_click(partial(self._fly_to_best, tour))
             steps = self._gui.add_button_group("View", tuple(STEPS))
             steps.on_click(lambda event: self._fly(self._tour, STEPS[event.target.value], event.client))
-            self._place = self._gui.add_markdown("")
         self._draw_boxes()
 
     def _draw_boxes(self) -> None:

@@ -100,6 +100,21 @@ def test_a_run_opens_without_its_photos(viewer, trainer):
     assert [photo.name for photo in opened.photos] == [photo.name for photo in trained.photos]
 
 
+def test_a_button_may_be_pressed_as_soon_as_it_is_there(panel, monkeypatch):
+    said, add_button = [], panel._gui.add_button
+
+    def press(label, **options):
+        (tour,) = panel._tours
+        panel._fly_to_best(tour, SimpleNamespace(client=Client()))
+        said.append(panel._place.content)
+        return add_button(label, **options)
+
+    monkeypatch.setattr(panel._gui, "add_button", press)
+    monkeypatch.setattr(panel, "_place", None, raising=False)
+    assert "good views" in type_in(panel, "dome")
+    assert len(said) == 1 and "1 of" in said[0]
+
+
 def test_outputs_are_in_the_order_in_which_they_are_wanted(panel, viewer):
     type_in(panel, "dome; rose window")
     outputs = frame(viewer)
@@ -288,13 +303,14 @@ def test_a_scene_can_be_asked_while_it_is_trained(scene, tiny_clip, tiny_dense, 
     viewer, panel = trainer.viewer_state, trainer.pipeline.panel
     panel._threshold.value = 0.0
     panel._take_settings()
-    seen = []
+    seen, shown = [], []
 
     def person():
         while trainer.training_state == "training":
             seen.append(type_in(panel, "dome"))
-            outputs = frame(viewer)
-            assert "relevancy_0" in outputs and "still learns" in panel._status.content
+            outputs, status = frame(viewer), panel._status.content
+            if trainer.training_state == "training":  # still
+                shown.append("relevancy_0" in outputs and "still learns" in status)
 
     person_at_the_page = threading.Thread(target=person)
     person_at_the_page.start()
@@ -302,6 +318,7 @@ def test_a_scene_can_be_asked_while_it_is_trained(scene, tiny_clip, tiny_dense, 
     person_at_the_page.join(60)
     assert not person_at_the_page.is_alive()
     assert seen and all("dome" in message and "good views" in message for message in seen)
+    assert shown and all(shown)
     type_in(panel, "dome")
     frame(viewer)
     assert "fast" in panel._status.content

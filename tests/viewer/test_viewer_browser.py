@@ -66,7 +66,7 @@ def address(run):
             yield f"http://127.0.0.1:{port}"
         finally:
             server.terminate()
-    assert "Traceback" not in log.read_text()
+    assert "Traceback" not in log.read_text(), log.read_text()[-5000:]
 
 
 @pytest.fixture(scope="module")
