@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ from lang3dxl_ns.evaluation.report import (
 if TYPE_CHECKING:
     from lang3dxl_ns.trainer import Lang3DXLTrainerConfig
 
-_LIBRARIES = ("lang3dxl_ns.methods", "pycolmap", "transformers")
+_alone = partial(in_own_process, preload=("lang3dxl_ns.methods", "pycolmap", "transformers"))
 
 PREDICTION = """Written before measuring. *Photos*: preparation holds one photo, one batch of crops and the
 encoders: constant. Training holds the cache (here `cache_gb`), what is read ahead, the Gaussians and one
@@ -63,7 +64,7 @@ class ScaleBenchmark:
             scene = _Measured(
                 self.out / f"photos-{count}", count, 2_000, self.steps, self.cache_gb, self.encoders
             )
-            rows["photos"].append(in_own_process(_measure, scene, preload=_LIBRARIES))
+            rows["photos"].append(_alone(_measure, scene))
             if count == min(self.photos):
                 self._measure_variants(scene, rows)
             shutil.rmtree(scene.folder)
@@ -72,7 +73,7 @@ class ScaleBenchmark:
             scene = _Measured(
                 self.out / f"gaussians-{count}", 20, count, self.gaussian_steps, self.cache_gb, self.encoders
             )
-            rows["gaussians"].append(in_own_process(_measure, scene, preload=_LIBRARIES))
+            rows["gaussians"].append(_alone(_measure, scene))
             shutil.rmtree(scene.folder)
             self._write(rows)
         print(f"Wrote {self.out / 'scale.md'}")
@@ -80,12 +81,12 @@ class ScaleBenchmark:
     def _measure_variants(self, scene: _Measured, rows: dict[str, list[dict[str, Any]]]) -> None:
         for _ in range(self.pairs):
             pair = {
-                "out of core": in_own_process(_measure, scene, preload=_LIBRARIES),
-                "in memory": in_own_process(_measure, replace(scene, cache_gb=1e3), preload=_LIBRARIES),
+                "out of core": _alone(_measure, scene),
+                "in memory": _alone(_measure, replace(scene, cache_gb=1e3)),
             }
             rows["pairs"].append(pair)
         for workers in self.workers if self.encoders != "none" else ():
-            seconds = in_own_process(_prepare, replace(scene, workers=workers), preload=_LIBRARIES)
+            seconds = _alone(_prepare, replace(scene, workers=workers))
             rows["workers"].append(
                 {"workers": workers, "seconds": seconds, "photos_per_second": scene.photos / seconds}
             )

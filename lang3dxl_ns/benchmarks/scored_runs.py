@@ -220,7 +220,8 @@ def _seen_in_training(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     more than those held out. `teacher_` stays in front, where a row of the teacher looks for its figures."""
     from lang3dxl_ns.evaluation.aggregate import average
 
-    if pipeline.scorer is None:
+    scorer, photos = pipeline.scorer, pipeline.datamanager.train_dataset.photos
+    if scorer is None or all(scorer.truth.key(photo.name) is None for photo in photos):
         return {}
     pipeline.config.evaluated_photos = "seen"
     figures = average([photo.metrics for photo in pipeline.evaluate()])

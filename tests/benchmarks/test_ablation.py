@@ -5,13 +5,21 @@ import json
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from lang3dxl_ns.baselines.rows import CLIPSEG, FULL, ROWS, TEACHER, Row, choose_rows
 from lang3dxl_ns.benchmarks.ablation import Ablation, make_all, teacher_figures
 from lang3dxl_ns.benchmarks.ablation_report import spread, table_of_runs, write_ablation
-from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, apply_changes, scene_labels
+from lang3dxl_ns.benchmarks.scored_runs import (
+    Run,
+    RunSettings,
+    ScoredRuns,
+    _seen_in_training,
+    apply_changes,
+    scene_labels,
+)
 from lang3dxl_ns.errors import UserError
 
 BY_NAME = {row.name: row for row in ROWS}
@@ -208,3 +216,12 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     stamp = (out / "results/scene/full/seed0.json").stat().st_mtime_ns
     Ablation((scene,), out, seeds=1, steps=4, dense_tokens=8, rows=names, clipseg=str(tmp_path / "no")).main()
     assert (out / "results/scene/full/seed0.json").stat().st_mtime_ns == stamp
+
+
+def test_labels_of_held_out_photos_alone_are_no_error():
+    photos = [SimpleNamespace(name="a.jpg"), SimpleNamespace(name="b.jpg")]
+    pipeline = SimpleNamespace(
+        scorer=SimpleNamespace(truth=SimpleNamespace(key=lambda name: None)),
+        datamanager=SimpleNamespace(train_dataset=SimpleNamespace(photos=photos)),
+    )
+    assert _seen_in_training(pipeline) == {}
