@@ -8,10 +8,10 @@ from importlib import import_module
 from typing import Any
 
 _PUBLIC = {
-    "load_scene": "scene_loading",
+    "load_scene": "plugin.load_scene",
     "Scene": "query.scene",
     "QueryConfig": "query.scene",
-    "Camera": "rendering",
+    "Camera": "scene.camera",
     "Gaussians": "rendering",
     "Rendering": "rendering",
     "rasterize": "rendering",
@@ -20,7 +20,7 @@ _PUBLIC = {
     "HashGrid": "components.hash_grid",
     "SemanticField": "components.semantic_field",
     "SemanticFieldConfig": "components.semantic_field",
-    "UserError": "errors",
+    "UserError": "common.errors",
 }
 __all__ = list(_PUBLIC)
 

@@ -1,7 +1,8 @@
-"""The methods that `ns-train` offers."""
+"""Method registration for nerfstudio: `ns-train lang3dxl`, its optimizers and schedules."""
 
 from __future__ import annotations
 
+import sys
 from copy import deepcopy
 from functools import partial
 from pathlib import Path
@@ -12,8 +13,11 @@ from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from lang3dxl_ns.pipeline import Lang3DXLPipelineConfig
-from lang3dxl_ns.trainer import Lang3DXLTrainerConfig, RunAdamConfig, RunScheduleConfig
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
+from lang3dxl_ns.plugin.saved_config import check_command_line
+from lang3dxl_ns.plugin.trainer import Lang3DXLTrainerConfig, RunAdamConfig, RunScheduleConfig
+
+check_command_line(sys.argv[1:])
 
 DEVICE: Literal["cuda", "cpu"] = "cuda" if torch.cuda.is_available() else "cpu"
 

@@ -1,4 +1,13 @@
-"""What tests share: small scenes, tiny encoders, and a short training run."""
+"""What tests share: small scenes, tiny encoders, and short training runs.
+
+- `scene`, `tiny_clip`, `tiny_dense`: read-only, made once per process that tests.
+- `train`: a short training with settings of your own. A step takes 60 ms: take as few as the law needs, and a
+  module's fixture where several tests only look at the same run.
+- `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
+  `processes.Process(function, …)`: a function in one.
+- `worker_tasks`: work for several processes; tests that need a Ray cluster belong into test_ray.py, which
+  has one.
+"""
 
 import os
 from collections import Counter
@@ -10,13 +19,19 @@ import torch
 from scenes import write_scene
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
-# Nothing in a test may reach for a model hub.
+# No test may contact a model hub.
 os.environ["HF_HUB_OFFLINE"] = "1"
+# A thread per process where several test at a time: more would wait for each other. Commands inherit it.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    torch.set_num_threads(1)
+# Tests use the torch backend; tests/rendering asks for the compiled kernels by name.
+os.environ.setdefault("LANG3DXL_CPU_KERNELS", "torch")
 torch.set_num_threads(min(torch.get_num_threads(), 2))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first: as the last, one of them would leave the other process without work."""
+    """Files with slow tests first: at the end, one of them would leave the other process idle."""
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 
@@ -41,7 +56,7 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def train(tiny_clip, tiny_dense, tmp_path):
-    """Trains as `ns-train lang3dxl` does, in this process; returns the trainer."""
+    """Train like `ns-train lang3dxl`, in this process; returns the trainer."""
 
     def run(data: Path, iterations: int = 40, output_dir: Path = tmp_path, semantics: bool = True, **changes):
         """`changes` are set by their dotted path, with __ for each dot."""
@@ -63,6 +78,7 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, **ch
     config.pipeline.datamanager.clip = str(clip) if semantics else "none"
     config.pipeline.datamanager.dense = str(dense) if semantics else "none"
     config.viewer.quit_on_train_completion = True
+    config.pipeline.model.encoder.compression.steps = 40
     for path, value in changes.items():
         *owners, name = path.split("__")
         owner = config
@@ -83,3 +99,10 @@ def real_scenes() -> Path:
     if not folder:
         pytest.skip("set LANG3DXL_REAL_SCENES to the folder that holds sceaux and sceaux_wild")
     return Path(folder)
+
+
+@pytest.fixture(params=["torch", "numba"])
+def backend(request, monkeypatch) -> str:
+    """The CPU rasterizer that "auto" selects in this test: both pass the same laws."""
+    monkeypatch.setenv("LANG3DXL_CPU_KERNELS", request.param)
+    return request.param

@@ -1,4 +1,4 @@
-"""A scene whose answers are known: a flat wall painted with a dome and two windows, seen by three cameras.
+"""A scene with known answers: a flat wall painted with a dome and two windows, seen by three cameras.
 
 from painted_scene import painted_scene
 """
@@ -8,32 +8,35 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from lang3dxl_ns.geometry import camera_to_world
+from lang3dxl_ns.query.engine import PerGaussian
+from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.scene import QueryConfig, Scene, View
-from lang3dxl_ns.query.scene_file import SceneFile, ScenePhoto
-from lang3dxl_ns.rendering import Camera
+from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.scene.camera import Camera, Lens, camera_to_world
 
 WORDS = ("wall", "dome", "window", "object")
-CODES = torch.tensor([[-2.0, -2.0, 0.0], [2.0, -2.0, 0.5], [0.0, 2.0, -0.5], [0.0, 0.0, 3.0]])
-"""Code of each word; the decoder turns a code into the word that is nearest, smoothly."""
 DISTANCE = 5.0
-"""Of all cameras from the wall, which is the plane z = 0."""
+"""Distance of all cameras from the wall, which is the plane z = 0."""
 DOME = (1.0, 2.0, 1.0, 2.0)
 """x from, to, y from, to."""
 WINDOWS = ((-2.0, -1.6, -1.0, -0.6), (-1.0, -0.6, -1.0, -0.6))
 CHANNELS = 16
 
 
-def decode(codes: Tensor) -> Tensor:
-    closeness = (-(codes[:, None] - CODES.to(codes)).square().sum(2)).softmax(1)
-    closeness[:, WORDS.index("object")] += 0.2  # everything is a bit of an object
-    return torch.cat([closeness, closeness.new_zeros(len(codes), CHANNELS - len(WORDS))], dim=1)
+def features() -> Tensor:
+    """Unit feature of each word."""
+    rows = torch.eye(len(WORDS), CHANNELS)
+    rows[:, WORDS.index("object")] += 0.2  # everything is a bit of an object
+    return F.normalize(rows, dim=1)
 
 
 def encode_texts(texts: list[str]) -> Tensor:
-    """A word's vector is its axis; other texts lie on axes of their own, more or less."""
+    """A word's vector is its axis; other texts get nearly independent axes."""
     rows = torch.zeros(len(texts), CHANNELS)
     for row, text in zip(rows, texts, strict=True):
         first = text.split(",")[0].removesuffix("s")
@@ -50,26 +53,56 @@ def word_at(points: Tensor) -> Tensor:
     return words
 
 
-def render(camera: Camera) -> View:
-    rows, columns = torch.meshgrid(
-        torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
+def painted_gaussians() -> dict[str, Tensor]:
+    """A Gaussian for each twelfth of a unit of the wall, and one behind it that no camera sees."""
+    ticks = (torch.arange(72) + 0.5) / 12 - 3
+    plane = torch.cartesian_prod(ticks, ticks)
+    means = torch.cat([F.pad(plane, (0, 1)), torch.tensor([[0.0, 0.0, -50.0]])])
+    count = len(means)
+    return {
+        "means": means,
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        "scales": torch.tensor([[0.035, 0.035, 0.001]]).log().repeat(count, 1),
+        "opacities": torch.full((count, 1), 4.0),
+        "features_dc": torch.zeros(count, 3),
+        "features_rest": torch.zeros(count, 15, 3),
+        "words": F.pad(word_at(plane), (0, 1)),
+    }
+
+
+def activated(gaussians: dict[str, Tensor]) -> Gaussians:
+    g = gaussians
+    return Gaussians(g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(1))
+
+
+def render(camera: Camera, carried: Tensor) -> View:
+    """Grey for walls, brighter for every further word."""
+    g = painted_gaussians()
+    colors = (g["words"][:, None] / 3.0).expand(-1, 3)
+    drawn = rasterize(activated(g), camera, colors, features=carried, render_depth=True)
+    return View(camera, drawn.image, drawn.features, drawn.alpha[..., 0], drawn.depth[..., 0])
+
+
+def fill(camera: Camera, weight: Tensor) -> Tensor:
+    gaussians = activated(painted_gaussians())
+    return filled_pixels(
+        lambda carried: rasterize(gaussians, camera, carried).image, weight, len(gaussians.means)
     )
-    k, position = camera.intrinsics, -camera.view_matrix[:3, 3]
-    x = (columns - k[0, 2]) / k[0, 0] * DISTANCE + position[0]
-    y = (rows - k[1, 2]) / k[1, 1] * DISTANCE + position[1]
-    alpha = ((x.abs() < 3) & (y.abs() < 3)).float()
-    words = word_at(torch.stack([x, y], dim=2))
-    # A little noise, as rendered codes have.
-    noise = 0.05 * torch.randn(*words.shape, 3, generator=torch.Generator().manual_seed(0))
-    codes = (CODES[words] + noise) * alpha[..., None]
-    return View(camera, words[..., None].expand(-1, -1, 3) / 3.0, codes, alpha, torch.full_like(x, DISTANCE))
+
+
+def engine() -> PerGaussian:
+    words = painted_gaussians()["words"]
+    rows = features()[words]
+    rows[-1] = 0  # nobody has seen it
+    return PerGaussian(GaussianFeatures(rows, None, (rows != 0).any(1)))
 
 
 def photo(name: str, x: float, y: float, split="train", focal: int = 96, size: int = 96) -> ScenePhoto:
     view = torch.eye(4)
     view[:3, 3] = -torch.tensor([x, y, -DISTANCE])
     middle = size / 2
-    return ScenePhoto(name, split, camera_to_world(view).tolist(), focal, focal, middle, middle, size, size)
+    lens = Lens(size, size, focal, focal, middle, middle)
+    return ScenePhoto(name, split, camera_to_world(view).tolist(), lens)
 
 
 def painted_scene(cache_dir: Path | None = None, config: QueryConfig | None = None, **changes) -> Scene:
@@ -80,7 +113,7 @@ def painted_scene(cache_dir: Path | None = None, config: QueryConfig | None = No
     ]
     photos.append(photo("held/0004.jpg", 0.5, 0.5, "eval"))
     file = SceneFile(photos, "clip", "0123", 1.0, torch.eye(4)[:3].tolist(), "nowhere")
-    gaussians = {"means": torch.zeros(4, 3), "codes": CODES.clone()}
-    parts = {"render": render, "decode": decode, "bounded": True, "gaussians": gaussians, "file": file}
+    gaussians = painted_gaussians()
+    parts = {"render": render, "fill": fill, "engine": engine, "gaussians": gaussians, "file": file}
     parts |= {"encode_texts": encode_texts, "state": gaussians, "cache_dir": cache_dir, "config": config}
     return Scene(**{**parts, **changes})

@@ -77,9 +77,10 @@ def write_scene(
 
 
 def _camera(pycolmap, camera_id, size, distortion, rng):
-    """A camera that sees the whole box; with a generator, one of its own."""
+    """A camera that sees the whole box; with a generator, one of its own. Pixels are not square and the
+    principal point is off the middle, so that no axis can stand in for the other."""
     width, height = size
-    focal, centre = 1.1 * max(size), np.array([width, height]) / 2
+    focal, centre = 1.1 * max(size), np.array([width, height]) * [0.48, 0.53]
     if rng is not None:
         width, height = np.round(np.array(size) * rng.uniform(0.7, 1.2)).astype(int)
         if camera_id % 3 == 0:
@@ -91,7 +92,7 @@ def _camera(pycolmap, camera_id, size, distortion, rng):
         model="OPENCV" if distortion else "PINHOLE",
         width=int(width),
         height=int(height),
-        params=[focal, focal, *centre, *(distortion or ())],
+        params=[focal, 1.07 * focal, *centre, *(distortion or ())],
     )
 
 
@@ -155,3 +156,13 @@ def texture(points: np.ndarray) -> np.ndarray:
     bands = 0.85 + 0.15 * np.sin(points * [7, 9, 11]).prod(axis=1)
     windows = (np.sin(points * [9, 9, 12] + 0.4) > 0.2).sum(axis=1) >= 2
     return face * (bands * np.where(windows, 0.45, 1.0))[:, None]
+
+
+def speckled(points: np.ndarray) -> np.ndarray:
+    """Another `texture`: cells of two sizes, colored by lot, so that SIFT finds corners everywhere."""
+    colors = 0.0
+    for size in (0.21, 0.053):
+        cells = np.floor((points + 0.0137) / size)
+        draws = np.sin(cells @ [[127.1, 269.5, 113.5], [311.7, 183.3, 271.9], [74.7, 246.1, 124.6]]) * 43758.5
+        colors = colors + 0.5 * (draws % 1)
+    return colors

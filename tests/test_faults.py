@@ -1,4 +1,4 @@
-"""Bad input and bad luck: each ends in a logged skip or a sentence that names the file, and loses nothing."""
+"""Bad input and failing hardware: a logged skip or an error that names the file, and no data loss."""
 
 import errno
 import os
@@ -17,23 +17,23 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 from scenes import write_scene
 
-from lang3dxl_ns.dataparser import PhotoCollectionDataParserConfig
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.memory import machine_memory, with_less_memory
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.memory import machine_memory, with_less_memory
 from lang3dxl_ns.methods import lang3dxl
-from lang3dxl_ns.other_scenes import photos_of
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.load_scene import check_checkpoint
+from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of
+from lang3dxl_ns.plugin.saved_config import read_config
 from lang3dxl_ns.preparation.foreground import with_foreground
-from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.preparation.pyramid import build_clip_target
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.query.relevancy import Queries, cosines_of_codes
-from lang3dxl_ns.saved_config import read_config
-from lang3dxl_ns.scene_loading import check_checkpoint
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """A scene to be spoilt."""
+    """A scene to damage."""
     return write_scene(tmp_path / "scene", photos=4, points=40)
 
 
@@ -58,7 +58,7 @@ def rename(folder, *names):
     model.write_binary(folder / "sparse" / "0")
 
 
-# ── what lies in the folder ─────────────────────────────────────────────────────────────────────────────
+# ── contents of the folder ──────────────────────────────────────────────────────────────────────────────
 
 
 def test_photos_that_the_model_does_not_know_are_named(folder, capsys):
@@ -235,7 +235,7 @@ def test_a_checkpoint_that_runs_code_is_refused_and_runs_nothing(folder, tiny_cl
     torch.save({"step": 1, "pipeline": Payload(trap)}, checkpoint)
     options = {"load_checkpoint": checkpoint}
     trainer = make_trainer(folder, tiny_clip, tiny_dense, tmp_path / "out", 4, semantics=False, **options)
-    with pytest.raises(UserError, match="no checkpoint of lang3dxl in"):
+    with pytest.raises(UserError, match="not a checkpoint of lang3dxl"):
         trainer.setup()
     assert not trap.exists()
     with zipfile.ZipFile(checkpoint) as archive:  # the trap would have worked
@@ -243,17 +243,19 @@ def test_a_checkpoint_that_runs_code_is_refused_and_runs_nothing(folder, tiny_cl
     assert trap.exists()
 
 
-def test_a_config_of_an_older_version_takes_defaults_for_what_it_lacks_and_says_so(tmp_path, capsys):
-    text = yaml.dump(lang3dxl.config)
-    lines = [line for line in text.splitlines() if "cache_gb:" not in line and "max_skipped" not in line]
-    lines.insert(1, "option_of_old: 3")
-    (tmp_path / "config.yml").write_text("\n".join(lines))
-    config = read_config(tmp_path / "config.yml")
-    assert config.max_skipped_steps == 20
-    assert config.pipeline.datamanager.cache_gb is None
-    printed = capsys.readouterr().out
-    assert "max_skipped_steps = 20 (new)" in printed
-    assert "option_of_old (gone" in printed
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda lines: [x for x in lines if "cache_gb:" not in x], r"lacks .*\.datamanager\.cache_gb"),
+        (lambda lines: [x for x in lines if "max_skipped" not in x], "lacks the setting max_skipped_steps"),
+        (lambda lines: [lines[0], "option_of_old: 3", *lines[1:]], "has the unknown setting option_of_old"),
+    ],
+)
+def test_a_config_of_another_version_names_what_differs(tmp_path, change, says):
+    lines = yaml.dump(lang3dxl.config).splitlines()
+    (tmp_path / "config.yml").write_text("\n".join(change(lines)))
+    with pytest.raises(UserError, match=says):
+        read_config(tmp_path / "config.yml")
 
 
 @pytest.mark.parametrize(
@@ -291,7 +293,7 @@ def test_servers_listen_on_this_machine_alone():
 
 
 def short_of_memory(limit, work):
-    """`work`, failing as a GPU without memory does for more than `limit` rows."""
+    """`work`, failing like a GPU out of memory for more than `limit` rows."""
 
     def run(rows):
         if len(rows) > limit:

@@ -1,10 +1,13 @@
-"""Whatever stands in a file, its reader answers, or says in a `UserError` what is wrong with it."""
+"""Fuzzing of file readers: any input gives a result or a `UserError`."""
 
 import contextlib
 import json
+import math
 import os
 import shutil
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 import torch
@@ -13,16 +16,25 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from scenes import write_scene
+from viser._messages import ViewerCameraMessage
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidHeaderValue
 
-from lang3dxl_ns import presets
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common import presets
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import FORMATS
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.preparation.companions import companion, inside
-from lang3dxl_ns.preparation.photo import Photo
-from lang3dxl_ns.preparation.physical_scale import read_reconstruction
+from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.plugin.load_scene import check_checkpoint, read_checkpoint
+from lang3dxl_ns.plugin.saved_config import read_config
+from lang3dxl_ns.plugin.viewer.guard import Guard, is_camera
 from lang3dxl_ns.preparation.regions import FolderRegions
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.query.scene_file import SceneFile, read_camera_path
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.companions import companion, inside
+from lang3dxl_ns.scene.photo import Photo
 
 INPUTS = int(os.environ.get("LANG3DXL_FUZZ", "60"))
 """Inputs per reader."""
@@ -42,7 +54,7 @@ JSON = st.recursive(
 
 @st.composite
 def damage(draw, content: bytes) -> bytes:
-    """Cut short, bytes changed, a stretch repeated or taken out; now and then something else altogether."""
+    """Truncated, bytes changed, a stretch repeated or removed; sometimes entirely random."""
     how = draw(st.sampled_from(["cut", "change", "change", "repeat", "remove", "other"]))
     if how == "other":
         return draw(st.binary(max_size=64))
@@ -60,7 +72,7 @@ def damage(draw, content: bytes) -> bytes:
 
 @contextlib.contextmanager
 def only_user_errors():
-    """Every other error is the reader's mistake."""
+    """Any other error is a bug of the reader."""
     with contextlib.suppress(UserError):
         yield
 
@@ -95,21 +107,21 @@ def test_colmap_models(model, tmp_path, ending, data):
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """Pictures of every format that people have, by suffix."""
+    """Pictures of every accepted format."""
     folder = tmp_path_factory.mktemp("pictures")
     image = Image.effect_noise((24, 16), 60).convert("RGB")
-    for suffix in ("jpg", "png", "webp", "tif", "gif", "bmp"):
-        image.save(folder / f"a.{suffix}")
-    return {path.suffix: path.read_bytes() for path in folder.iterdir()}
+    for form in FORMATS:
+        image.save(folder / form, form)
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif", ".gif", ".bmp"])
+@pytest.mark.parametrize("form", FORMATS)
 @fuzz
 @given(data=st.data())
-def test_photos_and_masks(pictures, tmp_path, suffix, data):
-    path = tmp_path / f"a{suffix}"
-    path.write_bytes(data.draw(damage(pictures[suffix])))
-    photo = Photo(path.name, path, path, 24, 16, 20.0, 20.0, 12.0, 8.0)
+def test_photos_and_masks(pictures, tmp_path, form, data):
+    path = tmp_path / "a.jpg"
+    path.write_bytes(data.draw(damage(pictures[form])))
+    photo = Photo(path.name, path, path, Lens(24, 16, 20.0, 21.0, 12.0, 8.0))
     with only_user_errors():
         photo.read()
     with only_user_errors():
@@ -120,7 +132,7 @@ def test_photos_and_masks(pictures, tmp_path, suffix, data):
 @given(data=st.data())
 def test_ground_truth(pictures, tmp_path, data):
     (tmp_path / "domes").mkdir(exist_ok=True)
-    (tmp_path / "domes" / "0001-gt.jpg").write_bytes(data.draw(damage(pictures[".jpg"])))
+    (tmp_path / "domes" / "0001-gt.jpg").write_bytes(data.draw(damage(pictures["JPEG"])))
     with only_user_errors():
         GroundTruth(tmp_path).masks("0001.jpg", (8, 12))
 
@@ -132,7 +144,7 @@ def test_label_maps(tmp_path, data):
 
     np.save(tmp_path / "whole.npy", np.arange(12).reshape(3, 4))
     (tmp_path / "a.npy").write_bytes(data.draw(damage((tmp_path / "whole.npy").read_bytes())))
-    photo = Photo("a.jpg", tmp_path / "a.jpg", None, 8, 6, 5.0, 5.0, 4.0, 3.0)
+    photo = Photo("a.jpg", tmp_path / "a.jpg", None, Lens(8, 6, 5.0, 5.5, 4.0, 3.0))
     with only_user_errors():
         FolderRegions(tmp_path).labels(photo, torch.zeros(6, 8, 3))
 
@@ -146,7 +158,7 @@ def test_store_entries(tmp_path, data):
     path = store.path("clip", "a.jpg")
     whole = path.read_bytes()
     path.write_bytes(data.draw(damage(whole)))
-    if store.is_current("clip", "a.jpg", made_with):  # then nothing that counts has changed
+    if store.is_current("clip", "a.jpg", made_with):  # then nothing relevant has changed
         found = store.read("clip", "a.jpg")
         assert all(torch.equal(found[key], value.half()) for key, value in features.items())
     for read in (store.read, store.shapes, store.settings):
@@ -171,6 +183,135 @@ def test_scene_files_and_camera_paths(content, tmp_path):
         SceneFile.read(tmp_path / "a.json")
     with only_user_errors():
         read_camera_path(tmp_path / "a.json")
+
+
+@st.composite
+def altered(draw, document: Any) -> Any:
+    """A JSON document with a value somewhere in it replaced, or left out."""
+    if not isinstance(document, dict | list) or not document or draw(st.integers(0, 5)) == 0:
+        return draw(ODD)
+    keys = list(document) if isinstance(document, dict) else range(len(document))
+    key = draw(st.sampled_from(keys))
+    copy = document.copy()
+    if draw(st.integers(0, 9)) == 0:
+        del copy[key]
+    else:
+        copy[key] = draw(altered(document[key]))
+    return copy
+
+
+NUMBERS = st.floats() | st.integers() | st.sampled_from([0, -1, 1e309, 1e-320, 2**31, 2_000_000, True])
+ODD = JSON | NUMBERS | st.sampled_from(["", "..", "\0", [], {}, [[]]])
+POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]]
+
+
+@fuzz
+@given(data=st.data())
+def test_scene_files_in_use(tmp_path, data):
+    lens = Lens(24, 16, 20.0, 21.0, 12.0, 8.0, (0.1, 0.0, 0.0, 0.0))
+    photos = [ScenePhoto(f"{i}.jpg", "train", POSE, lens, str(tmp_path / "mask.png")) for i in range(2)]
+    SceneFile(photos, "clip", "identity", 1.0, POSE, "data").write(tmp_path / "whole.json")
+    document = json.loads((tmp_path / "whole.json").read_text())
+    (tmp_path / "a.json").write_text(json.dumps(data.draw(altered(document))))
+    with only_user_errors():
+        scene = SceneFile.read(tmp_path / "a.json")
+        for photo in scene.photos:
+            assert scene.photo(photo.name) is photo
+            assert photo.camera.at_origin(torch.zeros(1))[1].isfinite().all()
+            assert photo.foreground() is None or max(photo.lens.width, photo.lens.height) < 1e5
+
+
+@fuzz
+@given(data=st.data())
+def test_camera_paths_in_use(tmp_path, data):
+    frame = {
+        "camera_to_world": [value for row in [*POSE, [0.0, 0.0, 0.0, 1.0]] for value in row],
+        "fov": 60.0,
+        "aspect": 1.5,
+    }
+    document = {"render_width": 24, "render_height": 16, "camera_path": [frame, frame]}
+    (tmp_path / "a.json").write_text(json.dumps(data.draw(altered(document))))
+    with only_user_errors():
+        for camera in read_camera_path(tmp_path / "a.json"):
+            assert camera.width > 0 and camera.height > 0
+            assert camera.intrinsics.isfinite().all() and camera.view_matrix.isfinite().all()
+
+
+@fuzz
+@given(data=st.data())
+def test_checkpoints(tmp_path, data):
+    torch.save({"step": 7, "pipeline": {"x": torch.arange(4.0)}}, tmp_path / "whole.ckpt")
+    path = tmp_path / "step-000000007.ckpt"
+    path.write_bytes(data.draw(damage((tmp_path / "whole.ckpt").read_bytes())))
+    with only_user_errors():
+        check_checkpoint(path)
+    with only_user_errors():
+        assert set(read_checkpoint(path)) >= {"step", "pipeline"}
+
+
+@pytest.fixture(scope="module")
+def settings_of_a_run():
+    """The lines of a config.yml."""
+    return yaml.dump(lang3dxl.config).encode()
+
+
+@settings(fuzz, max_examples=max(INPUTS // 20, 1))  # reading one takes half a second
+@given(data=st.data())
+def test_configs(settings_of_a_run, tmp_path, data):
+    (tmp_path / "config.yml").write_bytes(data.draw(damage(settings_of_a_run)))
+    with only_user_errors():
+        read_config(tmp_path / "config.yml")
+
+
+# ── the viewer's port ───────────────────────────────────────────────────────────────────────────────────
+
+TEXT = st.text(st.characters(min_codepoint=32, max_codepoint=255, exclude_characters="\x7f"), max_size=20)
+"""What can stand in a header at all: websockets refuses others."""
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """Folder of a page."""
+    folder = tmp_path_factory.mktemp("around") / "build"
+    folder.mkdir()
+    (folder / "index.html").write_text("page")
+    (folder.parent / "secret").write_text("secret")
+    return folder
+
+
+@fuzz
+@given(
+    path=TEXT | st.lists(st.sampled_from(["..", ".", "/", "secret", "index.html", "%2e", "?"])).map("".join),
+    headers=st.dictionaries(st.sampled_from(["Host", "Origin", "Cookie", "Upgrade"]), TEXT),
+    host=st.sampled_from(["127.0.0.1", "0.0.0.0"]),
+)
+def test_requests(page, path, headers, host):
+    local = {"Host": "127.0.0.1:7007"} | {k: v for k, v in headers.items() if k != "Host"}
+    for these in (headers, local):
+        try:
+            received = Headers(these)
+        except InvalidHeaderValue:  # websockets refuses it before we see it
+            continue
+        refusal = Guard(host, 7007, page).refusal(path, received)
+        assert host == "127.0.0.1" or (refusal is not None and refusal[0] == 403)
+        if refusal is None and these.get("Upgrade", "").lower() != "websocket":
+            served = page / (urlsplit(path).path.lstrip("/") or "index.html")
+            assert served.read_text() == "page"
+
+
+@fuzz
+@given(
+    vectors=st.tuples(*(st.tuples(*[NUMBERS] * size) for size in (4, 3, 3, 3))),
+    fov=NUMBERS,
+    aspect=NUMBERS,
+)
+def test_cameras_of_pages(vectors, fov, aspect):
+    wxyz, position, look_at, up = vectors
+    camera = ViewerCameraMessage(wxyz, position, fov, aspect, look_at, up)
+    if is_camera(camera):
+        height = int(512 / aspect)  # as nerfstudio's viewer chooses a picture's size
+        assert 0 < height < 1e5 and math.isfinite(math.tan(fov / 2)) and math.tan(fov / 2) > 0
+        assert all(map(math.isfinite, (*position, *look_at)))
 
 
 @fuzz

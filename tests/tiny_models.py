@@ -45,7 +45,7 @@ def make_tiny_clipseg(folder: Path, image_size: int = 32, seed: int = 0) -> Path
         reduce_dim=16,
         decoder_num_attention_heads=2,
         decoder_intermediate_size=32,
-        initializer_factor=20.0,  # else every pixel gets the same answer
+        initializer_factor=20.0,  # otherwise every pixel gets the same answer
     )
     save_random(CLIPSegForImageSegmentation, config, folder, seed)
     sides = {"height": image_size, "width": image_size}
@@ -132,7 +132,7 @@ def save_random(model_class, config, folder: Path, seed: int) -> None:
 
 
 def byte_tokenizer():
-    """CLIP's tokenizer with a word for every byte and no others."""
+    """CLIP's tokenizer with one token per byte and no others."""
     from tokenizers.pre_tokenizers import ByteLevel
     from transformers import CLIPTokenizer
 

@@ -1,1 +1,1 @@
-"""Encoders of the systems that the method is compared with, behind the semantic field's own interface."""
+"""Baselines from the literature, behind the semantic field's interface."""

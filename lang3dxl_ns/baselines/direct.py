@@ -1,4 +1,4 @@
-"""The whole feature on every Gaussian: nothing is encoded, and memory pays for it."""
+"""Direct baseline: the whole feature on every Gaussian, without compression."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.encoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 
 
 class DirectFeatures(SemanticEncoder):
-    """Gaussians carry whitened CLIP and dense features. A map is mean + deviation × what is rendered, so that
-    training starts at the mean feature, as the semantic field's does."""
+    """Gaussians carry whitened CLIP and dense features. A map is mean + deviation × rendering, so that
+    training starts at the mean feature, as for the semantic field."""
 
     def initial_codes(
         self, count: int, generator: torch.Generator | None = None

@@ -1,8 +1,8 @@
-"""Which encoder a run has: the semantic field, or one of the systems that it is compared with."""
+"""Choice of a run's feature decoder: the semantic field or a baseline."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from jaxtyping import Float
@@ -13,48 +13,62 @@ from lang3dxl_ns.baselines.feature3dgs import Feature3DGS
 from lang3dxl_ns.baselines.fmgs import PlaceField
 from lang3dxl_ns.baselines.langsplat import LangSplat
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
-from lang3dxl_ns.components.encoder import SemanticEncoder
+from lang3dxl_ns.components.compression import CompressedField, CompressionConfig
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
-EncoderName = Literal["lang3dxl", "feature3dgs", "fmgs", "langsplat", "direct", "lifting"]
+EncoderName = Literal["lang3dxl", "paper", "feature3dgs", "fmgs", "langsplat", "direct", "lifting"]
 
 
 @dataclass
 class EncoderConfig:
-    """What carries the semantics. Targets, losses and schedules are the same for all, so that a comparison
-    shows the encoder alone."""
+    """The model's feature decoder. Targets, losses and schedules are the same for all, so that a comparison
+    isolates the decoder."""
 
     name: EncoderName = "lang3dxl"
-    """lang3dxl: the semantic field. feature3dgs: codes of half the CLIP width and one linear layer after
-    rendering. fmgs: a hash grid over places, decoded before rendering, whole features rendered. langsplat: a
-    per-scene autoencoder's three numbers. direct: the whole feature on every Gaussian. lifting: no learning;
-    every Gaussian gets the mean of the target features of the pixels it contributes to."""
+    """lang3dxl: targets are averaged onto the Gaussians after training and compressed to three numbers
+    each, which the semantic field decodes Gaussian by Gaussian. paper: Lang3D-XL as published, codes trained
+    with the scene and decoded pixel by pixel. feature3dgs: codes of half the CLIP width and one linear layer
+    after rendering. fmgs: a hash grid over positions, decoded before rendering; whole features are rendered.
+    langsplat: a per-scene autoencoder's three numbers. direct: the whole feature on every Gaussian. lifting:
+    targets averaged onto the Gaussians, rendered uncompressed."""
+
+    compression: CompressionConfig = field(default_factory=CompressionConfig)
+    """lang3dxl: compression of gathered features to codes."""
+
+    @property
+    def learns_from_renderings(self) -> bool:
+        """Whether codes are trained with the scene, with all semantic losses."""
+        return self.name not in ("lang3dxl", "lifting")
+
     alignment_weight: float = 0.01
-    """fmgs: weight of the pixel alignment of CLIP to dense features (0.01 to 0.03 are published)."""
+    """fmgs: weight of the loss that aligns CLIP with dense features (published: 0.01 to 0.03)."""
     autoencoder_steps: int = 2_000
     """langsplat: iterations of 1,024 features each, before the run."""
 
 
 def make_encoder(
     config: EncoderConfig,
-    field: SemanticFieldConfig,
+    settings: SemanticFieldConfig,
     clip_dim: int,
     dense_dim: int,
     centre: Float[Tensor, "3"],
     radius: float,
 ) -> SemanticEncoder:
-    """The encoder of this name; `field` are the settings of those that have a hash grid.
+    """The feature decoder of this name; `settings`: of those that have a hash grid.
 
     centre, radius: of the scene, world units.
     """
     if config.name == "feature3dgs":
         return Feature3DGS(clip_dim, dense_dim)
     if config.name == "fmgs":
-        return PlaceField(field, clip_dim, dense_dim, centre, radius, config.alignment_weight)
+        return PlaceField(settings, clip_dim, dense_dim, centre, radius, config.alignment_weight)
     if config.name == "langsplat":
         return LangSplat(clip_dim, config.autoencoder_steps)
     if config.name == "direct":
         return DirectFeatures(clip_dim, dense_dim)
     if config.name == "lifting":
         return LiftedFeatures(clip_dim, dense_dim)
-    return SemanticField(field, clip_dim, dense_dim)
+    if config.name == "paper":
+        return SemanticField(settings, clip_dim, dense_dim)
+    return CompressedField(settings, clip_dim, config.compression)

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.encoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 
 
 class Feature3DGS(SemanticEncoder):
-    """Codes half as wide as CLIP's features (256 for ViT-B/32), and its "speed-up" layer, a 1×1 convolution,
-    from there to CLIP and dense features. Whitened like the semantic field, which only helps it."""
+    """Codes half as wide as CLIP's features (256 for ViT-B/32), expanded by its "speed-up" layer, a 1×1
+    convolution, to CLIP and dense features. Whitened like the semantic field, which can only help it."""
 
     def __init__(self, clip_dim: int, dense_dim: int) -> None:
         super().__init__(clip_dim, dense_dim)

@@ -1,4 +1,4 @@
-"""FMGS (Zuo et al. 2024), as Lang3D-XL adapts it: a hash grid over places, decoded before rendering."""
+"""FMGS (Zuo et al. 2024), as adapted by Lang3D-XL: a hash grid over positions, decoded before rendering."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.encoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
 _STRETCH = 2.0
-"""Places within a scene's radius fill 0.12 … 0.88 of the grid, almost evenly; all beyond share the rest."""
+"""Positions within the scene radius fill 0.12 … 0.88 of the grid almost evenly; all others share the rest."""
 
 
 class PlaceField(SemanticEncoder):
-    """The semantic field read at a Gaussian's place instead of a pixel's code: every Gaussian is decoded, and
-    the whole features are rendered. Gaussians learn nothing of their own.
+    """The semantic field evaluated at a Gaussian's position instead of a pixel's code: every Gaussian is
+    decoded, and whole features are rendered. Gaussians have no learned codes.
 
     Args:
         centre, radius: of the scene, world units.
@@ -36,7 +36,7 @@ class PlaceField(SemanticEncoder):
         alignment_weight: float,
     ) -> None:
         super().__init__(clip_dim, dense_dim)
-        # A place is a coordinate of three numbers, whatever codes the field would have.
+        # A position has three coordinates, whatever the field's code size.
         self.field = SemanticField(replace(config, code_dim=3, bounding="sigmoid"), clip_dim, dense_dim)
         self.alignment_weight = alignment_weight
         self.centre: Tensor
@@ -48,7 +48,7 @@ class PlaceField(SemanticEncoder):
         return None
 
     def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"]:
-        """Features of the Gaussians' places; places themselves get no gradient."""
+        """Features at the Gaussians' positions; positions get no gradient."""
         places = _STRETCH * (gaussians["means"].detach() - self.centre) / self.radius
         clip, dense = self.field(places)
         return clip if dense is None else torch.cat([clip, dense], dim=-1)
@@ -76,12 +76,12 @@ class PlaceField(SemanticEncoder):
 
 
 def pixel_alignment_loss(clip: Float[Tensor, "h w c"], dense: Float[Tensor, "h w d"]) -> Float[Tensor, ""]:
-    """Mean difference of how alike neighbours are in CLIP and in dense features; these get no gradient."""
+    """Mean difference of neighbour similarity between CLIP and dense features; these get no gradient."""
     return (neighbour_similarity(clip) - neighbour_similarity(dense.detach())).abs().mean()
 
 
 def neighbour_similarity(features: Float[Tensor, "h w c"]) -> Float[Tensor, "h w 8"]:
-    """Cosine of every pixel to its eight neighbours; mirrored at the border."""
+    """Cosine of every pixel with its eight neighbours; mirrored at the border."""
     height, width, _ = features.shape
     unit = F.normalize(features, dim=-1)
     padded = F.pad(unit.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="reflect")[0].permute(1, 2, 0)

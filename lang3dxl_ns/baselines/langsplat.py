@@ -10,23 +10,23 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.encoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 
 _ENCODER = (256, 128, 64, 32, 3)
 _DECODER = (16, 32, 64, 128, 256, 256)
 _BATCH = 1024
 _RATE = 2e-3
-"""The published 7e-4 is for batches of 64."""
+"""Higher than the published 7e-4, which is for batches of 64."""
 _MOST_FEATURES = 400_000
-"""Features that the autoencoder learns from, at most."""
+"""Most features the autoencoder is trained on."""
 
 
 class LangSplat(SemanticEncoder):
-    """Codes of unit length, decoded after rendering by the autoencoder's decoder, which stays as it is.
+    """Unit-length codes, decoded after rendering by the autoencoder's frozen decoder.
 
-    The autoencoder learns the scene's CLIP targets before the run, as unit vectors; decoded features get the
-    targets' typical length back. It has no dense features. The published system trains a model for each of
-    three levels of SAM's segments, on segment features; this one has the targets that all encoders have here.
+    The autoencoder learns the scene's CLIP targets before the run, as unit vectors; decoded features are
+    scaled back to the targets' typical length. There are no dense features. The published system trains a
+    model for each of three levels of SAM segments; this one uses the targets that all decoders share here.
 
     Args:
         clip_dim: channels of the CLIP features.
@@ -58,7 +58,7 @@ class LangSplat(SemanticEncoder):
         return {}
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
-        """Only the typical length of the CLIP targets is used."""
+        """Uses only the typical length of the CLIP targets."""
         mean, std = mean[: self.clip_dim], std[: self.clip_dim]
         super().set_output_statistics(mean, std)
         self.norm.copy_((mean.square() + std.square()).sum().sqrt())
@@ -90,7 +90,7 @@ class LangSplat(SemanticEncoder):
 
 
 def _sample(targets: Iterable[Tensor], generator: torch.Generator) -> Float[Tensor, "n c"]:
-    """Unit vectors of the targets, thinned out as they come where there are too many."""
+    """Unit vectors of the targets, subsampled if there are too many."""
     rows: list[Tensor] = []
     for target in targets:
         flat = F.normalize(target.flatten(0, 1).float(), dim=-1)
@@ -101,7 +101,7 @@ def _sample(targets: Iterable[Tensor], generator: torch.Generator) -> Float[Tens
 
 
 def _layers(widths: tuple[int, ...], normalise: bool = False) -> nn.Sequential:
-    """Linear layers with a ReLU between two, after a batch normalisation if asked for."""
+    """Linear layers with ReLU between, preceded by batch normalisation if requested."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         if layers:

@@ -1,4 +1,4 @@
-"""What the ablation changes, row by row: each row is the method with one thing different."""
+"""Rows of the ablation table: each is the method with one change."""
 
 from __future__ import annotations
 
@@ -6,34 +6,36 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 
-FULL, TEACHER, CLIPSEG = "full", "teacher", "clipseg"
+FULL, TEACHER, LIMIT, CHANCE, CLIPSEG = "full", "teacher", "limit", "chance", "clipseg"
+BOUNDS = (TEACHER, LIMIT, CHANCE)
+"""Rows that every run of the full method includes: figures with these prefixes."""
 _FIELD, _DATA = "pipeline.model.semantic_field.", "pipeline.datamanager."
 OF_TARGETS = ("scale_mode", "scale_range", "scales", "dense_tokens")
-"""Settings of the data manager that decide what the targets are."""
+"""Data manager settings that determine the targets."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table."""
+    """One row of the table."""
 
     name: str
     group: str
     label: str
     changes: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    """Values by their dotted path in the run's configuration."""
+    """Values by dotted path in the run's configuration."""
     published: str = ""
-    """What Lang3D-XL prints for the same comparison, on HolyScenes."""
+    """Lang3D-XL's published figures for the same comparison, on HolyScenes."""
 
     @property
     def trains(self) -> bool:
-        """Whether the row is a run of its own."""
-        return self.name not in (TEACHER, CLIPSEG)
+        """Whether the row needs its own training run."""
+        return self.name not in (*BOUNDS, CLIPSEG)
 
     @property
     def own_targets(self) -> bool:
-        """Whether the targets differ from those of the other rows."""
+        """Whether its targets differ from those of the other rows."""
         return any(path.removeprefix(_DATA) in OF_TARGETS for path in self.changes)
 
 
@@ -41,53 +43,66 @@ def _encoder(name: str, label: str, published: str = "") -> Row:
     return Row(name, "encoder", label, {"pipeline.model.encoder.name": name}, published)
 
 
+_PAPER = {"pipeline.model.encoder.name": "paper"}
+"""Codes trained with the scene, by downsampler, dense features and regions: compare with row "paper"."""
 ROWS = (
     Row(FULL, "method", "Lang3D-XL", published="mAP .59; windows AP .69; L1 .146, PSNR 13.9"),
-    Row(TEACHER, "2-D", "the crop pyramid itself, in the scored photo"),
+    Row(TEACHER, "2-D", "the crop pyramid itself, in the scored picture"),
+    Row(LIMIT, "2-D", "exact labels, lifted to the Gaussians and rendered back"),
+    Row(CHANCE, "2-D", "a map without information"),
     Row(CLIPSEG, "2-D", "CLIPSeg", published="mAP .56"),
     _encoder("feature3dgs", "Feature 3DGS: wide codes, linear layer", "L1 .149, PSNR 13.3"),
     _encoder("fmgs", "FMGS: hash grid over places, whole features rendered", "mAP .51; L1 .180, PSNR 11.6"),
     _encoder("langsplat", "LangSplat: per-scene autoencoder to 3 numbers", "mAP .19"),
     _encoder("direct", "whole feature on every Gaussian"),
     _encoder("lifting", "training-free lifting"),
+    _encoder("paper", "as published: codes composited, then decoded"),
     Row("hash", "field", "hash grid alone", {f"{_FIELD}fourier_frequencies": 0}),
     Row("fourier", "field", "Fourier features alone",
         {f"{_FIELD}levels": 0, f"{_FIELD}fourier_frequencies": 4, f"{_FIELD}coarse_to_fine": 0.0}),
     Row("both", "field", "hash grid and Fourier features", {f"{_FIELD}fourier_frequencies": 4}),
-    Row("paper", "field", "preset paper", {f"{_FIELD}preset": "paper"}),
-    Row("official", "field", "preset official", {f"{_FIELD}preset": "official"}),
+    Row("field-paper", "field", "preset paper", {f"{_FIELD}preset": "paper"}),
+    Row("field-official", "field", "preset official", {f"{_FIELD}preset": "official"}),
     Row("code-2", "field", "codes of 2 numbers", {f"{_FIELD}code_dim": 2}),
     Row("code-4", "field", "codes of 4 numbers", {f"{_FIELD}code_dim": 4}),
     Row("code-6", "field", "codes of 6 numbers", {f"{_FIELD}code_dim": 6}),
-    Row("alpha", "field", "codes divided by coverage", {"pipeline.model.divide_codes_by_alpha": True}),
     Row("lerf", "supervision", "LERF's pyramid instead of physical scales",
         {f"{_DATA}scale_mode": "relative"}, "windows AP .64"),
     Row("single-scale", "supervision", "crops of one size", {f"{_DATA}scales": 1}),
+    Row("pyramid", "supervision", "gathered from the whole pyramid, crops half a side apart",
+        {f"{_DATA}crops": "pyramid"}),
     Row("no-ad-lr", "supervision", "without attenuated downsampler (LR)",
-        {"pipeline.model.downsampler.match": "resize-features"}, "windows AP .53"),
+        _PAPER | {"pipeline.model.downsampler.match": "resize-features"}, "windows AP .53"),
     Row("no-ad-hr", "supervision", "without attenuated downsampler (HR)",
-        {"pipeline.model.downsampler.match": "resize-target"}, "windows AP .46"),
+        _PAPER | {"pipeline.model.downsampler.match": "resize-target"}, "windows AP .46"),
     Row("box", "supervision", "box window instead of the pyramid kernel",
-        {"pipeline.model.downsampler.kernel": "box"}),
-    Row("no-dense", "supervision", "without dense features", {f"{_DATA}dense": "none"}, "windows AP .30"),
-    Row("no-regions", "supervision", "without regions", {f"{_DATA}regions": "none"}, "windows AP .60"),
-    Row("regions", "supervision", "with regions (felzenszwalb)", {f"{_DATA}regions": "felzenszwalb"}),
+        _PAPER | {"pipeline.model.downsampler.kernel": "box"}),
+    Row("no-dense", "supervision", "without dense features",
+        _PAPER | {f"{_DATA}dense": "none"}, "windows AP .30"),
+    Row("no-regions", "supervision", "without regions",
+        _PAPER | {f"{_DATA}regions": "none"}, "windows AP .60"),
+    Row("regions", "supervision", "with regions (felzenszwalb)",
+        _PAPER | {f"{_DATA}regions": "felzenszwalb"}),
     Row("no-decay", "supervision", "without weight decay",
-        {f"optimizers.{group}.optimizer.weight_decay": 0.0 for group in ("field_decoder", "downsampler")}),
+        _PAPER | {f"optimizers.{g}.optimizer.weight_decay": 0.0 for g in ("field_decoder", "downsampler")}),
 )  # fmt: skip
-"""Everything that can be asked for."""
+"""All available rows."""
+SYSTEMS = (FULL, "paper", "feature3dgs", "fmgs", "langsplat", "direct", "lifting", *BOUNDS)
+"""Ways to carry features, and the bounds they are compared with."""
 
 
 def choose_rows(names: Iterable[str], short_run: bool, has_regions: bool) -> list[Row]:
-    """The rows of these names, in the order of `ROWS`; without names, all that differ from the full method.
+    """The rows with these names ("systems": `SYSTEMS`), in the order of `ROWS`; by default all that differ
+    from the full method.
 
-    That has Fourier features in short runs alone, and regions where the scene has a folder of them. Raises
-    UserError for an unknown name.
+    The full method has Fourier features only in short runs, and regions only if the scene has a folder of
+    them. Raises UserError for an unknown name.
     """
     known = {row.name for row in ROWS}
+    names = {part for name in names for part in (SYSTEMS if name == "systems" else (name,))}
     if unknown := [name for name in names if name not in known]:
         choices = ", ".join(row.name for row in ROWS)
-        raise UserError(f"there is no row {', '.join(unknown)}: choose of {choices}")
+        raise UserError(f"there is no row {', '.join(unknown)}: choose of systems, {choices}")
     same = {"both" if short_run else "hash", "regions" if has_regions else "no-regions"}
     wanted = set(names) or known - same
     return [row for row in ROWS if row.name in wanted]

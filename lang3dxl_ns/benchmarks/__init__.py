@@ -1,1 +1,1 @@
-"""What `lang3dxl benchmark` runs: error beside time and memory."""
+"""Benchmarks of `lang3dxl benchmark`: error beside time and memory."""

@@ -1,4 +1,4 @@
-"""The tables and the plot of a comparison of runs."""
+"""Tables and plots of the ablation report."""
 
 from __future__ import annotations
 
@@ -9,19 +9,17 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from lang3dxl_ns.baselines.rows import FULL, TEACHER, Row
+from lang3dxl_ns.baselines.rows import BOUNDS, FULL, Row
 from lang3dxl_ns.benchmarks.scored_runs import Run
-from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, write_atomically, write_report
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_atomically, write_report
 
 FIGURES = {
-    "map": ("mAP", ".3f"),
+    "test_map": ("mAP, test views", ".3f"),
+    "map": ("mAP, held-out photos", ".3f"),
     "seen_map": ("mAP, seen photos", ".3f"),
-    "raw_map": ("mAP without blur", ".3f"),
-    "localisation_accuracy": ("located", ".3f"),
-    "clip_l1": ("CLIP L1", ".3f"),
-    "clip_psnr": ("CLIP PSNR", ".2f"),
-    "clip_cosine": ("CLIP cosine", ".3f"),
-    "psnr": ("PSNR", ".2f"),
+    "test_raw_map": ("without blur, test views", ".3f"),
+    "test_clip_l1": ("CLIP L1", ".3f"),
+    "test_cc_psnr": ("PSNR, matched", ".2f"),
     "train_seconds": ("train, s", ".0f"),
     "train_peak_mb": ("peak, MB", ".0f"),
     "render_ms": ("render, ms", ".0f"),
@@ -31,25 +29,32 @@ Figures = Mapping[Run, Mapping[str, float]]
 
 
 def write_ablation(
-    folder: Path,
-    command: str,
-    rows: Sequence[Row],
-    scenes: Sequence[str],
-    figures: Figures,
-    failed: Mapping[Run, str],
+    folder: Path, command: str, rows: Sequence[Row], figures: Figures, failed: Mapping[Run, str]
 ) -> None:
-    """Write ablation.md, .json, .csv and .png from what there is so far."""
-    summary = [_summary(row, scenes, figures, failed) for row in rows]
-    data = {"command": command, "machine": describe_machine(), "scenes": list(scenes), "rows": summary}
+    """Write ablation.md, .json, .csv and .png from the results so far."""
+    scenes = list(dict.fromkeys(run.label for run in (*figures, *failed)))
+    lengths = sorted({run.steps for run in (*figures, *failed)})
+    summary = {steps: [_summary(row, steps, scenes, figures, failed) for row in rows] for steps in lengths}
+    quality = "test_map" if any("test_map" in found for found in figures.values()) else "map"
+    mark_front([row for rows in summary.values() for row in rows], quality)
+    data = {
+        "command": command,
+        "machine": describe_machine(),
+        "scenes": scenes,
+        "quality": quality,
+        "lengths": summary,
+    }
     write_report(folder, "ablation", markdown(data), data)
     write_atomically(folder / "ablation.csv", table_of_runs(figures))
-    if any("map" in row["mean"] for row in summary):
-        write_atomically(folder / "ablation.png", plot(summary))
+    if any({"train_seconds", quality} <= set(row["mean"]) for rows in summary.values() for row in rows):
+        write_atomically(folder / "ablation.png", plot(summary, quality))
 
 
-def _summary(row: Row, scenes: Sequence[str], figures: Figures, failed: Mapping[Run, str]) -> dict[str, Any]:
-    """A row's figures by scene and over all scenes, each a mean and a deviation over the seeds."""
-    own = {run: found for run, found in figures.items() if run.row.name == row.name}
+def _summary(
+    row: Row, steps: int, scenes: Sequence[str], figures: Figures, failed: Mapping[Run, str]
+) -> dict[str, Any]:
+    """A row's figures by scene and over all scenes, each with mean and deviation over the seeds."""
+    own = {run: found for run, found in figures.items() if run.row.name == row.name and run.steps == steps}
     names = list(dict.fromkeys(name for found in own.values() for name in found))
     by_scene = {
         scene: {
@@ -59,14 +64,14 @@ def _summary(row: Row, scenes: Sequence[str], figures: Figures, failed: Mapping[
         for scene in scenes
     }
     complete = {seed: [f for run, f in own.items() if run.seed == seed] for seed in {run.seed for run in own}}
-    # A mean over scenes counts where the seed has all of them: else scenes would pass for seeds.
+    # Only seeds that have all scenes enter the mean over scenes: otherwise scenes would pass for seeds.
     complete = {seed: found for seed, found in complete.items() if len(found) == len(scenes)}
     overall = {
         name: spread([mean(f[name] for f in found) for found in complete.values()])
         for name in names
         if all(name in f for found in complete.values() for f in found)
     }
-    reasons = {reason for run, reason in failed.items() if run.row.name == row.name}
+    reasons = {reason for run, reason in failed.items() if (run.row.name, run.steps) == (row.name, steps)}
     return {
         "row": row.name,
         "group": row.group,
@@ -80,56 +85,74 @@ def _summary(row: Row, scenes: Sequence[str], figures: Figures, failed: Mapping[
 
 
 def spread(values: Sequence[float]) -> dict[str, float] | None:
-    """Mean, deviation (of the sample; 0 of a single value) and number; None of nothing."""
+    """Mean, sample deviation (0 for a single value) and count; None for an empty list."""
     if not values:
         return None
     return {"mean": mean(values), "std": stdev(values) if len(values) > 1 else 0.0, "runs": len(values)}
 
 
+def mark_front(rows: Sequence[dict[str, Any]], quality: str) -> None:
+    """Add to every row `front`: whether no other is both as fast and better, or as good and faster."""
+
+    def point(row: Mapping[str, Any]) -> tuple[float, float]:
+        return row["mean"]["train_seconds"]["mean"], -row["mean"][quality]["mean"]
+
+    timed = [row for row in rows if {"train_seconds", quality} <= set(row["mean"])]
+    for row in rows:
+        row["front"] = row in timed and not any(
+            point(o) != point(row) and all(a <= b for a, b in zip(point(o), point(row), strict=True))
+            for o in timed
+        )
+
+
 def markdown(data: Mapping[str, Any]) -> str:
-    """The report for people."""
-    scenes = data["scenes"]
-    notes = [f"- {row['label']}: {'; '.join(row['not_run'])}" for row in data["rows"] if row["not_run"]]
-    table = markdown_table(
-        ["", "row", *(label for label, _ in FIGURES.values()), "published, another dataset"],
-        [
-            [row["group"], row["label"], *_cells(row["mean"], row["not_run"]), row["published"] or None]
-            for row in data["rows"]
-        ],
-    )
+    """The report in markdown."""
+    parts = []
+    for steps, rows in data["lengths"].items():
+        tables = (_table(rows), _scene_table(rows, data), _category_table(rows, data))
+        parts += [f"## {steps} iterations", *tables]
+    reasons = [(r["label"], why) for rows in data["lengths"].values() for r in rows for why in r["not_run"]]
+    notes = "\n".join(f"- {label}: {why}" for label, why in dict.fromkeys(reasons))
     return f"""# Ablation
 
     {data["command"]}
 
-Held-out photos of {len(scenes)} scene(s): {", ".join(scenes)}; "seen": the photos that training saw. Mean ±
-deviation over the seeds.
+{len(data["scenes"])} scene(s): {", ".join(data["scenes"])}. Mean ± deviation over the seeds.
 {data["machine"]}
 
-{table}
+mAP: mean over the categories of the average precision of relevancy maps, at half the picture's size. Test
+views are novel cameras with exact labels; "seen" are labelled training photos. CLIP L1 uses the same
+downsampling kernel for all rows. Times are wall-clock with a GPU, processor time (all threads) without;
+"train" excludes preparation of targets, "answer" is one view with all prompts. Bold: no other row
+of any length is as fast and better. "Published" are Lang3D-XL's figures for HolyScenes: other photos,
+another CLIP, other lengths.
 
-mAP: mean over the categories of the average precision of relevancy maps, blurred by 2.5 pixels at half the
-photo's size. "located": how often the highest pixel lies on the object. Times are of the clock with a GPU, of
-the processor (all threads) without one. "train" has no preparation of targets in it; "answer" decodes a
-rendered view and compares it with all prompts, without a lookup table. The last column is what Lang3D-XL
-prints for HolyScenes: other photos, another CLIP, other lengths of training. Compare its order with this one,
-not its figures.
-
-## mAP by scene
-
-{_scene_table(data)}
-
-## AP by category
-
-{_category_table(data)}
+{(chr(10) * 2).join(parts)}
 
 ![mAP](ablation.png)
-""" + ("\n## Not run here\n\n" + "\n".join(notes) + "\n" if notes else "")
+""" + (f"\n## Not run here\n\n{notes}\n" if notes else "")
 
 
-def _cells(found: Mapping[str, Any], not_run: Sequence[str]) -> list[str | None]:
-    if not found and not_run:
-        return ["not run here", *[None] * (len(FIGURES) - 1)]
-    return [_cell(found.get(name), form) for name, (_, form) in FIGURES.items()]
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    shown = [name for name in FIGURES if any(name in row["mean"] for row in rows)]
+    published = any(row["published"] for row in rows)
+    return markdown_table(
+        ["", "row", *(FIGURES[name][0] for name in shown), *["published"] * published],
+        [
+            [row["group"], _bold(row), *_cells(row, shown), *[row["published"] or None] * published]
+            for row in rows
+        ],
+    )
+
+
+def _bold(row: Mapping[str, Any]) -> str:
+    return f"**{row['label']}**" if row["front"] else row["label"]
+
+
+def _cells(row: Mapping[str, Any], shown: Sequence[str]) -> list[str | None]:
+    if not row["mean"] and row["not_run"]:
+        return ["not run here", *[None] * (len(shown) - 1)]
+    return [_cell(row["mean"].get(name), FIGURES[name][1]) for name in shown]
 
 
 def _cell(value: Mapping[str, float] | None, form: str) -> str | None:
@@ -139,32 +162,28 @@ def _cell(value: Mapping[str, float] | None, form: str) -> str | None:
     return f"{value['mean']:{form}}{deviation}"
 
 
-def _scene_table(data: Mapping[str, Any]) -> str:
+def _scene_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> str:
+    scenes, quality = data["scenes"], data["quality"]
     return markdown_table(
-        ["row", *data["scenes"]],
-        [
-            [row["label"], *(_cell(row["scenes"][scene].get("map"), ".3f") for scene in data["scenes"])]
-            for row in data["rows"]
-        ],
+        ["mAP", *scenes],
+        [[row["label"], *(_cell(row["scenes"][s].get(quality), ".3f") for s in scenes)] for row in rows],
     )
 
 
-def _category_table(data: Mapping[str, Any]) -> str:
-    """Means over the scenes that have the category."""
-
-    def is_category(name: str) -> bool:
-        return name.startswith("ap_") and not name.endswith("_photos")
-
-    found = [row["scenes"][scene] for row in data["rows"] for scene in data["scenes"]]
-    names = list(dict.fromkeys(name for figures in found for name in figures if is_category(name)))
+def _category_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> str:
+    """Means over the scenes that have each category."""
+    start = data["quality"].removesuffix("map") + "ap_"
+    found = [figures for row in rows for figures in row["scenes"].values()]
+    names = [name for figures in found for name in figures if name.startswith(start)]
+    names = [name for name in dict.fromkeys(names) if not name.endswith("_photos")]
 
     def over_scenes(row: Mapping[str, Any], name: str) -> str | None:
         values = [figures[name]["mean"] for figures in row["scenes"].values() if name in figures]
         return f"{mean(values):.3f}" if values else None
 
     return markdown_table(
-        ["row", *(name.removeprefix("ap_") for name in names)],
-        [[row["label"], *(over_scenes(row, name) for name in names)] for row in data["rows"]],
+        ["AP", *(name.removeprefix(start) for name in names)],
+        [[row["label"], *(over_scenes(row, name) for name in names)] for row in rows],
     )
 
 
@@ -173,38 +192,35 @@ def table_of_runs(figures: Figures) -> str:
     names = list(dict.fromkeys(name for found in figures.values() for name in found))
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["row", "group", "scene", "seed", *names])
+    writer.writerow(["row", "group", "scene", "steps", "seed", *names])
     for run, found in figures.items():
         values = [found.get(name, "") for name in names]
-        writer.writerow([run.row.name, run.row.group, run.label, run.seed, *values])
+        writer.writerow([run.row.name, run.row.group, run.label, run.steps, run.seed, *values])
     return file.getvalue()
 
 
-def plot(summary: Sequence[Mapping[str, Any]]) -> bytes:
-    """PNG: mAP of every row, bars for held-out photos and dots for those seen in training, the full method's
-    as a line."""
+def plot(lengths: Mapping[int, Sequence[Mapping[str, Any]]], quality: str) -> bytes:
+    """PNG: quality against training time; a line per row through its lengths, bounds as dotted lines."""
     from matplotlib.figure import Figure
 
-    rows = [row for row in summary if "map" in row["mean"]]
-    groups = list(dict.fromkeys(row["group"] for row in rows))
-    figure = Figure(figsize=(7, 1.2 + 0.3 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
     axes = figure.subplots()
-    for index, row in enumerate(rows):
-        value = row["mean"]["map"]
-        axes.barh(index, value["mean"], xerr=value["std"], color=f"C{groups.index(row['group'])}", height=0.7)
-        axes.text(0.005, index, row["label"], va="center", color="white", fontsize=8)
-        if seen := row["mean"].get("seen_map"):
-            axes.plot(seen["mean"], index, "o", color="0.3", markersize=4)
-        if row["row"] in (FULL, TEACHER):
-            axes.axvline(
-                value["mean"], color="0.3", linewidth=1, linestyle="-" if row["row"] == FULL else ":"
-            )
-    axes.set(
-        yticks=[],
-        xlabel="mAP held out (lines: the method, dotted its 2-D teacher); dots: in photos seen in training",
-    )
-    axes.invert_yaxis()
-    axes.spines[["top", "right", "left"]].set_visible(False)
+    for index, row in enumerate(next(iter(lengths.values()))):
+        found = [r["mean"] for rows in lengths.values() for r in rows if r["row"] == row["row"]]
+        if row["row"] in BOUNDS:
+            levels = [values[quality]["mean"] for values in found if quality in values]
+            if levels:
+                axes.axhline(mean(levels), color="0.4", linewidth=1, linestyle=":")
+                axes.annotate(row["row"], (1, mean(levels)), xycoords=("axes fraction", "data"), fontsize=7)
+            continue
+        points = [(v["train_seconds"], v[quality]) for v in found if {"train_seconds", quality} <= set(v)]
+        seconds, values = ([p[i]["mean"] for p in points] for i in (0, 1))
+        style = {"color": "C3", "linewidth": 2.5} if row["row"] == FULL else {"color": f"C{index % 10}"}
+        label = row["label"].split(":")[0]
+        axes.errorbar(seconds, values, [p[1]["std"] for p in points], marker="o", label=label, **style)
+    axes.set(xscale="log", xlabel="training, s of one core", ylabel="mAP")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=7)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=150)
     return file.getvalue()

@@ -1,7 +1,7 @@
-"""What the rasteriser costs and how wrong it is, beside a plain dense one in the same process.
+"""`lang3dxl benchmark rasterizer`: time, memory and error beside a plain dense rasteriser in one process.
 
-Absolute times don't carry over from one machine to the next; the ratios between candidates that ran in turn
-do, so those are the figures to quote.
+Absolute times don't carry over to another machine; ratios between candidates that ran in turn do, so
+quote those.
 """
 
 import io
@@ -17,13 +17,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.evaluation.dense_rasterizer import (
+from lang3dxl_ns.benchmarks.dense_rasterizer import (
     DENSE_BYTES_PER_PAIR,
     DENSE_TILE,
     count_pairs,
     render_dense,
 )
-from lang3dxl_ns.evaluation.rasterizer_scenes import (
+from lang3dxl_ns.benchmarks.rasterizer_scenes import (
     CHANNELS,
     COLOURS,
     Case,
@@ -31,7 +31,9 @@ from lang3dxl_ns.evaluation.rasterizer_scenes import (
     Recipe,
     make_problem,
 )
-from lang3dxl_ns.evaluation.report import (
+from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.kernels import takes_kernels
+from lang3dxl_ns.common.reports import (
     MEBIBYTE,
     command_line,
     describe_machine,
@@ -41,11 +43,10 @@ from lang3dxl_ns.evaluation.report import (
     progress_bar,
     write_report,
 )
-from lang3dxl_ns.files import write_atomically
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.rasterize import Backend
 
-OURS, DENSE, GSPLAT = "lang3dxl", "dense tiles", "gsplat"
+OURS, TORCH, DENSE, GSPLAT = "lang3dxl", "torch kernels", "dense tiles", "gsplat"
 
 
 # --- measuring --------------------------------------------------------------------------------------------
@@ -56,6 +57,8 @@ def forward(problem: Problem, method: str) -> tuple[Float[Tensor, "h w 6"], Floa
     if method == DENSE:
         return render_dense(problem)
     backend: Backend = "gsplat" if method == GSPLAT else "torch"
+    if method == OURS and takes_kernels(problem.channels, wanted="numba"):
+        backend = "numba"
     scene = problem.gaussians, problem.camera, problem.channels, problem.background
     rendering = rasterize(*scene, backend=backend)
     return rendering.image, rendering.alpha
@@ -77,10 +80,10 @@ def forward_backward(problem: Problem, method: str) -> tuple[Tensor, tuple[Tenso
 def error_against(
     result: tuple[Tensor, tuple[Tensor, ...]], reference: tuple[Tensor, tuple[Tensor, ...]]
 ) -> dict[str, float]:
-    """Error of an image in [0, 1] and, relative L2, of the worst of the gradients.
+    """Error of an image in [0, 1] and, relative L2, of the worst gradient.
 
-    Where rounding moves a pair over the threshold of 1/255 (or of the end of a pixel), that pixel changes by
-    up to about 2e-3: pixels off by more than 1e-4 are counted apart.
+    Where rounding moves a pair across the threshold of 1/255 (or of the stop at 1e-4), that pixel changes by
+    up to about 2e-3: pixels off by more than 1e-4 are counted separately.
     """
     difference = (result[0].double() - reference[0].double()).abs()
     gradients = [
@@ -96,7 +99,7 @@ def error_against(
 
 
 def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
-    """Forward and backward of colours with and without the features, in the ways there are to get both."""
+    """Forward and backward of colours with and without features, in one pass and in two."""
     gaussians, camera, background = problem.gaussians, problem.camera, problem.background[:COLOURS]
     colours, features = (
         part.clone().requires_grad_()
@@ -149,27 +152,27 @@ class RasterizerBenchmark:
     out: Path
     """Folder for rasterizer.md, rasterizer.json and rasterizer.png."""
     scene: Path | None = None
-    """Points to use, an npz like gsplat's test_garden.npz. Without it, a made scene of similar statistics."""
+    """Points: an npz like gsplat's test_garden.npz. Default: a synthetic scene with similar statistics."""
     gaussians: tuple[int, ...] = (5_000, 20_000, 100_000)
-    """How many Gaussians."""
+    """Number of Gaussians."""
     image_sizes: tuple[tuple[int, int], ...] = ((160, 120), (320, 240), (640, 480))
     """Widths and heights, pixels."""
     recipes: tuple[Recipe, ...] = ("A", "B")
     """A: random small Gaussians. B: sizes and opacities as in training."""
     threads: int = 1
-    """CPU threads. On one thread processor time is measured, else wall time."""
+    """CPU threads. With one, processor time is measured, otherwise wall time."""
     repeats: int = 5
-    """Runs of each candidate after a warm-up; the median counts."""
+    """Runs of each candidate after a warm-up; the median is reported."""
     candidate_seconds: float = 5.0
-    """A candidate slower than this altogether is repeated less often (at least one run)."""
+    """A candidate that takes longer in total is repeated less often (at least once)."""
     baseline_gigabytes: float = 4.0
-    """The dense baseline's backward pass is left out where it would need more memory than this."""
+    """The dense baseline's backward pass is skipped if it would need more memory than this."""
     device: str = "auto"
-    """Where to render: auto (a GPU if there is one), cpu, cuda."""
+    """Device: auto (a GPU if there is one), cpu, cuda."""
     seed: int = 0
-    """Seed of everything random."""
+    """Random seed."""
     quick: bool = False
-    """Two small cases in seconds, to see that it works; no figures to quote."""
+    """Two small cases in seconds, as a smoke test; not for quoting."""
 
     def main(self) -> None:
         """Measure, and write the report."""
@@ -185,7 +188,7 @@ class RasterizerBenchmark:
             results = {
                 "command": command_line("lang3dxl benchmark rasterizer", self),
                 "machine": describe_machine(device),
-                "points": self.scene.name if self.scene else "made scene",
+                "points": self.scene.name if self.scene else "synthetic scene",
                 "baseline_gigabytes": self.baseline_gigabytes,
                 **_measure(plan),
             }
@@ -221,7 +224,7 @@ def _measure(plan: RasterizerBenchmark) -> dict[str, Any]:
 
 def _measure_case(case: Case, plan: RasterizerBenchmark) -> dict[str, Any]:
     problem = make_problem(case, plan.scene, plan.device, seed=plan.seed)
-    methods = [OURS, DENSE] + ([GSPLAT] if plan.device == "cuda" else [])
+    methods = [OURS, DENSE, GSPLAT] if plan.device == "cuda" else [OURS, TORCH, DENSE]
     kept, evaluated = count_pairs(problem)
     need = evaluated * DENSE_BYTES_PER_PAIR / 1e9
     differentiated = [method for method in methods if method != DENSE or need <= plan.baseline_gigabytes]
@@ -230,7 +233,7 @@ def _measure_case(case: Case, plan: RasterizerBenchmark) -> dict[str, Any]:
         {method: partial(forward_backward, problem, method) for method in differentiated}, plan
     )
 
-    # The dense baseline is the independent reference, as far as it fits: float64 takes twice the memory.
+    # The dense baseline is the independent reference where it fits: float64 takes twice the memory.
     reference_method = DENSE if 2 * need <= plan.baseline_gigabytes else OURS
     exact = make_problem(case, plan.scene, plan.device, torch.float64, plan.seed)
     reference = forward_backward(exact, reference_method)
@@ -270,10 +273,11 @@ def _markdown(results: dict[str, Any]) -> str:
 `{results["command"]}`
 {results["machine"]}. Points: {results["points"]}.
 
-{CHANNELS} channels (colours and features) over a background; gradients of image and alpha to all Gaussian
-parameters and channels; projection included. Medians of runs that took turns; f: forward, f+b: forward and
+{CHANNELS} channels (colours and features) over a background; gradients of image and alpha for all Gaussian
+parameters and channels; projection included. Medians of interleaved runs; f: forward, f+b: forward and
 backward. **Quote the ratios**: times don't carry over to another machine.
-{DENSE}: the same rules of rendering in plain torch with autograd, in tiles of {DENSE_TILE} pixels (the
+{TORCH}: the rasterizer in torch operations, for other devices and where numba is missing.
+{DENSE}: the same rendering rules in plain torch with autograd, in tiles of {DENSE_TILE} pixels (the
 fastest size); – where its backward pass would need more than {results["baseline_gigabytes"]:g} GB.
 
 {markdown_table(header, [_time_row(case, others) for case in results["cases"]])}
@@ -281,7 +285,7 @@ fastest size); – where its backward pass would need more than {results["baseli
 ## Error and memory
 
 Against {DENSE} in float64 (†: too large for it; against {OURS} in float64), images in [0, 1]. Pixels off:
-by more than 1e-4, where rounding moved a pair over the threshold of 1/255 or the end of a pixel. Gradients:
+by more than 1e-4, where rounding moved a pair across the threshold of 1/255 or the stop at 1e-4. Gradients:
 relative L2, the worst of means, rotations, scales, opacities, channels. Peak: extra memory of forward and
 backward.
 
@@ -333,7 +337,7 @@ def _pass_row(row: dict[str, Any]) -> list[str]:
 
 
 def _plot(results: dict[str, Any]) -> bytes:
-    """PNG: forward and backward time against the number of Gaussians, a panel for each recipe."""
+    """PNG: forward and backward time against the number of Gaussians, a panel per recipe."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.ticker import NullFormatter
@@ -342,7 +346,7 @@ def _plot(results: dict[str, Any]) -> bytes:
     methods = list(cases[0]["forward_ms"])
     sizes = sorted({(case["width"], case["height"]) for case in cases})
     colours = dict(zip(sizes, ("#7fb3d5", "#2471a3", "#0b2545", "#6c3483"), strict=False))
-    styles = dict(zip(methods, ("o-", "s--", "^:"), strict=False))
+    styles = dict(zip(methods, ("o-", "s--", "^:", "v-."), strict=False))
     recipes = {"A": "A: random small Gaussians", "B": "B: as in training"}
     drawn = [recipe for recipe in recipes if any(case["recipe"] == recipe for case in cases)]
     figure = Figure(figsize=(4.6 * len(drawn), 4.2), layout="constrained")

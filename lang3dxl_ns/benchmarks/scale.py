@@ -1,4 +1,4 @@
-"""Whether memory and time stay put as a scene grows: generated photos by the thousand, the real pipeline."""
+"""`lang3dxl benchmark scale`: growth of memory and time with photos and Gaussians, on generated scenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from lang3dxl_ns.evaluation.report import (
+from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
     host_peak,
@@ -20,26 +20,26 @@ from lang3dxl_ns.evaluation.report import (
 )
 
 if TYPE_CHECKING:
-    from lang3dxl_ns.trainer import Lang3DXLTrainerConfig
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainerConfig
 
 _alone = partial(in_own_process, preload=("lang3dxl_ns.methods", "pycolmap", "transformers"))
 
 PREDICTION = """Written before measuring. *Photos*: preparation holds one photo, one batch of crops and the
-encoders: constant. Training holds the cache (here `cache_gb`), what is read ahead, the Gaussians and one
-step: it grows until the cache is full and is constant from there on, but for the model's tracks (about 100
-bytes per observation) and a few kilobytes per photo of bookkeeping, 20 MB from 200 to 2,000 photos. The time
+encoders: constant. Training holds the cache (here `cache_gb`), the photos read ahead, the Gaussians and one
+step: it grows until the cache is full and is constant afterwards, except for the model's tracks (about 100
+bytes per observation) and a few kilobytes of bookkeeping per photo, 20 MB from 200 to 2,000 photos. The time
 of a step does not depend on the number of photos; out of core it may take 10 % longer, since another thread
 decodes photos meanwhile. *Gaussians*: 62 numbers each (59 of 3D Gaussian splatting and a code of 3), with
-gradients and Adam's two moments, are 1 kB each; a step's memory grows linearly on top of a constant of the
+gradients and Adam's two moments, are 1 kB each; a step's memory grows linearly on top of a constant for the
 decoder's maps, its time linearly or less."""
 
 
 @dataclass
 class ScaleBenchmark:
-    """Prepare, train and evaluate generated scenes of ever more photos, and of ever more Gaussians."""
+    """Prepare, train and evaluate generated scenes with growing numbers of photos and Gaussians."""
 
     out: Path
-    """Folder for scale.md, scale.json and the scenes (deleted when measured)."""
+    """Folder for scale.md, scale.json and the scenes (deleted afterwards)."""
     photos: tuple[int, ...] = (200, 500, 1000, 2000)
     """Numbers of photos."""
     gaussians: tuple[int, ...] = (10_000, 50_000, 100_000, 400_000)
@@ -49,16 +49,16 @@ class ScaleBenchmark:
     gaussian_steps: int = 5
     """Training steps of each run with Gaussians."""
     pairs: int = 3
-    """Runs with the fewest photos, out of core and all in memory in turn, to compare their steps."""
+    """Runs with the fewest photos, alternately out of core and in memory, to compare their steps."""
     workers: tuple[int, ...] = (1, 2)
-    """Numbers of processes that prepare the fewest photos, one after the other."""
+    """Numbers of processes to prepare the fewest photos with."""
     cache_gb: float = 0.01
-    """Memory for photos and targets: small, so that it is full with the fewest photos already."""
+    """Memory for photos and targets: small, so that even the fewest photos fill it."""
     encoders: str = "builtin"
     """CLIP and dense encoder; none measures photos alone."""
 
     def main(self) -> None:
-        """Each measurement has a process of its own, so that its peak memory is its own."""
+        """Runs each measurement in its own process, so that its peak memory can be measured."""
         rows: dict[str, list[dict[str, Any]]] = {"photos": [], "pairs": [], "workers": [], "gaussians": []}
         for count in sorted(self.photos):
             scene = _Measured(
@@ -107,9 +107,9 @@ class _Measured:
 
 
 def _measure(scene: _Measured) -> dict[str, Any]:
-    """Seconds and peak memory (bytes above the process with everything imported) of each part."""
-    from lang3dxl_ns import timing
-    from lang3dxl_ns.trainer import Lang3DXLTrainer
+    """Seconds and peak memory (bytes beyond the process with everything imported) of each part."""
+    from lang3dxl_ns.common import timing
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     config = _configuration(scene)
     config.save_config()
@@ -122,7 +122,7 @@ def _measure(scene: _Measured) -> dict[str, Any]:
     iterate = trainer.train_iteration
 
     def timed(step: int):
-        begin = time.process_time()  # of all threads: other people's processes don't count
+        begin = time.process_time()  # of all threads; excludes other processes
         result = iterate(step)
         times.append(time.process_time() - begin)
         return result
@@ -140,14 +140,14 @@ def _measure(scene: _Measured) -> dict[str, Any]:
         "preparation_bytes": after_preparation - empty,
         "training_bytes": after_training - empty,
         "evaluation_bytes": host_peak() - empty,
-        "step_s": median(times[len(times) // 5 :]),  # the first steps warm caches up
+        "step_s": median(times[len(times) // 5 :]),  # without the first steps, which warm up caches
         "data_s": median(seconds["data"]),
         "store_bytes": sum(path.stat().st_size for path in store.rglob("*") if path.is_file()),
     }
 
 
 def _prepare(scene: _Measured) -> float:
-    """Seconds to prepare all photos anew, the start of the processes included."""
+    """Seconds to prepare all photos anew, including the start of the processes."""
     data = _configuration(scene).pipeline.datamanager
     data.cache_dir = scene.folder / f"targets-{scene.workers}"
     start = time.perf_counter()
@@ -156,7 +156,7 @@ def _prepare(scene: _Measured) -> float:
 
 
 def _configuration(scene: _Measured) -> Lang3DXLTrainerConfig:
-    from lang3dxl_ns.demo.crowd import write_crowd
+    from lang3dxl_ns.demo.landmark.crowd import write_crowd
     from lang3dxl_ns.methods import run_config
 
     data = scene.folder / "scene"
@@ -175,10 +175,10 @@ def _configuration(scene: _Measured) -> Lang3DXLTrainerConfig:
 
 
 def markdown(settings: ScaleBenchmark, rows: dict[str, list[dict[str, Any]]]) -> str:
-    """The report."""
+    """The report in markdown."""
     photos = [(r, f"{r['photos']:,}") for r in rows["photos"]]
     photos += [(r, f"{r['photos']:,}, {name}") for pair in rows["pairs"] for name, r in pair.items()]
-    return f"""# How memory and time grow
+    return f"""# Memory and time as scenes grow
 
     {command_line("lang3dxl benchmark scale", settings)}
 
@@ -186,7 +186,7 @@ def markdown(settings: ScaleBenchmark, rows: dict[str, list[dict[str, Any]]]) ->
 
 {PREDICTION}
 
-Memory is the peak resident set above the process with everything imported. Photos are of 120×160 to 240×160
+Memory is the peak resident set beyond the process with everything imported. Photos are of 120×160 to 240×160
 pixels, encoders: {settings.encoders}.
 
 ## With the number of photos

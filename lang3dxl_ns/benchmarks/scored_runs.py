@@ -1,4 +1,4 @@
-"""Trains a variant of the method on a scene with ground truth, scores it, and never does so twice."""
+"""Training and scoring of a variant on a scene with ground truth, with results kept on disk."""
 
 from __future__ import annotations
 
@@ -12,44 +12,44 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
 from lang3dxl_ns.baselines.rows import CLIPSEG, Row
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.report import host_peak, in_own_process, write_atomically
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import host_peak, in_own_process, write_atomically
 
 if TYPE_CHECKING:
     from lang3dxl_ns.evaluation.scores import MapScorer
-    from lang3dxl_ns.pipeline import Lang3DXLPipeline
-    from lang3dxl_ns.trainer import Lang3DXLTrainerConfig
+    from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainerConfig
 
-_LIBRARIES = ("lang3dxl_ns.trainer", "lang3dxl_ns.methods")
-"""What a run's process needs: ten seconds of loading."""
+_LIBRARIES = ("lang3dxl_ns.plugin.trainer", "lang3dxl_ns.methods")
+"""Imports of a run's process, preloaded because they take ten seconds."""
 _TIMED_PHOTOS = 3
 _UNWANTED = ("num_rays_per_sec", "fps")
-_SEEN = ("map", "raw_map", "localisation_accuracy")
-"""Figures of the photos that training saw."""
+_BESIDE = ("map", "raw_map", "localisation_accuracy", "cc_psnr", "clip_l1", "clip_cosine")
+"""Figures beyond those of the held-out photos, besides every category's average precision."""
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What all runs of a comparison have in common."""
+    """Settings shared by all runs of a comparison."""
 
-    steps: int
     clip: str
     dense: str
     foreground: str
     scale: float
     dense_tokens: int
     flags: str
-    """More flags of `ns-train lang3dxl`."""
+    """Extra flags of `ns-train lang3dxl`."""
     clipseg: str
-    """Name or folder of the CLIPSeg."""
+    """Name or folder of CLIPSeg."""
 
 
 @dataclass(frozen=True)
@@ -59,22 +59,32 @@ class Run:
     row: Row
     scene: Path
     label: str
-    """The scene's, unique."""
+    """The scene's unique label."""
     seed: int
+    steps: int = 1_200
+    """Training iterations."""
 
     @property
     def name(self) -> str:
-        return f"{self.label}/{self.row.name}/{self.seed}"
+        return f"{self.label}/{self.row.name}/{self.steps}-{self.seed}"
 
 
 class ScoredRuns:
-    """Runs of a comparison; those that are finished are on disk, with the settings that made them."""
+    """Runs of a comparison; finished ones are on disk, with the settings that made them."""
 
     def __init__(self, folder: Path, settings: RunSettings) -> None:
         self.folder, self.settings = folder, settings
 
+    @cached_property
+    def _clip_weights(self) -> str:
+        """Fingerprint of the CLIP's weights, so that another version under the same name is noticed."""
+        from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
+
+        clip = self.settings.clip
+        return clip if clip == "none" else find_model(clip, CLIP_OPTION).identity
+
     def finished(self, run: Run) -> dict[str, float] | None:
-        """Figures of a run that was made with these settings; None where it has to be made."""
+        """Figures of a run already made with these settings; None if it has to be made."""
         path = self._path(run)
         if not path.is_file():
             return None
@@ -82,10 +92,10 @@ class ScoredRuns:
         return found["figures"] if found["made_with"] == self._made_with(run) else None
 
     def make(self, run: Run) -> dict[str, float]:
-        """Train and score in a process of its own, so that its peak memory is its own; what it prints goes to
+        """Train and score in a separate process, so that its peak memory can be measured; its output goes to
         a log beside the result.
 
-        Raises UserError when the run fails, with the reason.
+        Raises UserError with the reason if the run fails.
         """
         path = self._path(run)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -97,28 +107,29 @@ class ScoredRuns:
         return figures
 
     def _submit(self, run: Run, log: Path) -> dict[str, float]:
-        work = self.folder / f"work-{run.label}-{run.row.name}-{run.seed}"
+        work = self.folder / f"work-{run.name.replace('/', '-')}"
         try:
             return in_own_process(_in_process, run, self.settings, work, log, preload=_LIBRARIES)
         except BrokenProcessPool as error:
-            raise UserError(f"killed, most likely for want of memory (see {log})") from error
+            raise UserError(f"killed, most likely for lack of memory (see {log})") from error
         except (RuntimeError, MemoryError) as error:
             raise UserError(f"{error} (see {log})") from error
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
     def _path(self, run: Run) -> Path:
-        return self.folder / "results" / run.label / run.row.name / f"seed{run.seed}.json"
+        return self.folder / "results" / f"{run.name}.json"
 
     def _made_with(self, run: Run) -> dict[str, Any]:
         made_with = {"scene": str(run.scene), "changes": dict(run.row.changes), **asdict(self.settings)}
+        made_with["clip_weights"] = self._clip_weights
         if run.row.name != CLIPSEG:
             del made_with["clipseg"]
         return json.loads(json.dumps(made_with))
 
 
 def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
-    """A short unique name per scene: what its folder is called, the folder above where two agree.
+    """A short unique name per scene: its folder's name, or the parent's if two agree.
 
     Raises UserError for a scene that is missing, has no ground truth, or is given twice.
     """
@@ -131,7 +142,7 @@ def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
         names = [scene.name, f"{scene.parent.name}-{scene.name}"]
         label = next((name for name in names if name not in labels), None)
         if scene in labels.values() or label is None:
-            raise UserError(f"{scene} is given twice, or can't be told from another: rename its folder")
+            raise UserError(f"{scene} is given twice, or has the same name as another: rename its folder")
         labels[label] = scene
     return labels
 
@@ -142,7 +153,7 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
 
     from lang3dxl_ns.methods import run_config
 
-    config = run_config(run.scene, work / "runs", run.label, settings.steps, settings.clip, settings.dense)
+    config = run_config(run.scene, work / "runs", run.label, run.steps, settings.clip, settings.dense)
     config.timestamp = f"{run.row.name}-{run.seed}"
     data = config.pipeline.datamanager
     data.foreground, data.camera_res_scale_factor = settings.foreground, settings.scale
@@ -151,7 +162,7 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
         config = tyro.cli(type(config), args=shlex.split(settings.flags), default=config)
         data = config.pipeline.datamanager
     if run.row.own_targets:
-        # Else rows would overwrite each other's targets. Made anew in every run, and timed.
+        # A cache per run: rows would overwrite each other's targets. Made anew in every run, and timed.
         data.cache_dir = work / "targets"
     config.machine.seed = run.seed
     data.train_cameras_sampling_seed = run.seed
@@ -184,9 +195,9 @@ def _in_process(run: Run, settings: RunSettings, work: Path, log: Path) -> dict[
 
 
 def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
-    from lang3dxl_ns import timing
+    from lang3dxl_ns.common import timing
     from lang3dxl_ns.evaluation.aggregate import average
-    from lang3dxl_ns.trainer import Lang3DXLTrainer
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     config = run_configuration(run, settings, work)
     torch.manual_seed(run.seed)
@@ -199,13 +210,13 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     _reset_peak()
     start = _now()
     trainer.train()
-    if trainer.interrupted:  # it ends in good order, but what it has learned is no result
+    if trainer.interrupted:  # an interrupted run exits normally, but has no result
         raise KeyboardInterrupt
     seconds = _now() - start
     peak = _peak()
-    figures = average([photo.metrics for photo in trainer.pipeline.evaluate()])
+    figures = average([photo.metrics for photo in trainer.pipeline.evaluate("held-out")])
     figures = {name: value for name, value in figures.items() if name not in _UNWANTED}
-    figures |= _seen_in_training(trainer.pipeline)
+    figures |= _beside(trainer.pipeline)
     return figures | {
         "setup_seconds": set_up - learned,
         "train_seconds": learned + seconds,
@@ -215,22 +226,22 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     }
 
 
-def _seen_in_training(pipeline: Lang3DXLPipeline) -> dict[str, float]:
-    """mAP and localisation in the photos that training saw, as the paper's main table has them; they are many
-    more than those held out. `teacher_` stays in front, where a row of the teacher looks for its figures."""
-    from lang3dxl_ns.evaluation.aggregate import average
+def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
+    """Figures of the scene's test views, `test_…`, and of the labelled training photos, `seen_…`, if there
+    are any; both are far more numerous than the held-out photos."""
+    from lang3dxl_ns.evaluation.aggregate import PREFIXES, average
 
     scorer, photos = pipeline.scorer, pipeline.datamanager.train_dataset.photos
-    if scorer is None or all(scorer.truth.key(photo.name) is None for photo in photos):
-        return {}
-    pipeline.config.evaluated_photos = "seen"
-    figures = average([photo.metrics for photo in pipeline.evaluate()])
-    return {
-        f"{teacher}seen_{name}": figures[teacher + name]
-        for teacher in ("", "teacher_")
-        for name in _SEEN
-        if teacher + name in figures
-    }
+    splits: list[Literal["test", "seen"]] = [] if pipeline.datamanager.test_views is None else ["test"]
+    if scorer is not None and any(scorer.truth.key(photo.name) is not None for photo in photos):
+        splits.append("seen")
+    found = {}
+    for split in splits:
+        for name, value in average([photo.metrics for photo in pipeline.evaluate(split)]).items():
+            plain = next((name.removeprefix(p) for p in PREFIXES if p and name.startswith(p)), name)
+            if plain in _BESIDE or plain.startswith("ap_"):
+                found[f"{split}_{name}"] = value
+    return found
 
 
 def _reset_peak() -> None:
@@ -240,15 +251,15 @@ def _reset_peak() -> None:
 
 
 def _peak() -> float:
-    """Of the GPU where there is one, else of the process, the libraries included."""
+    """Of the GPU if there is one, otherwise of the process, libraries included."""
     return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else host_peak()
 
 
 @torch.no_grad()
 def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
-    """Median milliseconds to render a held-out view, and to answer all prompts in it by decoding."""
-    scorer, encoder = pipeline.scorer, pipeline.model.semantic_field
-    if scorer is None or encoder is None:
+    """Median milliseconds to render a held-out view, and a view that answers all prompts."""
+    scorer = pipeline.scorer
+    if scorer is None:
         return {}
     pipeline.eval()
     times: dict[str, list[float]] = {"render_ms": [], "answer_ms": []}
@@ -256,16 +267,15 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
-        codes = pipeline.model.rendered_codes
-        scorer.field_maps(encoder.decode_clip, codes, (codes.shape[0], codes.shape[1]))
+        pipeline.relevancy(camera, scorer.queries.to(pipeline.device))
         times["render_ms"].append(1000 * (rendered - start))
         times["answer_ms"].append(1000 * (_now() - rendered))
     return {name: median(values) for name, values in times.items()}
 
 
 def _now() -> float:
-    """Seconds: of the clock with a GPU, of the processor (all threads) without one, where other programs, or
-    other runs at a time, would be counted in by the clock."""
+    """Seconds: wall-clock with a GPU, otherwise processor time (all threads), which excludes other programs
+    and concurrent runs."""
     if not torch.cuda.is_available():
         return time.process_time()
     torch.cuda.synchronize()
@@ -294,7 +304,7 @@ def _score_clipseg(run: Run, settings: RunSettings, work: Path) -> dict[str, flo
 def score_photo(
     maps: dict[str, Any], scorer: MapScorer, name: str, size: tuple[int, int]
 ) -> dict[str, float]:
-    """Figures of maps of a whole photo by category."""
+    """Figures of maps of a whole photo, by category."""
     from lang3dxl_ns.evaluation.scores import resize_map
 
     small = scorer.truth.scoring_size(*size)

@@ -1,4 +1,4 @@
-"""What semantics cost: the same scene trained with and without them, evaluated on held-out photos."""
+"""`lang3dxl benchmark training`: cost and quality of semantics, by training with and without them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from lang3dxl_ns.evaluation.report import command_line, describe_machine, markdown_table, write_report
+from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
 
 PARTS = ("data", "render", "appearance", "decode", "downsample", "losses", "backward", "optimiser")
-"""Of a step; the appearance is a part of the rendering."""
+"""Parts of a step; appearance is within the rendering."""
 
 
 @dataclass
@@ -31,11 +31,11 @@ class TrainingBenchmark:
     iterations: int = 1_000
     """Iterations of each run."""
     scale: float = 0.25
-    """Size of the training photos against those on disk."""
+    """Size of the training photos relative to those on disk."""
 
     def main(self) -> None:
-        """Each run has a process of its own, so that its peak memory is its own. They follow one another on
-        a machine that may be busy: quote the split of a step and ratios rather than absolute seconds."""
+        """Runs each variant in its own process, so that its peak memory can be measured. They run one after
+        the other, so on a busy machine quote the split of a step and ratios, not absolute seconds."""
         results = {}
         for name, settings in (("joint", self), ("rgb only", replace(self, clip="none", dense="none"))):
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
@@ -49,9 +49,9 @@ def _train_and_evaluate(settings: TrainingBenchmark) -> dict[str, Any]:
 
     import torch
 
-    from lang3dxl_ns import timing
+    from lang3dxl_ns.common import timing
     from lang3dxl_ns.methods import run_config
-    from lang3dxl_ns.trainer import Lang3DXLTrainer
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     name = "joint" if settings.clip != "none" else "rgb"
     runs = settings.out / "runs"
@@ -69,7 +69,7 @@ def _train_and_evaluate(settings: TrainingBenchmark) -> dict[str, Any]:
     total = time.perf_counter() - start
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     step = median(seconds["step"])
-    # "losses" is visited twice in a step with semantics.
+    # "losses" is entered twice in a step with semantics.
     split = {name: sum(seconds[name]) / len(seconds["step"]) for name in PARTS if name in seconds}
     cuda = torch.cuda.is_available()
     return {
@@ -86,8 +86,8 @@ def _train_and_evaluate(settings: TrainingBenchmark) -> dict[str, Any]:
 
 
 def _time_parts(trainer: Any) -> None:
-    """Wrap the trainer's own methods, which cannot name their parts themselves."""
-    from lang3dxl_ns.timing import part
+    """Wrap the trainer's own methods to time them."""
+    from lang3dxl_ns.common.timing import part
 
     def timed(name, function):
         def run(*args, **kwargs):
@@ -114,7 +114,7 @@ def _time_parts(trainer: Any) -> None:
 
 
 def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:
-    """The report of the two runs."""
+    """The report of both runs, in markdown."""
     joint, rgb = results["joint"], results["rgb only"]
     names = [name for name in joint["metrics"] if name not in ("num_rays_per_sec", "fps")]
     quality = markdown_table(
@@ -148,7 +148,7 @@ def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:
 
 ## Cost of a step
 
-Mean milliseconds by part, the appearance being within `render`; the median step beside them.
+Mean milliseconds by part, with appearance inside `render`; and the median step.
 
 {cost}
 """

@@ -1,1 +1,1 @@
-"""What people type after `lang3dxl`."""
+"""Subcommands of `lang3dxl`."""

@@ -1,4 +1,4 @@
-"""`lang3dxl demo`: the whole way on a scene with known answers, from photos to average precision."""
+"""`lang3dxl demo`: the full workflow on a generated scene, from photos to average precision."""
 
 from __future__ import annotations
 
@@ -15,65 +15,67 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from rich import get_console
 
-from lang3dxl_ns.demo.labels import CATEGORIES
-from lang3dxl_ns.demo.scene_writer import DemoScene, write_scene
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.report import (
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
     host_peak,
     markdown_table,
     write_report,
 )
-from lang3dxl_ns.files import write_atomically
+from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
+from lang3dxl_ns.demo.landmark.labels import CATEGORIES
 
 if TYPE_CHECKING:
     from lang3dxl_ns.demo.picture import PictureRow
-    from lang3dxl_ns.pipeline import EvaluatedPhoto
-    from lang3dxl_ns.trainer import Lang3DXLTrainer, Lang3DXLTrainerConfig
+    from lang3dxl_ns.plugin.pipeline import EvaluatedPhoto
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer, Lang3DXLTrainerConfig
 
 RUN = Path("run", "lang3dxl", "demo")
-"""The run's folder inside the demo's."""
+"""The run's folder inside the demo's folder."""
 _STAGES = "stages.json"
 
 
 @dataclass
 class Demo:
-    """See the whole way in minutes, with nothing of your own: make a landmark that the built-in CLIP has
+    """See the full workflow in minutes, without any data: generate a landmark that the built-in CLIP has
     never seen, photograph it, prepare targets, train, and measure how well words find their pixels in
-    photos that were held out.
+    novel views and held-out photos.
 
-    Ctrl-C stops at any point and leaves what is there; the same command goes on with it.
+    Ctrl-C stops at any point and keeps what is there; the same command continues.
     """
 
     out: Path = Path("lang3dxl-demo")
     """Folder for the scene, the run and the report."""
     seed: int = 2
-    """Landmark; those below 1,000 are unknown to the built-in CLIP."""
+    """Landmark seed; those below 1,000 are unknown to the built-in CLIP."""
     family: Literal["cathedral", "mosque", "hall", "auto"] = "auto"
-    """Kind of building; auto: the seed chooses."""
+    """Kind of building; auto: chosen by the seed."""
     photos: int | None = None
-    """How many photos; 48, or 24 with --quick."""
+    """Number of photos; 48, or 24 with --quick."""
     steps: int | None = None
     """Training iterations; 1,200, or 250 with --quick."""
     wild: bool = True
-    """Photos as from the Internet: other sizes, lenses, weather, exposures and passers-by in each.
-    --no-wild: one camera, one sun, nobody there."""
+    """Photos like those from the Internet: sizes, lenses, weather, exposures and passers-by vary.
+    --no-wild: one camera, one sun, no people."""
+    test_views: int = 24
+    """Novel views with exact labels to score, besides the held-out photos; 0: none."""
     quick: bool = False
-    """Two minutes instead of ten: fewer photos and iterations. The words are found less well."""
+    """Two minutes instead of ten: fewer photos and iterations, less accurate words."""
     clip: str = "builtin"
     """CLIP: "builtin", a Hugging Face name, a folder, or "none" for colours only."""
     dense: str = "builtin"
     """Dense encoder: the same choices."""
     ns_train: str = ""
-    """More flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.dense-weight 0.5"."""
+    """Extra flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.dense-weight 0.5"."""
 
     def main(self) -> None:
         out = self.out.expanduser().absolute()
         try:
             self._run(out)
         except KeyboardInterrupt:
-            sys.exit(f"\nStopped. What is done is kept in {out}; the same command goes on with it.")
+            sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
         stages = Stages(out / _STAGES)
@@ -89,8 +91,11 @@ class Demo:
             if trainer.interrupted:
                 raise KeyboardInterrupt
         with stages.stage("evaluate"):
-            photos = list(trainer.pipeline.evaluate())
-            report = self._report(photos, trainer)
+            photos = list(trainer.pipeline.evaluate("held-out"))
+            splits = {"Held-out photos": photos}
+            if self.test_views:
+                splits = {"Test views": list(trainer.pipeline.evaluate("test")), **splits}
+            report = self._report(splits, trainer)
         report |= stages.figures()
         folder = config.get_base_dir()
         write_report(folder, "report", self.markdown(report), report)
@@ -105,36 +110,36 @@ class Demo:
         say(f"Walk through it: lang3dxl view --load-config {config_path}", soft_wrap=True)
 
     def _scene(self, out: Path) -> Path:
-        """The scene in `out`, made unless it is there. Raises UserError when another one is."""
+        """The scene in `out`, generated unless it is there. Raises UserError if another one is there."""
+        from lang3dxl_ns.demo.landmark.scene_writer import write_scene
+
         photos = self.photos or (24 if self.quick else 48)
         folder = out / "scene"
         wanted: dict[str, Any] = {"seed": self.seed, "photos": photos, "wild": self.wild}
+        wanted["test_views"] = self.test_views
         if self.family != "auto":
             wanted["family"] = self.family
         if not (folder / "scene.json").exists():
-            return write_scene(
-                DemoScene(out=folder, seed=self.seed, family=self.family, photos=photos, wild=self.wild)
-            )
+            return write_scene(DemoScene(out=folder, **{"family": self.family, **wanted}))
         found = json.loads((folder / "scene.json").read_text())
         for name, value in wanted.items():
-            if found[name] != value:
+            if found.get(name, 0) != value:
                 raise UserError(
-                    f"{folder} is a scene with {name} {found[name]}, and {value} was asked for: give --out "
-                    f"another folder, or remove this one"
+                    f"{folder} is a scene with {name} {found.get(name, 0)}, and {value} was asked for: give "
+                    f"--out another folder, or remove this one"
                 )
         return folder
 
     def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
-        """The run's configuration, which goes on with the checkpoint that an earlier command left."""
+        """The run's configuration; resumes from the checkpoint of an earlier command, if any."""
         import tyro
-        from nerfstudio.utils.rich_utils import CONSOLE
 
         from lang3dxl_ns.methods import run_config
 
         steps = self.steps or (250 if self.quick else 1_200)
         config = run_config(scene, out, str(RUN.parts[0]), steps, self.clip, self.dense)
         config.timestamp = RUN.name
-        config.pipeline.datamanager.foreground = "none"  # every pixel counts, sky and people too
+        config.pipeline.datamanager.foreground = "none"  # score every pixel, sky and people too
         config.pipeline.datamanager.camera_res_scale_factor = 0.5  # words are scored at half the size
         config.pipeline.datamanager.dense_tokens = 32 if self.quick else 48
         config.logging.steps_per_log = 50
@@ -145,52 +150,34 @@ class Demo:
             config.load_dir = checkpoints
         config.set_timestamp()
         config.save_config()
-        CONSOLE.log(f"Training {steps} iterations; the run is in {config.get_base_dir()}")
+        get_console().log(f"Training {steps} iterations; the run is in {config.get_base_dir()}")
         return config
 
-    def _report(self, photos: list[EvaluatedPhoto], trainer: Lang3DXLTrainer) -> dict[str, Any]:
+    def _report(self, splits: dict[str, list[EvaluatedPhoto]], trainer: Lang3DXLTrainer) -> dict[str, Any]:
         from lang3dxl_ns.evaluation.aggregate import average
 
-        means = average([photo.metrics for photo in photos], with_deviation=True)
         report: dict[str, Any] = {
             "command": command_line("lang3dxl demo", self),
             "machine": describe_machine(trainer.device),
-            "held_out": len(photos),
             "gaussians": trainer.pipeline.model.num_points,
-            "field": {name: means[name] for name in ("psnr", "cc_psnr", "ssim")},
+            "splits": {},
         }
-        for name, prefix in (("field", ""), ("teacher", "teacher_")):
-            precision = {c: means[f"{prefix}ap_{c}"] for c in CATEGORIES if f"{prefix}ap_{c}" in means}
-            if precision:
-                report.setdefault(name, {}).update({"mAP": means[f"{prefix}map"], "AP": precision})
-        if "raw_map" in means:
-            report["field"]["mAP_without_blur"] = means["raw_map"]
-        report["photos"] = {c: means[f"ap_{c}_photos"] for c in CATEGORIES if f"ap_{c}" in means}
-        features = {n: v for n, v in means.items() if n.startswith(("clip_", "dense_")) and "_std" not in n}
-        return report | ({"features": features} if features else {})
+        for split, photos in splits.items():
+            means = average([photo.metrics for photo in photos])
+            found: dict[str, Any] = {"photos": len(photos)}
+            found["colors"] = {name: means[name] for name in COLORS if name in means}
+            for who, prefix in WHO.items():
+                precision = {c: means[f"{prefix}ap_{c}"] for c in CATEGORIES if f"{prefix}ap_{c}" in means}
+                if precision:
+                    found[who] = {"mAP": means[f"{prefix}map"], "AP": precision}
+            found["shown"] = {c: means[f"ap_{c}_photos"] for c in CATEGORIES if f"ap_{c}" in means}
+            features = {n: v for n, v in means.items() if n.startswith(("clip_", "dense_"))}
+            report["splits"][split] = found | ({"features": features} if features else {})
+        return report
 
     def markdown(self, report: dict[str, Any]) -> str:
-        """The report for people."""
-        words = "Colours only: no words were learned.\n"
-        if "AP" in report["field"]:
-            rows = [
-                [category, report["photos"][category], *(f"{report[who]['AP'][category]:.3f}" for who in WHO)]
-                for category in report["field"]["AP"]
-            ]
-            rows.append(["**mean (mAP)**", "", *(f"**{report[who]['mAP']:.3f}**" for who in WHO)])
-            words = markdown_table(["prompt", "photos", "3-D field", "2-D teacher"], rows)
-        unblurred = report["field"].get("mAP_without_blur")
-        unblurred = "" if unblurred is None else f"; without, the field's mAP is {unblurred:.3f}"
-        features = report.get("features", {})
-        quality = [
-            ["PSNR (dB)", f"{report['field']['psnr']:.2f}", ""],
-            ["PSNR with matched colours (dB)", f"{report['field']['cc_psnr']:.2f}", ""],
-        ]
-        quality += [
-            [label, f"{features[name]:.4g}", f"{features[f'{name}_of_mean']:.4g}"]
-            for name, label in FEATURES.items()
-            if name in features
-        ]
+        """The report in markdown."""
+        splits = "".join(f"## {name}\n\n{_split(found)}\n\n" for name, found in report["splits"].items())
         cost = [
             [stage, f"{seconds:.0f}", f"{report['peak_mb'][stage]:.0f}"]
             for stage, seconds in report["seconds"].items()
@@ -200,26 +187,22 @@ class Demo:
 
     {report["command"]}
 
-{report["machine"]}. {report["gaussians"]} Gaussians, {report["held_out"]} photos held out of training.
+{report["machine"]}. {report["gaussians"]} Gaussians.
 
-## Average precision of words, held-out photos
+Average precision of words, by prompt. The teacher is the crop pyramid's relevancy in the very picture that is
+scored, which the field has never seen; the limit is the exact labels, lifted to the Gaussians and
+rendered back; chance is a map without information. Maps of field and teacher are blurred by 2.5 pixels at
+half the photo's size, as published, and not masked. Test views are novel cameras in plain light, no people.
 
-{words}
-
-The teacher is the crop pyramid's own relevancy in the very photo that is scored; the field has never seen it.
-Maps of both are blurred by 2.5 pixels at half the photo's size, as published{unblurred}. No mask cuts them.
-
-## Held-out photos
-
-{markdown_table(["", "rendered", "mean feature instead"], quality)}
-
-## Cost
+{splits}## Cost
 
 {markdown_table(["stage", "seconds", "peak memory (MB)"], cost)}
 """
 
 
-WHO = ("field", "teacher")
+WHO = {"field": "", "teacher": "teacher_", "limit": "limit_", "chance": "chance_"}
+"""Sources of the reported average precision, and the prefix of their figures."""
+COLORS = {"psnr": "PSNR (dB)", "cc_psnr": "PSNR with matched colours (dB)", "ssim": "SSIM"}
 FEATURES = {
     "clip_l1": "CLIP feature, L1",
     "clip_psnr": "CLIP feature, PSNR (dB)",
@@ -229,8 +212,31 @@ FEATURES = {
 }
 
 
+def _split(found: dict[str, Any]) -> str:
+    """The tables of a split."""
+    words = "Colours only: no semantics were trained."
+    who = [name for name in WHO if name in found]
+    if who:
+        rows = [
+            [prompt, count, *(f"{found[name]['AP'][prompt]:.3f}" for name in who)]
+            for prompt, count in found["shown"].items()
+        ]
+        rows.append(["**mean (mAP)**", "", *(f"**{found[name]['mAP']:.3f}**" for name in who)])
+        words = markdown_table(
+            ["prompt", f"of {found['photos']}", "3-D field", "2-D teacher", *who[2:]], rows
+        )
+    features = found.get("features", {})
+    quality = [[COLORS[name], f"{value:.4g}", ""] for name, value in found["colors"].items()]
+    quality += [
+        [label, f"{features[name]:.4g}", f"{features[f'{name}_of_mean']:.4g}"]
+        for name, label in FEATURES.items()
+        if name in features
+    ]
+    return f"{words}\n\n{markdown_table(['', 'rendered', 'mean feature instead'], quality)}"
+
+
 class Stages:
-    """Seconds and peak memory of the demo's stages, summed over the commands that it took."""
+    """Seconds and peak memory of the demo's stages, summed over interrupted commands."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -1,7 +1,8 @@
-"""What stands between this machine and a run: versions, devices, gsplat's build, disk, memory, weights."""
+"""`lang3dxl doctor`: checks versions, devices, gsplat's build, disk, memory, weights."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
 import subprocess
@@ -13,13 +14,13 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
-from lang3dxl_ns.memory import machine_memory
-from lang3dxl_ns.preparation.prepare import PreparationConfig
+from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 
 PACKAGES = ("nerfstudio", "torch", "gsplat", "transformers", "pycolmap", "numpy", "viser", "pillow")
 LEAST_MEMORY = 4e9
 LEAST_DISK = 10e9
-"""Bytes: encoders of a gigabyte or two, targets of eight megabytes per photo, and a run."""
+"""Bytes: encoders of one or two gigabytes, targets of eight megabytes per photo, and a run."""
 
 _PROBE = """
 import torch
@@ -34,27 +35,27 @@ assert float(alpha.max()) > 0.5, "a Gaussian in front of the camera was not draw
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     what: str
     verdict: Literal["ok", "note", "problem"]
     found: str
     remedy: str = ""
-    """What to do, where it isn't fine."""
+    """What to do if it isn't fine."""
 
 
 @dataclass(kw_only=True)
 class Doctor:
-    """Look at this machine: versions, devices, gsplat's build, disk, memory and weights, and say what to do.
+    """Check this machine: versions, devices, gsplat's build, disk, memory and weights, and say what to do.
 
-    Nothing is downloaded or changed, except that gsplat keeps the kernels that it builds. Ends with status 1
-    where something stands in the way.
+    Nothing is downloaded or changed, except that gsplat caches the kernels it builds. Exits with status 1
+    if something prevents a run.
     """
 
     data: Path | None = None
-    """Folder of photos: looks at its disk too."""
+    """Folder of photos, to check its disk too."""
     build_seconds: float = 60.0
-    """Time that gsplat gets to build or load its CUDA kernels. The first build takes many minutes."""
+    """Time limit for gsplat to build or load its CUDA kernels. The first build takes many minutes."""
 
     def main(self) -> None:
         problems = 0
@@ -64,11 +65,11 @@ class Doctor:
             if finding.remedy:
                 print(f"{'':10}{finding.remedy}")
         if problems:
-            sys.exit(f"{problems} thing(s) stand in the way")
+            sys.exit(f"{problems} problem(s) found")
 
 
 def findings(data: Path | None = None, build_seconds: float = 60.0) -> Iterator[Finding]:
-    """Everything, as it is found out."""
+    """Runs all checks, yielding each result."""
     yield from versions()
     yield from devices(build_seconds)
     yield memory()
@@ -78,7 +79,7 @@ def findings(data: Path | None = None, build_seconds: float = 60.0) -> Iterator[
 
 
 def versions() -> Iterator[Finding]:
-    """Python and the packages that matter, against what this package asks for."""
+    """Python and the main packages, against this package's requirements."""
     python = sys.version.split()[0]
     if (3, 10) <= sys.version_info[:2] < (3, 13):
         yield Finding("Python", "ok", python)
@@ -97,12 +98,12 @@ def versions() -> Iterator[Finding]:
 
 
 def _requirements() -> dict[str, str]:
-    """Package → version specifier, from our own metadata."""
+    """Package → version specifier, from this package's metadata."""
     from packaging.requirements import Requirement
 
     try:
         parsed = [Requirement(line) for line in requires("lang3dxl-ns") or []]
-    except PackageNotFoundError:  # a checkout that is not installed
+    except PackageNotFoundError:  # a checkout without installation
         return {}
     return {r.name.lower(): str(r.specifier) for r in parsed if r.marker is None}
 
@@ -112,26 +113,29 @@ def _against(name: str, found: str, wanted: str) -> Finding:
 
     if SpecifierSet(wanted).contains(found.partition("+")[0], prereleases=True):
         return Finding(name, "ok", found)
-    return Finding(name, "problem", f"{found}, wanted is {wanted}", f"pip install '{name}{wanted}'")
+    return Finding(name, "problem", f"{found}, needs {wanted}", f"pip install '{name}{wanted}'")
 
 
 def devices(build_seconds: float) -> Iterator[Finding]:
-    """GPUs and gsplat's kernels; without a GPU the CPU's own rasteriser takes over."""
+    """GPUs and gsplat's kernels; without a GPU, the CPU rasterizer is used."""
+    cores = f"CPU, {os.cpu_count()} cores"
+    slower = (
+        "training and queries run on the CPU, slower: read photos small "
+        "(--pipeline.datamanager.camera-res-scale-factor 0.25)"
+    )
+    if not _has_driver():  # then skip importing torch, which takes seconds
+        yield Finding("device", "note", cores, slower)
+        return
     import torch
 
     if not torch.cuda.is_available():
-        # A driver that is there while torch sees nothing is a mistake; no GPU at all is not.
-        verdict: Literal["note", "problem"] = "problem" if shutil.which("nvidia-smi") else "note"
+        # A driver without a GPU visible to torch is a problem; no GPU at all is not.
+        mistaken = shutil.which("nvidia-smi") is not None
         remedy = (
             "nvidia-smi is there, but torch sees no GPU: install the torch build that fits the driver "
             "(https://pytorch.org/get-started/locally)"
-            if verdict == "problem"
-            else "training and queries run on the CPU, slower: read photos small "
-            "(--pipeline.datamanager.camera-res-scale-factor 0.25)"
         )
-        yield Finding(
-            "device", verdict, f"CPU, {os.cpu_count()} cores, {torch.get_num_threads()} used", remedy
-        )
+        yield Finding("device", "problem" if mistaken else "note", cores, remedy if mistaken else slower)
         return
     for i in range(torch.cuda.device_count()):
         gpu = torch.cuda.get_device_properties(i)
@@ -139,8 +143,19 @@ def devices(build_seconds: float) -> Iterator[Finding]:
     yield gsplat_build(_PROBE, build_seconds)
 
 
+def _has_driver() -> bool:
+    """Whether NVIDIA's driver is installed, judged by its program or library."""
+    if shutil.which("nvidia-smi"):
+        return True
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
 def gsplat_build(probe: str, seconds: float) -> Finding:
-    """Draws a Gaussian with gsplat in a process of its own, which may take only so long."""
+    """Renders a Gaussian with gsplat in a separate process with a time limit."""
     start = time.monotonic()
     what = "gsplat's CUDA kernels"
     try:
@@ -148,22 +163,22 @@ def gsplat_build(probe: str, seconds: float) -> Finding:
     except subprocess.TimeoutExpired:
         remedy = (
             "the first build takes many minutes: give it time (lang3dxl doctor --build-seconds 1800), or "
-            "install a wheel that is built already (https://docs.gsplat.studio/whl)"
+            "install a prebuilt wheel (https://docs.gsplat.studio/whl)"
         )
         return Finding(what, "note", f"not built within {seconds:.0f} s", remedy)
     if done.returncode == 0:
-        return Finding(what, "ok", f"draw, after {time.monotonic() - start:.0f} s")
+        return Finding(what, "ok", f"work, after {time.monotonic() - start:.0f} s")
     last = (done.stderr.strip().splitlines() or ["no message"])[-1]
     compiler = shutil.which("nvcc") or os.environ.get("CUDA_HOME")
     remedy = (
-        "install a wheel that is built already (https://docs.gsplat.studio/whl), or the CUDA toolkit of "
+        "install a prebuilt wheel (https://docs.gsplat.studio/whl), or the CUDA toolkit of "
         f"torch's version for nvcc{'' if compiler else ', which is missing'}"
     )
     return Finding(what, "problem", last, remedy)
 
 
 def memory() -> Finding:
-    """Main memory, and what of it a run will take for photos."""
+    """Main memory, and how much of it a run uses for photos."""
     total = machine_memory()
     found = f"{total / 1e9:.1f} GB, of which photos and targets may take {total / 4e9:.1f}"
     if total >= LEAST_MEMORY:
@@ -174,7 +189,7 @@ def memory() -> Finding:
 
 
 def disks(data: Path | None) -> Iterator[Finding]:
-    """Free space where things get written."""
+    """Free space in the folders that get written to."""
     places = {"here (runs)": Path.cwd(), "model cache": model_cache()}
     if data is not None:
         places["data (prepared targets)"] = data
@@ -192,25 +207,26 @@ def disks(data: Path | None) -> Iterator[Finding]:
 
 
 def model_cache() -> Path:
-    """Where Hugging Face keeps models."""
+    """Hugging Face's model cache."""
     from huggingface_hub.constants import HF_HUB_CACHE
 
     return Path(HF_HUB_CACHE)
 
 
 def weights() -> Iterator[Finding]:
-    """The default models: cached, or where they would come from."""
+    """The default models: whether they are cached, and where they would come from."""
     from huggingface_hub import constants, try_to_load_from_cache
 
     defaults = PreparationConfig()
     options = {
         "clip": "",
-        "dense": "",
+        "dense": "only for semantics that are trained with the scene",
         "foreground_model": "only for --foreground text",
         "sam": "only for regions sam",
     }
     for option, when in options.items():
         name = getattr(defaults, option)
+        name = DENSE_MODEL if name == "auto" else name
         found = try_to_load_from_cache(name, "config.json")
         what = f"weights {name}" + (f" ({when})" if when else "")
         if isinstance(found, str):
@@ -222,13 +238,13 @@ def weights() -> Iterator[Finding]:
             what,
             "note",
             f"not cached; would be downloaded from {constants.ENDPOINT}{offline}",
-            f"where there is no Internet: hf download {name} --local-dir DIR elsewhere, copy it, and pass "
+            f"without Internet: run hf download {name} --local-dir DIR elsewhere, copy it, and pass "
             f"--pipeline.datamanager.{flag} DIR",
         )
 
 
 def programs() -> Iterator[Finding]:
-    """Programs that other commands call."""
+    """External programs that commands use."""
     for name, use in {"ffmpeg": "ns-render writes videos", "colmap": "new scenes are reconstructed"}.items():
         path = shutil.which(name)
         if path:

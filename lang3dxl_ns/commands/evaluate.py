@@ -1,4 +1,4 @@
-"""`lang3dxl evaluate`: scores of runs, of anyone's maps, and of several scenes together."""
+"""`lang3dxl evaluate`: scores of runs, of other systems' maps, and of several scenes together."""
 
 from __future__ import annotations
 
@@ -11,30 +11,31 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_names, write_atomically
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.evaluation.aggregate import PREFIXES, TOTALS, average, mean_average_precision, pool
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
-from lang3dxl_ns.evaluation.predictions import score_predictions
-from lang3dxl_ns.evaluation.report import describe_machine, markdown_table, write_report
-from lang3dxl_ns.files import read_names, write_atomically
 
 REPORT = "scores"
-"""Name of the report's files, without suffix."""
+"""Report file name, without suffix."""
 WHOSE = {
     "": "blurred",
-    "raw_": "as they are",
+    "raw_": "unprocessed",
     "authors_": "as published",
     "teacher_": "2-D teacher",
+    "limit_": "limit",
+    "chance_": "chance",
 }
-"""Heads of the report's columns."""
+"""Column headers of the report."""
 
 
 @dataclass(kw_only=True)
 class EvaluateMaps:
-    """Score relevancy maps that any system made.
+    """Score relevancy maps made by any system.
 
-    They lie in a folder per prompt, `<prompt>/<photo>.npy` (float) or a picture, as `lang3dxl query` writes
-    them too. Writes scores.md and scores.json.
+    Maps are in a folder per prompt, `<prompt>/<photo>.npy` (float) or a picture, as `lang3dxl query` also
+    writes them. Writes scores.md and scores.json.
     """
 
     maps: Path
@@ -42,20 +43,22 @@ class EvaluateMaps:
     ground_truth: Path
     """Folder of the scene's ground truth, in any layout of docs/evaluation.md."""
     layout: Layout | Literal["auto"] = "auto"
-    """Which layout; "auto" looks."""
+    """Layout of the ground truth; "auto" detects it."""
     photos: Path | None = None
-    """Text file with the names of the photos to score, one per line (default: all that have a label)."""
+    """Text file with the names of the photos to score, one per line (default: all labelled photos)."""
     masks: Path | None = None
-    """Folder of foreground masks, white = keep: predictions count as 0 elsewhere."""
+    """Folder of foreground masks, white = keep: predictions become 0 elsewhere."""
     temperature: float = 1.0
-    """Steepness of the relevancy that the maps hold: 10 for those of `lang3dxl query`, as in LERF's code. The
-    published processing is of temperature 1, to which they are brought back for it."""
+    """Softmax temperature that the maps were made with: 10 for `lang3dxl query`, as in LERF's code. The
+    published processing uses temperature 1, to which maps are converted for it."""
     scene: str | None = None
-    """Name in the report (default: the ground truth's folder)."""
+    """Name in the report (default: that of the ground truth's folder)."""
     out: Path
     """Folder for the report."""
 
     def main(self) -> None:
+        from lang3dxl_ns.evaluation.predictions import score_predictions
+
         if not self.temperature > 0:
             raise UserError(f"--temperature is {self.temperature}: give a number above 0")
         truth = GroundTruth(self.ground_truth, self.layout)
@@ -68,34 +71,28 @@ class EvaluateMaps:
 
 @dataclass(kw_only=True)
 class EvaluateRun:
-    """Score a trained run, as `ns-eval` does, on photos and with ground truth of your choice.
+    """Score a trained run like `ns-eval`, but on photos and with ground truth of your choice.
 
     Writes scores.md and scores.json.
     """
 
     load_config: Path
     """config.yml of the run."""
-    split: Literal["held-out", "seen"] = "held-out"
-    """Photos held out of training, or the training photos that have ground truth."""
+    split: Literal["held-out", "seen", "test"] = "held-out"
+    """Photos held out of training, labelled training photos, or the scene's test views."""
     ground_truth: Path | None = None
-    """Folder of ground truth (default: as the run was configured, else what lies with its data)."""
+    """Folder of ground truth (default: the run's setting, or the one beside its data)."""
     layout: Layout | Literal["auto"] = "auto"
-    """Which layout; "auto" looks."""
+    """Layout of the ground truth; "auto" detects it."""
     scene: str | None = None
     """Name in the report (default: the data folder)."""
     out: Path
     """Folder for the report."""
 
     def main(self) -> None:
-        from nerfstudio.utils.eval_utils import eval_setup
+        from lang3dxl_ns.plugin.open_run import open_run
 
-        from lang3dxl_ns.pipeline import Lang3DXLPipeline
-
-        if not self.load_config.is_file():
-            raise UserError(f"{self.load_config} is not a file: pass the config.yml of a run")
-        _, pipeline, _, _ = eval_setup(self.load_config)
-        if not isinstance(pipeline, Lang3DXLPipeline):
-            raise UserError(f"{self.load_config} is the run of another method: use ns-eval")
+        _, pipeline, _ = open_run(self.load_config)
         pipeline.config.evaluated_photos = self.split
         if self.ground_truth is not None:
             pipeline.config.ground_truth = self.ground_truth
@@ -107,19 +104,19 @@ class EvaluateRun:
 
 @dataclass(kw_only=True)
 class EvaluatePool:
-    """Put scenes together: averages over all photos, and over the means of the scenes.
+    """Combine scenes: averages over all photos, and over the scenes' means.
 
     Writes scores.md and scores.json.
     """
 
     reports: list[Path]
-    """Of each scene the scores.json of `lang3dxl evaluate`, or what `ns-eval --output-path` wrote."""
+    """For each scene the scores.json of `lang3dxl evaluate`, or the file of `ns-eval --output-path`."""
     out: Path
     """Folder for the report."""
 
     def main(self) -> None:
         if not self.reports:
-            raise UserError("there is nothing to put together: name the scenes' reports after --reports")
+            raise UserError("there is nothing to combine: name the scenes' reports after --reports")
         scenes: dict[str, dict[str, Any]] = {}
         for path in self.reports:
             name, results = _read_results(path)
@@ -129,9 +126,9 @@ class EvaluatePool:
         protocols = {name: results["protocol"] for name, results in scenes.items()}
         for key in ("layout", "scored_at"):
             if len({protocol.get(key) for protocol in protocols.values()}) > 1:
-                raise UserError(f"the scenes differ in {key}: {', '.join(scenes)} can't be put together")
+                raise UserError(f"the scenes differ in {key}: {', '.join(scenes)} can't be combined")
         if not any("map" in results for results in scenes.values()):
-            raise UserError(f"no word was scored in {', '.join(scenes)}: there is nothing to put together")
+            raise UserError(f"no prompt was scored in {', '.join(scenes)}: there is nothing to combine")
         pooled = pool({name: list(results["photos"].values()) for name, results in scenes.items()})
         notes = [
             f"- {name}: {p.get('evaluated_photos')} photos, {p.get('seen_in_training', 'unknown')} of them "
@@ -147,13 +144,13 @@ class EvaluatePool:
 class EvaluateSplit:
     """Choose labelled photos to hold out of training, up to five per category, the same at every call.
 
-    The list goes into `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`.
+    Pass the list to `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`.
     """
 
     ground_truth: Path
     """Folder of the scene's ground truth."""
     out: Path
-    """The text file."""
+    """Text file to write."""
     per_category: int = 5
     """Photos for each category; photos that show several count for each."""
 
@@ -177,24 +174,24 @@ Evaluate = (
 
 
 def _read_results(path: Path) -> tuple[str, dict[str, Any]]:
-    """Scene and results of a report, of `ns-eval`'s form too."""
+    """Scene and results of a report, also in the form of `ns-eval`."""
     try:
         content = json.loads(path.read_text())
         results = content["results"]
         for figures in results["photos"].values():
             if not all(math.isfinite(value) for value in figures.values()):
-                raise ValueError("a photo has a figure that is no number")
+                raise ValueError("a photo has a figure that is not a number")
         if not isinstance(results["protocol"], dict):
             raise ValueError("it does not say what was scored")
         return str(content.get("scene") or content["experiment_name"]), results
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
-            f"{path} is no report of `lang3dxl evaluate` or `ns-eval` ({error!r}): make it again"
+            f"{path} is not a report of `lang3dxl evaluate` or `ns-eval` ({error!r}): make it again"
         ) from error
 
 
 def _scene_name(folder: Path) -> str:
-    """Ground truth is in a folder of the scene's name, or in one inside it."""
+    """Name of the scene, from a ground truth folder named after it, or one inside that."""
     return folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
 
 
@@ -207,7 +204,7 @@ def _write(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu
 
 
 def _scene_table(scene: str, results: Mapping[str, Any]) -> str:
-    """The report for people: average precision by category, then totals, then the protocol."""
+    """The report in markdown: average precision by category, then totals, then the protocol."""
     categories = sorted(name.removeprefix("ap_").removesuffix("_photos") for name in results if _counts(name))
     whose = [prefix for prefix in PREFIXES if f"{prefix}map" in results]
     rows = [
@@ -215,7 +212,7 @@ def _scene_table(scene: str, results: Mapping[str, Any]) -> str:
         for c in categories
     ]
     rows.append(["**mAP**", "", *(f"**{results[f'{prefix}map']:.3f}**" for prefix in whose)])
-    heads = WHOSE | ({"": "as they are"} if results["protocol"].get("layout") == "lerf_ovs" else {})
+    heads = WHOSE | ({"": "unprocessed"} if results["protocol"].get("layout") == "lerf_ovs" else {})
     words = markdown_table(["average precision", "photos", *(heads[prefix] for prefix in whose)], rows)
     totals = [[name, f"{results[name]:.3f}"] for name in TOTALS.values() if name in results]
     others = [[name, _mean_std(results, name)] for name in _OTHERS if name in results]

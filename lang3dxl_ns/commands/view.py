@@ -1,34 +1,45 @@
-"""`lang3dxl view`: a trained scene in the viewer, for this machine alone."""
+"""`lang3dxl view`: a trained scene in the viewer, on this machine only."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 
 @dataclass(kw_only=True)
 class View:
-    """Walk through a trained scene and ask it: nerfstudio's viewer, which only this machine can open.
+    """Explore and query a trained scene in a browser on this machine.
 
-    (`ns-viewer` does the same, open to the whole network unless told otherwise.)
+    The browser draws the Gaussians (WebGL) at its own frame rate, whatever this machine can render; a prompt
+    sends colors. No code in config.yml is run. (`ns-viewer` shows server renderings in nerfstudio's
+    viewer; it is open to the whole network by default, and trusts the file.)
     """
 
     load_config: Path
     """config.yml of the run."""
     text: str = ""
-    """What to look for at first."""
+    """Initial prompt."""
     host: str = "127.0.0.1"
-    """Address to serve at; 0.0.0.0 lets the network in."""
+    """Address to serve at; 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
-    """Port to serve at; a free one from 7007 on by default."""
+    """Port to serve at; by default a free one from 7007 on."""
+    share: bool = False
+    """Make the viewer public through viser's share tunnel, to anyone with the token."""
 
     def main(self) -> None:
-        from nerfstudio.scripts.viewer.run_viewer import RunViewer, ViewerConfigWithoutNumRays
-
-        from lang3dxl_ns.pipeline import QUERY_VARIABLE
+        from lang3dxl_ns.plugin.open_run import open_run
+        from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 
         if self.text:
             os.environ[QUERY_VARIABLE] = self.text
-        viewer = ViewerConfigWithoutNumRays(websocket_host=self.host, websocket_port=self.port)
-        RunViewer(self.load_config, viewer).main()
+        config, pipeline, _ = open_run(self.load_config)
+        viewer = replace(
+            config.viewer,
+            websocket_host=self.host,
+            websocket_port=self.port,
+            make_share_url=self.share,
+        )
+        from lang3dxl_ns.plugin.viewer.browser import BrowserViewer
+
+        BrowserViewer(pipeline, viewer, config.get_base_dir()).serve()

@@ -1,8 +1,8 @@
-"""Light that differs between photos: every Gaussian's colour is shifted, steered by a vector per photo.
+"""Appearance field: photo-dependent colour shifts of the Gaussians, steered by a vector per photo.
 
-One photo is taken at noon, the next at dusk. A small network sees where a Gaussian is, its base colour and
-the photo's vector, and says how far its colour in that photo is from the base (SWAG, Dahmani et al. 2024, as
-used in Lang3D-XL). Only colours, and on request opacities, depend on the photo: semantics never do.
+One photo is taken at noon, the next at dusk. A small network takes a Gaussian's position, its base colour and
+the photo's vector, and predicts its colour shift in that photo (SWAG, Dahmani et al. 2024, as used in
+Lang3D-XL). Only colours, and optionally opacities, depend on the photo: semantics never do.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.hash_grid import HashGrid
-from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.rendering.gaussians import Gaussians
 
 HIDDEN = 64
 TEMPERATURE = 0.1
-"""Of the Binary Concrete distribution that opacity shifts are drawn from."""
+"""Temperature of the Binary Concrete distribution from which opacity shifts are sampled."""
 FIRST_DEVIATION = 0.1
-"""Of the initial vectors. The published 1 makes every photo a case of its own: on eleven photos that differ
-in exposure and white balance the error after 300 steps is twice that of 0.1."""
+"""Standard deviation of the initial vectors. The published 1 separates photos too much: on eleven photos that
+differ in exposure and white balance, the error after 300 steps is twice that with 0.1."""
 FIRST_LOGIT = -4.0
-"""Log odds of a Gaussian being taken out of a training step by an untrained opacity shift: about 2 %."""
+"""Log odds that an untrained opacity shift removes a Gaussian from a training step: about 2 %."""
 GRIDS: dict[str, dict[str, int]] = {
-    # Light changes smoothly over a building: a coarse grid learns it in hundreds of steps, at half the time.
+    # Light changes smoothly over a building: a coarse grid learns it in hundreds of steps, in half the time.
     "short": {
         "levels": 4,
         "features_per_level": 4,
@@ -52,31 +52,31 @@ class AppearanceConfig:
     """Settings of the appearance field."""
 
     use: Literal["auto", "on", "off"] = "auto"
-    """`auto`: on, unless the scene's measured needs say that its photos share one light. Off means absent:
-    no parameters, no time."""
+    """`auto`: on, unless the scene's measured needs show that its photos share one light. Off means absent:
+    no parameters, no cost."""
     preset: Literal["auto", "short", "paper"] = "auto"
-    """Hash grid over places: `short` is coarse, for runs on a CPU; `paper` as published; `auto`: by the
-    length of the run."""
+    """Hash grid over positions: `short` is coarse, for runs on a CPU; `paper` as published; `auto`: chosen by
+    the length of the run."""
     vector_dim: int = 24
-    """Numbers that describe a photo."""
+    """Size of a photo's vector."""
     unseen: Literal["nearest", "mean"] = "nearest"
-    """Light of a view that is no training photo: that of the `nearest` training camera, by position (in units
-    of the cameras' spread) and direction, or the `mean` vector."""
+    """Look of a view that is not a training photo: that of the `nearest` training camera, by position (in
+    units of the cameras' spread) and direction, or the `mean` vector."""
     opacity_shift: bool = False
-    """Let photos take Gaussians out, for what stands in one photo only. Costs a second rendering."""
+    """Let photos remove Gaussians, for what appears in one photo only. Costs a second rendering."""
 
 
 class AppearanceField(nn.Module):
-    """Colours of Gaussians as one photo shows them.
+    """Colours of Gaussians under one photo's look.
 
-    Untrained, it changes no colour. Vectors belong to photos by name: a checkpoint's vectors stay with their
-    photos whatever the photos of the present run, and photos that it does not know get fresh ones.
+    Untrained, it changes nothing. Vectors belong to photos by name: a checkpoint's vectors stay with their
+    photos whichever photos the present run has, and new photos get fresh vectors.
 
     Args:
         config: the settings.
         names: of the training photos.
-        centre: middle of the scene, world units.
-        radius: distance from the middle within which most of the scene lies, world units.
+        centre: of the scene, world units.
+        radius: distance from the centre that contains most of the scene, world units.
         generator: source of the initial weights and vectors.
     """
 
@@ -94,7 +94,7 @@ class AppearanceField(nn.Module):
         grid = GRIDS["short" if config.preset == "auto" else config.preset]
         self.grid = HashGrid(3, **grid, generator=generator)
         inputs = self.grid.output_dim + 3 + config.vector_dim
-        # The first layer in two parts: the photo's is the same for all Gaussians, and computed once.
+        # The first layer is split in two: the photo's part is the same for all Gaussians, and computed once.
         self.from_gaussian = _linear(inputs - config.vector_dim, HIDDEN, inputs, generator)
         self.from_photo = _linear(config.vector_dim, HIDDEN, inputs, generator, bias=False)
         self.hidden = _linear(HIDDEN, HIDDEN, HIDDEN, generator)
@@ -110,7 +110,7 @@ class AppearanceField(nn.Module):
         self.directions: Tensor
         self.learned: Tensor
         self.register_buffer("centre", centre.detach().clone())
-        # A scene without extent has no unit of its own: any will do.
+        # A scene without extent has no length of its own: use 1.
         self.register_buffer("radius", centre.new_tensor(radius or 1.0))
         self.register_buffer("positions", torch.zeros(len(names), 3))
         self.register_buffer("directions", torch.zeros(len(names), 3))
@@ -125,16 +125,16 @@ class AppearanceField(nn.Module):
         visible: Int[Tensor, " m"],
         seed: int | None = None,
     ) -> tuple[Float[Tensor, "n 3"], Gaussians]:
-        """Colours, and with `opacity_shift` the Gaussians' opacities, in the light of a photo's vector.
+        """Colours, and with `opacity_shift` the Gaussians' opacities, under a photo's vector.
 
-        No gradient reaches the Gaussians' places through it. Colours are at least 0, opacities in 0…1.
+        The Gaussians' positions get no gradient from it. Colours are at least 0, opacities in 0…1.
 
         Args:
-            gaussians: in the world frame; come back as they are without `opacity_shift`.
+            gaussians: in the world frame; returned unchanged without `opacity_shift`.
             colours: before the shift, at least 0.
             vector: of the photo.
-            visible: rows of the Gaussians to work on; the others stay as they are.
-            seed: of the noise in the opacity shift, in training; None for none.
+            visible: rows of the Gaussians to change; the others stay as they are.
+            seed: of the opacity shift's noise in training; None for no noise.
         """
         base = colours[visible]
         features = torch.cat((self.grid(self._unit_cube(gaussians.means[visible])), base), 1)
@@ -149,32 +149,32 @@ class AppearanceField(nn.Module):
         return colours, gaussians
 
     def network_parameters(self) -> list[nn.Parameter]:
-        """What all photos share; `vectors` is what each has of its own."""
+        """Parameters shared by all photos; `vectors` are per photo."""
         return [parameter for parameter in self.parameters() if parameter is not self.vectors]
 
     def vector(self, name: str) -> Float[Tensor, " v"]:
-        """Vector of a training photo.
+        """The vector of a training photo.
 
         Raises:
             UserError: no training photo has this name.
         """
         if name not in self._rows:
             raise UserError(
-                f"{name} is not a photo that this scene was trained on: choose one of "
+                f"{name} is not a training photo of this scene: choose one of "
                 f"{', '.join(self.names[:5])}{', …' if len(self.names) > 5 else ''}"
             )
         return self.vectors[self._rows[name]]
 
     @torch.no_grad()
     def remember(self, name: str, position: Float[Tensor, "3"], direction: Float[Tensor, "3"]) -> None:
-        """Note that a photo is being learned from, and how its camera stands (unit viewing direction)."""
+        """Record that a photo is used in training, and its camera's position and unit viewing direction."""
         row = self._rows[name]
         self.positions[row], self.directions[row], self.learned[row] = position, direction, True
 
     def vector_of_view(
         self, position: Float[Tensor, "3"], direction: Float[Tensor, "3"]
     ) -> Float[Tensor, " v"]:
-        """Vector for a view that is no training photo, by the rule `unseen`; zero before any training."""
+        """Vector for a view that is not a training photo, by the rule `unseen`; zero before any training."""
         vectors = self.vectors[self.learned]
         if len(vectors) == 0:
             return self.vectors.new_zeros(self.config.vector_dim)
@@ -187,21 +187,21 @@ class AppearanceField(nn.Module):
         return vectors[(moved.square() + turned.square()).argmin()]
 
     def _unit_cube(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Places as grid coordinates in [0, 1]: space contracted to a ball (Mip-NeRF 360, Barron et al.
-        2022), of which the scene takes the inner half and everything as far as the sky the rest."""
+        """Positions as grid coordinates in [0, 1]: space contracted to a ball (Mip-NeRF 360, Barron et al.
+        2022); the scene fills the inner half, everything out to the sky the rest."""
         x = (means.detach() - self.centre) / self.radius
         largest = x.abs().amax(1, keepdim=True).clamp_min(1.0)
-        # In units of the largest part: squares of far places would be infinite, and end in the middle.
+        # In units of the largest component: the squares of far positions would overflow.
         distance = largest * (x / largest).norm(dim=1, keepdim=True).clamp_min(1 / largest)
         return 0.5 + 0.25 * (x / distance) * (2 - 1 / distance)
 
     def _binary_concrete(
         self, logits: Float[Tensor, " m"], visible: Int[Tensor, " m"], count: int, seed: int | None
     ) -> Float[Tensor, " m"]:
-        """A draw per Gaussian of a relaxed coin, close to 0 or 1 (Maddison et al. 2017): with noise u,
+        """A sample per Gaussian of a relaxed coin, close to 0 or 1 (Maddison et al. 2017): with noise u,
         sigmoid((logit + log u − log(1 − u)) / temperature); u = 1/2 without a seed."""
         if seed is not None:
-            # Drawn for all on the CPU: the same whatever is visible, and on whatever device.
+            # Sampled for all on the CPU: the same whatever is visible, and on every device.
             noise = torch.rand(count, generator=torch.Generator().manual_seed(seed))
             logits = logits + torch.logit(noise, eps=1e-6).to(logits)[visible]
         return torch.sigmoid(logits / TEMPERATURE)
@@ -216,10 +216,10 @@ class AppearanceField(nn.Module):
         return self.names
 
     def set_extra_state(self, state: list[str]) -> None:
-        """The names are taken over together with their rows, in `_load_from_state_dict`."""
+        """The names are restored together with their rows, in `_load_from_state_dict`."""
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args) -> None:
-        """Take the checkpoint's photos first, then those of this run that it does not know."""
+        """Take the checkpoint's photos first, then those of this run that it lacks."""
         saved = state_dict.get(f"{prefix}_extra_state")
         if saved is not None:
             known = set(saved)
@@ -236,7 +236,7 @@ class AppearanceField(nn.Module):
 def _linear(
     inputs: int, outputs: int, fan_in: int, generator: torch.Generator | None, bias: bool = True
 ) -> nn.Linear:
-    """A linear layer with torch's customary initial range for `fan_in` inputs, from the generator."""
+    """A linear layer with torch's default initial range for `fan_in` inputs, from the generator."""
     layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
     for parameter in layer.parameters():
         nn.init.uniform_(parameter, -(fan_in**-0.5), fan_in**-0.5, generator=generator)

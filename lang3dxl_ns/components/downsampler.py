@@ -1,12 +1,12 @@
 """Attenuated downsampler: from a decoded feature map to the grid of the CLIP targets.
 
-A CLIP target is a mean over crops of several sizes, so a cell of it knows about a wide neighbourhood. The
-downsampler gives the decoded map the same blur before the two are compared: a fixed kernel with the
-footprint of the crops, times learned per-pixel weights that choose what inside the window counts. It exists
-in training only; queries read the map itself.
+A CLIP target is a mean over crops of several sizes, so each cell covers a wide neighbourhood. The
+downsampler blurs the decoded map likewise before the two are compared: a fixed kernel with the footprint of
+the crops, times learned per-pixel weights that choose what counts inside the window. It is used in training
+only; queries read the decoded map itself.
 
 Every kernel here is a sum of boxes, hence separable: sum_j A_j X B_jᵀ, where the small matrices A_j and B_j
-carry window, resize and centring along each axis.
+contain window, resize and centring along each axis.
 """
 
 from __future__ import annotations
@@ -23,38 +23,38 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.precision import in_full_precision
+from lang3dxl_ns.common.precision import in_full_precision
 
 KernelName = Literal["pyramid", "footprint", "box"]
 
 # exp(-2 * 30) is far above the smallest float32, so one maximum over the whole map serves every window.
 _LARGEST_BOUND_FOR_ONE_MAXIMUM = 30.0
-_ROUND_OFF = 1e-9  # of a window; less coverage than this is an error of rounding, not a pixel
+_ROUND_OFF = 1e-9  # of a window; smaller coverage is rounding error, not a pixel
 
 
 @dataclass
 class DownsamplerConfig:
-    """How a decoded map is brought to the target grid."""
+    """How a decoded map is reduced to the target grid."""
 
     kernel: KernelName = "pyramid"
     """Fixed part of the weights. pyramid: nested squares from the smallest crop to the largest, growing by
     √2, favouring small ones (the published system's kernel). footprint: the exact crops of every scale and
-    the resize of their grids, all with the same weight. box: the cell alone, as the paper's formula reads;
-    much too narrow for targets that are a mean over scales."""
+    the resize of their grids, equally weighted. box: the cell alone, as in the paper's formula; much too
+    narrow for targets that are a mean over scales."""
     hidden: int = 16
     """Width of the network that predicts the weights; 0 keeps the fixed kernel and builds no network. The
-    published system has 512, which makes the downsampler about thirty times as slow on a CPU as 16."""
+    published system has 512, about thirty times as slow on a CPU as 16."""
     logit_bound: float | None = 10.0
     """Logits w become b·tanh(w/b), so that no pixel outweighs another by more than exp(2b). None leaves them
-    free and takes a slower path that is stable for any logits."""
+    unbounded and takes a slower path that is stable for any logits."""
     match: Literal["attenuated", "resize-features", "resize-target"] = "attenuated"
-    """How features and target meet. The others are the paper's ablations: features resized to the target's
-    grid ("w/o AD (LR)"), or the target to the features' size ("w/o AD (HR)"), bilinear; the settings above
-    are then without effect."""
+    """How features and target are brought to one grid. The other choices are the paper's ablations: features
+    resized to the target's grid ("w/o AD (LR)"), or the target to the features' size ("w/o AD (HR)"),
+    bilinear; the settings above then have no effect."""
 
 
 class SeparableKernel(NamedTuple):
-    """K[i, k, p, q] = sum_j rows[j, i, p] · columns[j, k, q]; sums to 1 over a window that is all inside."""
+    """K[i, k, p, q] = sum_j rows[j, i, p] · columns[j, k, q]; sums to 1 over a window inside the map."""
 
     rows: Float[Tensor, "j hd h"]
     columns: Float[Tensor, "j wd w"]
@@ -64,7 +64,7 @@ class AttenuatedDownsampler(nn.Module):
     """Kernel- and attention-weighted mean of a feature map around every cell of a target grid (Lang3D-XL §3).
 
     out(o) = Σ_i K(o, i) m_i exp(w_i) f_i / Σ_i K(o, i) m_i exp(w_i), with the kernel K centred on the cell,
-    the mask m, and logits w from three 3×3 convolutions over f. What hangs over the edge of the map is left
+    the mask m, and logits w from three 3×3 convolutions over f. Parts of a window outside the map are left
     out of both sums. The last convolution starts at zero: training starts from the plain kernel mean.
     """
 
@@ -83,7 +83,7 @@ class AttenuatedDownsampler(nn.Module):
         crop_sides: Sequence[float],
         mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
     ) -> tuple[Float[Tensor, "a b c"], Float[Tensor, "a b c"], Float[Tensor, "a b"]]:
-        """Features and target on one grid, the target's unless configured otherwise, and the cells' weight
+        """Features and target on one grid (the target's unless configured otherwise), and the cells' weight
         (see `forward`)."""
         inside = features.new_ones(features.shape[:2]) if mask is None else mask.to(features.dtype)
         if self.config.match == "resize-target":
@@ -102,12 +102,12 @@ class AttenuatedDownsampler(nn.Module):
         crop_sides: Sequence[float],
         mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
     ) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
-        """Downsampled features, and the share of each window's kernel that lies inside and on the mask.
+        """Downsampled features, and the share of each window's kernel inside the map and the mask.
 
         grid: (rows, columns) of the target. crop_sides: sides of the crops that the target averages, smallest
-        first, as fractions of the photo's width; the map has the photo's aspect. Where the share is 0 the
-        features are 0 and pass no gradient; elsewhere it serves as the weight of the loss. Features off the
-        mask have no influence at all. Raises ValueError for crop sides that are not positive and ascending.
+        first, as fractions of the photo's width; the map has the photo's aspect ratio. Where the share is 0,
+        features are 0 and pass no gradient; elsewhere it serves as the loss weight. Features outside the mask
+        have no influence. Raises ValueError for crop sides that are not positive and ascending.
         """
         masked = features if mask is None else features * mask.to(features.dtype)[..., None]
         logits = None if self.network is None else self.logits(masked)
@@ -149,7 +149,7 @@ def mean_with_one_maximum(
     logits: Float[Tensor, "h w"],
     mask: Float[Tensor, "h w"],
 ) -> Float[Tensor, "hd wd c"]:
-    """Weighted mean of every window, with one shift of the logits for the whole map: for bounded logits."""
+    """Weighted mean of every window, with one shift of the logits for the whole map; for bounded logits."""
     weights = torch.exp(logits - logits.detach().max()) * mask
     mass = apply_kernel(kernel, weights[..., None]).squeeze(-1)
     return _divide(apply_kernel(kernel, features * weights[..., None]), mass)
@@ -161,11 +161,11 @@ def mean_with_window_maxima(
     logits: Float[Tensor, "h w"],
     mask: Float[Tensor, "h w"],
 ) -> Float[Tensor, "hd wd c"]:
-    """Weighted mean of every window, with a shift of the logits for each: for any logits, −∞ included.
+    """Weighted mean of every window, each with its own shift of the logits; for any logits, −∞ included.
 
-    Axis by axis: along y every window has a maximum of its own, subtracted before `exp`; along x those maxima
-    are the logits. Only differences of logits are ever taken, and no logarithm. A shift changes no mean, so
-    the maxima carry no gradient.
+    Axis by axis: along y every window has its own maximum, subtracted before `exp`; along x those maxima are
+    the logits. Only differences of logits are taken, and no logarithm. A shift changes no mean, so the maxima
+    carry no gradient.
     """
     (boxes, hd, h), (_, wd, w) = kernel.rows.shape, kernel.columns.shape
     rows = kernel.rows.reshape(boxes * hd, h)
@@ -202,7 +202,7 @@ def apply_kernel(kernel: SeparableKernel, values: Float[Tensor, "h w c"]) -> Flo
 
 
 @lru_cache(maxsize=128)
-@torch.inference_mode(False)  # else a matrix cached by an evaluation could not be used in training
+@torch.inference_mode(False)  # otherwise a matrix cached during evaluation could not be used in training
 def separable_kernel(
     name: KernelName,
     size: tuple[int, int],
@@ -249,19 +249,18 @@ def _nested_rows(size: int, cells: int, sides: Sequence[float]) -> Float[Tensor,
 def _footprint_rows(
     size: tuple[int, int], grid: tuple[int, int], sides: Sequence[float], axis: int
 ) -> Float[Tensor, "j n a"]:
-    """Crops of every scale along an axis, their grid resized bilinearly to the target's.
+    """Crops of every scale along an axis, and the bilinear resize of their grid to the target's.
 
-    Crops of one scale overlap by half and are centred in the image as a whole, so their centres differ a
-    little from those of the cells that the resize takes them for. The target has that error, so this has.
+    Crops of one scale overlap by about half; their centres are the middles of equal cells.
     """
     length, cells = size[axis], grid[axis]
-    # A map's height is the photo's, scaled and rounded down, so the photo is up to a pixel higher.
+    # A map's height is the photo's, scaled and rounded down, so the photo may be up to a pixel higher.
     photo_length = length if axis == 1 else length + 0.5
     rows = []
     for index, side in enumerate(side * size[1] for side in sides):
         shift = side / 2
         count = cells if index == 0 else max(1, math.floor(photo_length / shift + 1e-6))
-        centres = length / 2 + (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * shift
+        centres = (torch.arange(count, dtype=torch.float64) + 0.5) * (length / count)
         rows.append(_bilinear_rows(count, cells) @ _window_means(length, centres, side))
     return torch.stack(rows)
 
@@ -276,9 +275,9 @@ def _bilinear_rows(source: int, target: int) -> Float[Tensor, "target source"]:
 def _window_means(size: int, centres: Float[Tensor, " n"], side: float) -> Float[Tensor, "n a"]:
     """Weights of an axis' pixels in windows of the given side, as shares of the whole window.
 
-    A pixel counts by the part of it that the window covers, and that part is read at its own middle, between
-    the neighbouring pixels. So whole pixels are plainly averaged, a window narrower than a pixel
-    interpolates, and a ramp keeps its position exactly wherever the window is inside the map.
+    A pixel counts by the part of it that the window covers, sampled at that part's centre by interpolating
+    between neighbouring pixels. So whole pixels are averaged, a window narrower than a pixel interpolates,
+    and a ramp keeps its position exactly wherever the window is inside the map.
     """
     pixel = torch.arange(size, dtype=torch.float64)
     start = torch.maximum(centres[:, None] - side / 2, pixel)
@@ -295,7 +294,7 @@ def _window_means(size: int, centres: Float[Tensor, " n"], side: float) -> Float
 
 
 def _weight_network(channels: int, hidden: int, generator: torch.Generator | None) -> nn.Sequential:
-    """Three 3×3 convolutions to one logit; only the given generator is drawn from."""
+    """Three 3×3 convolutions to one logit; initialised from the given generator alone."""
     widths = (channels, hidden, hidden, 1)
     first, second, last = (
         nn.utils.skip_init(nn.Conv2d, a, b, kernel_size=3, padding=1) for a, b in pairwise(widths)
@@ -306,10 +305,10 @@ def _weight_network(channels: int, hidden: int, generator: torch.Generator | Non
     for layer in (first, second, last):
         nn.init.zeros_(layer.bias)
     network = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
-    # The map arrives channels last; weights in the same layout halve the time of the convolutions on a CPU.
+    # The map is channels-last; weights in the same layout halve the convolutions' time on a CPU.
     return nn.utils.convert_conv2d_weight_memory_format(network, torch.channels_last)
 
 
 def _divide(total: Float[Tensor, "hd wd c"], mass: Float[Tensor, "hd wd"]) -> Float[Tensor, "hd wd c"]:
-    """total / mass, and 0 without gradient where there is no mass (and so no total)."""
+    """total / mass, or 0 without gradient where mass (and so total) is 0."""
     return total / torch.where(mass > 0, mass, 1.0)[..., None]

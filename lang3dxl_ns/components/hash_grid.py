@@ -18,27 +18,27 @@ HASH_PRIMES = (1, 2654435761, 805459861, 3674653429, 2097192037, 1434869437)
 MOST_DIMENSIONS = len(HASH_PRIMES)
 INITIAL_RANGE = 1e-4
 COORDINATE_LIMIT = 1024.0
-"""Coordinates are clamped to ± this; there, float32 resolves an eighth of a cell 1/2048 wide."""
+"""Coordinates are clamped to ± this, where float32 still resolves an eighth of a cell 1/2048 wide."""
 
 
 class HashGrid(nn.Module):
     """Trainable features over [0, 1]^d, differentiable in the table and in the coordinates (first order).
 
     A level of resolution r has r vertices per axis, and [0, 1] spans r - 2 cells, from half a cell inside the
-    lattice on either side: neither 0 nor 1 reads past the table or sits on a vertex. Outside [0, 1] the
-    lattice goes on, onto entries that are already in use (dense levels repeat, hashed levels hash), so any
+    lattice on either side: neither 0 nor 1 reads past the table or lies on a vertex. Outside [0, 1] the
+    lattice continues with entries already in use (dense levels repeat, hashed levels hash), so any
     coordinate gives finite features, and has a gradient up to ± 1024, where it is clamped. A NaN coordinate
-    makes its own output row NaN and no other.
+    makes only its own output row NaN.
 
     Keep `max_resolution` as low as the task allows: Adam with a vanishing epsilon moves every touched entry
-    equally far, so fine levels, which few samples constrain, grow as loud as coarse ones.
+    equally far, so fine levels, which few samples constrain, grow as large as coarse ones.
 
     Args:
         input_dim: d, 2 to 6.
         levels: number of resolutions, in geometric progression from `min_resolution` to `max_resolution`;
-            0 makes a grid without any feature.
+            0 makes a grid without features.
         features_per_level: length of an entry.
-        log2_table_size: a level keeps at most 2 to this power entries.
+        log2_table_size: log2 of the most entries per level.
         generator: source of the uniform ± 1e-4 initial values.
     """
 
@@ -68,7 +68,6 @@ class HashGrid(nn.Module):
         capacity = 2**log2_table_size
         sizes = [min(_round_up(r**input_dim, 8), capacity) for r in resolutions]
         self.entries = sum(sizes)
-        self._ends = [sum(sizes[: level + 1]) for level in range(levels)]
         self.dense_levels = sum(r**input_dim <= capacity for r in resolutions)
         self.hash_mask = capacity - 1
 
@@ -78,7 +77,7 @@ class HashGrid(nn.Module):
         self.offsets: Tensor
         self.dense_resolutions: Tensor
         offsets = [sum(sizes[:level]) for level in range(levels)]
-        # Integers: `.half()` and the like must not round them.
+        # Integers, so that `.half()` and the like don't round them.
         self.register_buffer("cells", torch.tensor([r - 2 for r in resolutions]), persistent=False)
         self.register_buffer("offsets", torch.tensor(offsets), persistent=False)
         dense = torch.tensor(resolutions[: self.dense_levels], dtype=torch.int64)
@@ -89,7 +88,7 @@ class HashGrid(nn.Module):
     ) -> Float[Tensor, "n out"]:
         """Interpolated features of every point; `level_weights` scales each level (see `coarse_to_fine`).
 
-        Features have the table's number type. Coordinates are computed in float32 at least: in 16 bits a
+        Features have the table's number type. Coordinates are computed in at least float32: in 16 bits a
         fine level would have no fractions left.
         """
         if not self.levels:
@@ -97,63 +96,41 @@ class HashGrid(nn.Module):
         x = x.to(torch.promote_types(self.table.dtype, torch.float32)).clamp(
             -COORDINATE_LIMIT, COORDINATE_LIMIT
         )
-        # Whole units apart, as integers: far from 0 a product in float32 has no digits left for a fraction.
+        # Whole units separately, as integers: far from 0 a float32 product has no digits left for a fraction.
         whole = x.detach().floor()
         position = (x.detach() - whole).T[:, None] * self.cells[:, None] + 0.5
         lower = position.floor()
         index = self._vertex_entries(lower.long() + whole.long().T[:, None] * self.cells[:, None])
         return _Interpolate.apply(x, self.table, index, position - lower, self.cells, level_weights)
 
-    def keep_levels(self, count: int) -> None:
-        """Drop all but the `count` coarsest levels, their entries too: the table becomes a new parameter.
-
-        Raises ValueError for fewer than one or more than there are.
-        """
-        if not 1 <= count <= self.levels:
-            raise ValueError(f"the grid has {self.levels} levels, {count} can't be kept")
-        self.levels, self.output_dim = count, count * self.features_per_level
-        self._ends, self.entries = self._ends[:count], self._ends[count - 1]
-        self.dense_levels = min(self.dense_levels, count)
-        self.table = nn.Parameter(self.table.detach()[: self.entries].clone())
-        self.cells, self.offsets = self.cells[:count], self.offsets[:count]
-        self.dense_resolutions = self.dense_resolutions[: self.dense_levels]
-
-    def levels_in(self, entries: int) -> int | None:
-        """How many of the coarsest levels make a table of this many entries; None for none of them."""
-        return self._ends.index(entries) + 1 if entries in self._ends else None
-
-    def resolved_levels(self, distance: float) -> int:
-        """Number of levels whose cells are not finer than a distance in the unit cube; at least one."""
-        return max(int((1 / self.cells >= distance).sum()), 1)
-
     def coarse_to_fine(self, fraction: float) -> Float[Tensor, " levels"]:
-        """Level weights that open the coarsest level at fraction 0 and all at 1; the newest one fades in."""
+        """Level weights: only the coarsest level open at fraction 0, all at 1; the newest one fades in."""
         opened = 1 + min(max(fraction, 0.0), 1.0) * (self.levels - 1)
         amount = (opened - torch.arange(self.levels, dtype=torch.float64)).clamp(0, 1)
         return (0.5 - 0.5 * torch.cos(math.pi * amount)).to(self.table)
 
     def _vertex_entries(self, lower: Int[Tensor, "d levels n"]) -> Int[Tensor, "corners levels n"]:
-        """Rows of the table that hold the corners of each point's cell; the last axis varies fastest.
+        """Table rows of the corners of each point's cell; the last axis varies fastest.
 
-        Any integer is a valid vertex, also whatever NaN was converted to.
+        Any integer is a valid vertex, even what NaN was converted to.
         """
         vertices = torch.stack((lower, lower + 1), 1)
         dense, hashed = vertices[:, :, : self.dense_levels], vertices[:, :, self.dense_levels :]
         dense = dense % self.dense_resolutions[:, None]
-        # The mask keeps the low bits, which a product in 64 bits shares with the customary one in 32.
+        # The mask keeps the low bits, which are the same in a 64-bit product as in the usual 32-bit one.
         keys = [axis * prime & self.hash_mask for axis, prime in zip(hashed, HASH_PRIMES, strict=False)]
         dense_entry, hashed_entry = dense[0], keys[0]
         for axis in range(1, self.input_dim):
             stride = self.dense_resolutions[:, None] ** axis
             dense_entry = (dense_entry[:, None] + dense[axis] * stride).flatten(0, 1)
             hashed_entry = (hashed_entry[:, None] ^ keys[axis]).flatten(0, 1)
-        # 32 bits suffice for a row number, and halve the time to sort them in the backward pass.
+        # 32 bits suffice for a row number, and halve the time of sorting in the backward pass.
         return (torch.cat((dense_entry, hashed_entry), 1) + self.offsets[:, None]).int()
 
 
 def _resolutions(levels: int, lowest: int, highest: int) -> list[int]:
     growth = (highest / lowest) ** (1 / max(levels - 1, 1))
-    # Rounding first: the finest level must not become highest + 1 by a last bit.
+    # Rounding first: otherwise rounding error could make the finest level highest + 1.
     return [math.ceil(round(lowest * growth**level, 6)) for level in range(levels)]
 
 
@@ -166,12 +143,12 @@ class _Interpolate(torch.autograd.Function):
 
     Written by hand because autograd through `embedding_bag` takes two to three times as long on a CPU. Here
     the derivative along an axis is the same interpolation with that axis' weights (1 - t, t) replaced by
-    (-s, s), s being the cells to the unit.
+    (-s, s), where s is the number of cells per unit.
     """
 
     @staticmethod
     def forward(ctx, x, table, index, fraction, cells, level_weights):
-        # Points vary fastest in `index` and `fraction`, which suits elementwise work; in bags corners do.
+        # Points vary fastest in `index` and `fraction`, which suits elementwise work; in bags, corners do.
         rows = _as_bags(index)
         axis_weights = torch.stack((1 - fraction, fraction), 1)
         weights = _as_bags(_corner_weights(list(axis_weights), level_weights)).to(table.dtype)
@@ -186,7 +163,7 @@ class _Interpolate(torch.autograd.Function):
         grad_bags = grad.reshape(-1, table.shape[1])
         grad_x = grad_table = None
         if ctx.needs_input_grad[1]:
-            # A GPU adds atomically; one of its threads alone would sum a bag of thousands of samples of one
+            # A GPU adds atomically, since a single thread would sum a bag of thousands of samples of one
             # coarse entry. On a CPU sorting into bags is up to three times faster than adding in place.
             gather = _table_gradient_added if grad.is_cuda else _table_gradient_sorted
             grad_table = gather(len(table), rows, weights, grad_bags)
@@ -236,7 +213,7 @@ def _table_gradient_sorted(
 def _table_gradient_added(
     entries: int, rows: Int[Tensor, "b c"], weights: Float[Tensor, "b c"], grad: Float[Tensor, "b f"]
 ) -> Float[Tensor, "entries f"]:
-    """Add each corner's weighted output gradients to the table rows, in an order that is the device's."""
+    """Add each corner's weighted output gradients to the table rows, in a device-dependent order."""
     total = grad.new_zeros(entries, grad.shape[1])
     for corner_rows, corner_weights in zip(rows.T, weights.T, strict=True):
         total.index_add_(0, corner_rows, grad * corner_weights[:, None])

@@ -1,6 +1,6 @@
 """Losses of a training step: pure functions that take their mask and return a scalar.
 
-Every mean is over the mask, not over the image, so that a small building weighs as much as a large one. An
+Every mean is over the mask, not the image, so that a small building weighs as much as a large one. An
 empty mask gives zero with zero gradient.
 """
 
@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 from pytorch_msssim import ssim
 from torch import Tensor
 
-from lang3dxl_ns.precision import in_full_precision
+from lang3dxl_ns.common.kernels import takes_kernels
+from lang3dxl_ns.common.precision import in_full_precision
 
 _SSIM_WINDOW = 11
 
@@ -60,11 +61,11 @@ def dense_loss(
 ) -> Float[Tensor, ""]:
     """Mean absolute difference between decoded dense features and their target, on one grid.
 
-    compare_at: "target" resizes the prediction to the target's grid, as the published system does. "auto"
-    resizes the target instead, which needs no gradient and so costs a fraction, unless the target has less
-    than half as many cells as the prediction: details that it doesn't show should not be pressed out of the
-    prediction. The resize is bilinear and antialiased: it averages where it shrinks, and keeps positions
-    within a tenth of a cell. The weight, of any size, is resized like the features.
+    compare_at: "target" resizes the prediction to the target's grid, as in the published system. "auto"
+    resizes the target instead, which needs no gradient and costs a fraction, unless the target has less than
+    half as many cells as the prediction: then it would suppress detail that the target doesn't show. The
+    resize is bilinear and antialiased: it averages when shrinking, and keeps positions within a tenth of a
+    cell. The weight, of any size, is resized like the features.
     """
     at_prediction = compare_at == "auto" and prediction.numel() <= 2 * target.numel()
     rows, columns, _ = (prediction if at_prediction else target).shape
@@ -83,7 +84,7 @@ def region_variance_loss(
     """Variance of the features inside each region, summed over channels, averaged over the valid pixels.
 
     Σ_r Σ_{i∈r} ‖f_i − mean_r‖² / (number of valid pixels). Labels are any integers, negative for no region;
-    a mask counts from 0.5. A region of one pixel adds nothing but its pixel to the mean.
+    the mask is thresholded at 0.5. A region of one pixel only adds to the pixel count.
     """
     valid = labels >= 0 if mask is None else (labels >= 0) & (mask >= 0.5)
     features, valid = features.flatten(0, 1), valid.flatten()
@@ -97,11 +98,11 @@ def region_variance_loss(
 def _region_means(
     features: Float[Tensor, "n c"], labels: Int[Tensor, " n"]
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"]]:
-    """Mean of each pixel's region, as a rounded value and the small rest that the rounding lost.
+    """Mean of each pixel's region, as a rounded value and its rounding error.
 
-    Both are needed where features are large beside their spread: subtract one, then the other. They carry no
-    gradient and the loss above loses none: the deviations in a region sum to zero, and so does the gradient
-    that would flow through its mean.
+    Both are needed where features are large compared with their spread: subtract one, then the other. They
+    carry no gradient, and the loss above loses none: the deviations in a region sum to zero, and so does the
+    gradient through its mean.
     """
     regions, inverse, counts = torch.unique(labels, return_inverse=True, return_counts=True)
 
@@ -122,7 +123,7 @@ def _weighted_mean(values: Float[Tensor, "h w c"], weight: Tensor | None) -> Flo
 
 
 def resize(values: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
-    """Bilinear resize that averages where it shrinks."""
+    """Bilinear resize that averages when shrinking."""
     if values.shape[:2] == grid:
         return values
     planes = values.permute(2, 0, 1)[None]
@@ -133,4 +134,8 @@ def _ssim(prediction: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) ->
     missing = [max(0, _SSIM_WINDOW - side) for side in prediction.shape[:2]]
     border = (missing[1] // 2, missing[1] - missing[1] // 2, missing[0] // 2, missing[0] - missing[0] // 2)
     images = [F.pad(image.permute(2, 0, 1)[None], border, mode="replicate") for image in (prediction, target)]
+    if takes_kernels(prediction) and not target.requires_grad:
+        from lang3dxl_ns.components.ssim import ssim as compiled_ssim
+
+        return compiled_ssim(images[0][0], images[1][0].to(prediction))
     return ssim(*images, data_range=1.0, win_size=_SSIM_WINDOW, win_sigma=1.5)

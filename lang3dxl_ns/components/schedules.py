@@ -1,7 +1,7 @@
 """Learning-rate and loss-weight schedules: pure functions of the step or of x, the run's fraction in [0, 1].
 
-Outside its range a schedule keeps its value at the nearer end. All return Python floats: a NumPy scalar would
-travel into optimiser state and checkpoints, where a safe loader refuses it.
+Outside its range a schedule keeps its nearest end value. All return Python floats: a NumPy scalar would end
+up in optimiser state and checkpoints, where a safe loader rejects it.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ import math
 
 
 def log_linear(x: float, start: float, end: float) -> float:
-    """From start to end (both positive), straight on a logarithmic axis."""
+    """From start to end (both positive), linear in the logarithm."""
     x = _fraction(x)
     return math.exp((1 - x) * math.log(start) + x * math.log(end))
 
 
 def exponential_ramp(step: float, start: float, end: float, steps: float) -> float:
-    """From start to end (both positive) over the first `steps` steps, multiplied by one factor per step."""
+    """From start to end (both positive) over the first `steps` steps, by a constant factor per step."""
     return log_linear(step / steps if steps > 0 else 1.0, start, end)
 
 
 def semantic_ramp(x: float) -> float:
-    """Weight of the semantic losses: 0.1 to 1 over the first half of the run, so that geometry comes first.
+    """Weight of the semantic losses: 0.1 to 1 over the first half of the run, so that geometry leads.
 
     Lang3D-XL's released schedule ramps over 15,000 of 30,000 iterations.
     """
@@ -29,7 +29,7 @@ def semantic_ramp(x: float) -> float:
 
 
 def cosine_decay(x: float, peak: float, end: float, power: float = 1.0) -> float:
-    """From peak to end along half a cosine of x^power; a power above 1 stays near the peak for longer."""
+    """From peak to end along half a cosine of x^power; a power above 1 stays near the peak longer."""
     peak, end = float(peak), float(end)
     return end + 0.5 * (peak - end) * (1 + math.cos(math.pi * _fraction(x) ** float(power)))
 

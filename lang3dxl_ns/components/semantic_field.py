@@ -1,30 +1,29 @@
 """The semantic field: a per-pixel decoder from bottleneck codes to CLIP and dense features.
 
 The rendered code of a pixel is the *coordinate* of a multi-resolution hash grid, so the field is indexed by
-feature value and not by place: repeated structures share codes (Lang3D-XL). An MLP turns the encoding into
+feature value, not by position: repeated structures share codes (Lang3D-XL). An MLP turns the encoding into
 CLIP features and, through the same hidden layers, dense (DINO) features.
 """
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.encoder import SemanticEncoder
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, MOST_DIMENSIONS, HashGrid
-from lang3dxl_ns.errors import UserError
 
 Preset = Literal["default", "short", "paper", "official"]
 
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """Every setting of a semantic field, none left open; `SemanticFieldConfig` documents each."""
+    """All settings of a semantic field, resolved; documented in `SemanticFieldConfig`."""
 
     code_dim: int
     code_std: float
@@ -44,8 +43,8 @@ class FieldSettings:
 
 
 PRESETS: dict[Preset, FieldSettings] = {
-    # One lookup of 16 × 32 features does the work of the method's four indexed passes of 16 × 8 in a fraction
-    # of the time. The table size is a compromise between room for a large scene and an optimiser's memory.
+    # One lookup of 16 × 32 features replaces the method's four indexed passes of 16 × 8 in a fraction of the
+    # time. The table size is a compromise between capacity for a large scene and the optimiser's memory.
     "default": FieldSettings(
         code_dim=3,
         code_std=0.01,
@@ -63,7 +62,7 @@ PRESETS: dict[Preset, FieldSettings] = {
         activation="every",
         whiten=True,
     ),
-    # A hash grid alone needs thousands of steps; Fourier features beside a small one learn within hundreds.
+    # A hash grid alone needs thousands of steps; Fourier features and a small grid learn within hundreds.
     "short": FieldSettings(
         code_dim=3,
         code_std=0.01,
@@ -81,8 +80,8 @@ PRESETS: dict[Preset, FieldSettings] = {
         activation="every",
         whiten=True,
     ),
-    # As printed. The index coordinate is kept, not folded into a wider row: with it the table has the printed
-    # size. Where the paper is silent (range, initial codes, features per level) this takes the safe choice.
+    # As printed. The index coordinate is kept, not folded into a wider row: the table has the printed size.
+    # Where the paper is silent (range, initial codes, features per level) these are safe choices.
     "paper": FieldSettings(
         code_dim=3,
         code_std=0.01,
@@ -123,35 +122,35 @@ PRESETS: dict[Preset, FieldSettings] = {
 
 @dataclass
 class SemanticFieldConfig:
-    """Settings of a semantic field: a preset, and whatever is set here instead of the preset's value."""
+    """Settings of a semantic field: a preset, and values that override it."""
 
     preset: Preset | Literal["auto"] = "auto"
     """`default`: long GPU run; `short`: 300 to 1,000 steps on a CPU; `paper`: as printed; `official`: as
-    released; `auto`: chosen by the length of the run (`default` where none is known)."""
+    released; `auto`: chosen by the length of the run (`default` if unknown)."""
     code_dim: int | None = None
-    """Channels of the rendered code, 2 to 6 (2 to 5 with `indexed`). Each doubles the work of a lookup."""
+    """Channels of the rendered code, 2 to 6 (2 to 5 with `indexed`). Each doubles the cost of a lookup."""
     code_std: float | None = None
-    """Standard deviation of the initial codes. Small: wide starts scatter equal surfaces over the field."""
+    """Standard deviation of the initial codes. Small: a wide start scatters equal surfaces over the field."""
     bounding: Literal["sigmoid", "raw"] | None = None
-    """How a code becomes a coordinate. `sigmoid`: into (0, 1), where distinct cells keep distinct vertices;
-    `raw`: as it is, and codes outside [0, 1] reuse entries of those inside."""
+    """How a code becomes a coordinate. `sigmoid`: into (0, 1), where distinct cells have distinct vertices;
+    `raw`: unchanged, and codes outside [0, 1] share entries with those inside."""
     fourier_frequencies: int | None = None
-    """Octaves of sines and cosines of the coordinate beside the grid, the longest one wave over the unit;
+    """Octaves of sines and cosines of the coordinate, alongside the grid; the longest has one wave per unit.
     0 for none."""
     indexed: bool | None = None
-    """Put an index coordinate before the code and look up at index 0, 1/k, 2/k, … until there are as many
-    channels as CLIP has (Lang3D-XL). Without it the grid is read once."""
+    """Prepend an index coordinate to the code and look up at index 0, 1/k, 2/k, … until there are as many
+    channels as CLIP has (Lang3D-XL). Otherwise the grid is read once."""
     levels: int | None = None
-    """Resolutions of the hash grid; 0 for none, the Fourier features alone."""
+    """Levels of the hash grid; 0 for none, only Fourier features."""
     features_per_level: int | None = None
-    """Features that each level contributes to a lookup."""
+    """Features per level."""
     log2_table_size: int | None = None
-    """A level keeps at most 2 to this power entries."""
+    """Log2 of the most entries per level."""
     min_resolution: int | None = None
     """Vertices per axis of the coarsest level."""
     max_resolution: int | None = None
     """Vertices per axis of the finest level. Capped low, because Adam with epsilon 1e-15 moves every touched
-    entry equally far: fine levels would end as loud as coarse ones, and neighbouring codes decode to
+    entry equally far: fine levels would grow as large as coarse ones, and neighbouring codes would decode to
     unrelated features."""
     coarse_to_fine: float | None = None
     """Fraction of the run over which levels open, coarsest first; 0 opens all from the start."""
@@ -165,11 +164,11 @@ class SemanticFieldConfig:
     """Outputs are mean + deviation × network, with the targets' statistics: training starts at their mean."""
 
     def resolved(self) -> FieldSettings:
-        """All settings, the open ones taken from the preset.
+        """All settings, with unset ones taken from the preset.
 
         Raises:
             UserError: the preset is unknown, the code has too many or too few channels for the grid, or the
-                decoder has no hidden layer or nothing to read.
+                decoder has no hidden layer or no input.
         """
         name = "default" if self.preset == "auto" else self.preset
         if name not in PRESETS:
@@ -192,24 +191,16 @@ class SemanticFieldConfig:
         return settings
 
 
-class ShrunkParameter(NamedTuple):
-    """A parameter, what replaced it, and how to cut anything of the old shape to the new one."""
-
-    old: Tensor
-    new: Tensor
-    cut: Callable[[Tensor], Tensor]
-
-
 class SemanticField(SemanticEncoder):
-    """Decodes rendered codes to raw (not unit length) CLIP features and, if asked for, dense features.
+    """Decodes rendered codes to raw (not unit length) CLIP features and, if configured, dense features.
 
     Codes may be any number: ±inf decode to finite features, NaN to NaN in their own pixel alone. Everything
-    is per pixel; decode large maps in chunks.
+    is per pixel, so large maps can be decoded in chunks.
 
     Args:
         config: the settings.
         clip_dim: channels of the CLIP features.
-        dense_dim: channels of the dense features; 0 leaves the dense head out.
+        dense_dim: channels of the dense features; 0 omits the dense head.
         generator: source of the initial weights.
     """
 
@@ -235,11 +226,11 @@ class SemanticField(SemanticEncoder):
         )
         grid_dim = clip_dim if s.indexed else self.grid.output_dim
         fourier_dim = s.code_dim * (1 + 2 * s.fourier_frequencies) if s.fourier_frequencies else 0
-        self.hidden = _hidden_layers(grid_dim + fourier_dim, s, generator)
+        self.layers = _hidden_layers(grid_dim + fourier_dim, s, generator)
         self.output = _linear(s.hidden_width, clip_dim + dense_dim, generator)
 
         self.level_weights: Tensor | None
-        # All levels are open until `set_progress` says otherwise.
+        # All levels are open until `set_progress` is called.
         self.register_buffer("level_weights", torch.ones(s.levels) if s.coarse_to_fine > 0 else None)
 
     @property
@@ -249,7 +240,7 @@ class SemanticField(SemanticEncoder):
     def initial_codes(
         self, count: int, generator: torch.Generator | None = None
     ) -> Float[Tensor, "count code"]:
-        """Codes to start training from, one per Gaussian; drawn on the generator's device."""
+        """Initial codes, one per Gaussian; sampled on the generator's device."""
         device = generator.device if generator else None
         noise = torch.randn(count, self.code_dim, generator=generator, device=device)
         return (self.settings.code_std * noise).to(self.output_mean)
@@ -260,48 +251,26 @@ class SemanticField(SemanticEncoder):
             super().set_output_statistics(mean, std)
 
     def set_progress(self, fraction: float) -> None:
-        """Tell how much of the run is done (0 to 1): opens the grid's levels; saved with the checkpoint."""
+        """Set the fraction of the run done (0 to 1), which opens grid levels; saved in the checkpoint."""
         if self.level_weights is not None:
             self.level_weights.copy_(self.grid.coarse_to_fine(fraction / self.settings.coarse_to_fine))
-
-    def keep_levels(self, count: int) -> list[ShrunkParameter]:
-        """Drop all but the grid's `count` coarsest levels, and what the decoder's first layer reads of them.
-
-        Returns the parameters that were replaced, for the optimiser to follow.
-        """
-        first = self.hidden[0]
-        assert isinstance(first, nn.Linear) and not self.settings.indexed
-        columns = first.in_features - (self.grid.levels - count) * self.grid.features_per_level
-        table, weight = self.grid.table, first.weight
-        self.grid.keep_levels(count)
-        entries = self.grid.entries
-        first.weight = nn.Parameter(weight.detach()[:, :columns].clone())
-        first.in_features = columns
-        if self.level_weights is not None:
-            self.level_weights = self.level_weights[:count]
-        return [
-            ShrunkParameter(table, self.grid.table, lambda moment: moment[:entries].clone()),
-            ShrunkParameter(weight, first.weight, lambda moment: moment[:, :columns].clone()),
-        ]
 
     def forward(
         self, codes: Float[Tensor, "*batch code"]
     ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
         """CLIP and dense features of every code; dense is None without a dense head."""
-        hidden = self._decode_hidden(codes)
-        clip = self._head(hidden, slice(0, self.clip_dim))
-        dense = self._head(hidden, slice(self.clip_dim, None)) if self.dense_dim else None
+        hidden = self.hidden(codes)
+        clip = F.linear(hidden, *self._head(slice(0, self.clip_dim)))
+        dense = F.linear(hidden, *self._head(slice(self.clip_dim, None))) if self.dense_dim else None
         return clip, dense
 
     def decode_clip(self, codes: Float[Tensor, "*batch code"]) -> Float[Tensor, "*batch clip"]:
         """CLIP features of every code, without computing the dense ones."""
-        return self._head(self._decode_hidden(codes), slice(0, self.clip_dim))
+        return F.linear(self.hidden(codes), *self.clip_head())
 
-    def fit_to_state(self, state: Mapping[str, Tensor]) -> None:
-        """Drop the levels that the saved grid has lost."""
-        kept = self.grid.levels_in(len(state["grid.table"]))
-        if kept is not None and kept < self.grid.levels:
-            self.keep_levels(kept)
+    def clip_head(self) -> tuple[Float[Tensor, "clip hidden"], Float[Tensor, " clip"]]:
+        """See `SemanticEncoder`."""
+        return self._head(slice(0, self.clip_dim))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         return {"field_encoding": self.encoding_parameters(), "field_decoder": self.decoder_parameters()}
@@ -312,14 +281,15 @@ class SemanticField(SemanticEncoder):
 
     def decoder_parameters(self) -> list[nn.Parameter]:
         """Parameters of the MLP: a group with weight decay, so that CLIP and dense outputs share edges."""
-        return [*self.hidden.parameters(), *self.output.parameters()]
+        return [*self.layers.parameters(), *self.output.parameters()]
 
-    def _decode_hidden(self, codes: Float[Tensor, "*batch code"]) -> Float[Tensor, "*batch hidden"]:
+    def hidden(self, codes: Float[Tensor, "*batch code"]) -> Float[Tensor, "*batch hidden"]:
+        """Activations of the last hidden layer."""
         coordinates = self._coordinates(codes.reshape(-1, self.code_dim))
         encoding = self._read_grid(coordinates)
         if self.settings.fourier_frequencies:
             encoding = torch.cat((self._fourier(coordinates), encoding), 1)
-        return self.hidden(encoding).reshape(*codes.shape[:-1], self.settings.hidden_width)
+        return self.layers(encoding).reshape(*codes.shape[:-1], self.settings.hidden_width)
 
     def _coordinates(self, codes: Float[Tensor, "n code"]) -> Float[Tensor, "n code"]:
         if self.settings.bounding == "sigmoid":
@@ -341,11 +311,12 @@ class SemanticField(SemanticEncoder):
         angles = (coordinates[..., None] * (2 * math.pi * octaves.to(coordinates))).flatten(1)
         return torch.cat((coordinates, angles.sin(), angles.cos()), 1)
 
-    def _head(self, hidden: Tensor, channels: slice) -> Tensor:
-        # Whitening is folded into the layer: scaling its few weights is cheaper than scaling a feature map.
+    def _head(self, channels: slice) -> tuple[Float[Tensor, "out hidden"], Float[Tensor, " out"]]:
+        """Weight and bias of the last layer for some of its outputs, with whitening folded in: scaling its
+        few weights costs less than scaling a feature map."""
         std = self.output_std[channels]
         weight = self.output.weight[channels] * std[:, None]
-        return F.linear(hidden, weight, self.output.bias[channels] * std + self.output_mean[channels])
+        return weight, self.output.bias[channels] * std + self.output_mean[channels]
 
 
 def _hidden_layers(inputs: int, settings: FieldSettings, generator: torch.Generator | None) -> nn.Sequential:
@@ -360,7 +331,7 @@ def _hidden_layers(inputs: int, settings: FieldSettings, generator: torch.Genera
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
-    """A linear layer with torch's customary initial range, drawn from the given generator."""
+    """A linear layer with torch's default initial range, sampled from the given generator."""
     layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
     for parameter in layer.parameters():
         nn.init.uniform_(parameter, -(inputs**-0.5), inputs**-0.5, generator=generator)

@@ -1,4 +1,4 @@
-"""What a trained demo sees, in one picture: photos, renderings, codes, and where it finds each word."""
+"""Overview picture of a trained demo: photos, renderings, codes, and heat maps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLUMNS = 4
 
 @dataclass
 class PictureRow:
-    """One held-out photo and what the scene makes of it; colours in 0…1."""
+    """One held-out photo and its renderings; colours in 0…1."""
 
     name: str
     photo: Float[Array, "h w 3"]
@@ -29,7 +29,7 @@ class PictureRow:
 
 
 def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
-    """The rows that show most: taken one by one, each for the prompts that the ones before lack."""
+    """The rows that show the most, chosen greedily by the prompts not yet covered."""
     chosen: list[PictureRow] = []
     shown: set[str] = set()
     while len(chosen) < min(count, len(rows)):
@@ -41,7 +41,7 @@ def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
 
 
 def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
-    """Write a PNG: per photo the photo, its rendering, the codes as colour, and a heat map per prompt with
+    """Write a PNG with a row per photo: photo, rendering, codes as colour, and a heat map per prompt with
     the ground truth outlined in white."""
     import matplotlib
 

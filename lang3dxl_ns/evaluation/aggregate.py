@@ -1,4 +1,4 @@
-"""From the figures of photos to those of a scene, and from scenes to those of a benchmark."""
+"""Aggregation of scores: photos to scene, scenes to benchmark."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 
 from lang3dxl_ns.evaluation.average_precision import deviation_over_photos, mean_over_photos
 
-PREFIXES = ("", "raw_", "authors_", "teacher_")
-"""Whose maps: the field's, before the blur, processed as published, and the 2D teacher's."""
+PREFIXES = ("", "raw_", "authors_", "teacher_", "limit_", "chance_")
+"""Which maps: the field's, unblurred, processed as published, the 2D teacher's, the lifted labels', and maps
+without information."""
 TOTALS = {
     "located": "localisation_accuracy",
     "iou": "miou",
@@ -21,15 +22,15 @@ TOTALS = {
 }
 """Measures whose total is the mean over all pairs of a photo and a category, as for LERF-OVS."""
 Figures = Mapping[str, float]
-"""Of one photo: psnr …, and `{prefix}{measure}_{category}`."""
+"""Of one photo: psnr etc., and `{prefix}{measure}_{category}`."""
 
 
 def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str, Any]:
     """Means over photos of every figure, and totals.
 
-    `{prefix}map`: unweighted mean over the categories of average precision. `{prefix}miou`,
-    `{prefix}localisation_accuracy` …: means over all pairs of a photo and a category. `ap_{category}_photos`:
-    how many photos that category has. with_deviation: `…_std` of every mean.
+    `{prefix}map`: unweighted mean of average precision over the categories. `{prefix}miou`,
+    `{prefix}localisation_accuracy` etc.: means over all pairs of a photo and a category.
+    `ap_{category}_photos`: number of photos with that category. with_deviation: adds `…_std` of every mean.
     """
     means: dict[str, Any] = mean_over_photos(photos)
     counts = {
@@ -59,18 +60,18 @@ def _totals(photos: Sequence[Figures], means: Figures) -> dict[str, float]:
 
 
 def mean_average_precision(means: Figures, prefix: str = "") -> float | None:
-    """Unweighted mean of the categories' APs in `means`, each a mean over photos; None without any."""
+    """Unweighted mean of the categories' APs in `means`, each a mean over photos; None if there are none."""
     found = [value for name, value in means.items() if name.startswith(f"{prefix}ap_")]
     return float(np.mean(found)) if found else None
 
 
 def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
-    """Several scenes together, in both ways of reading a benchmark's table.
+    """Figures of several scenes together, by the two ways of reading a benchmark's table.
 
-    `image_pooled`: `average` of the photos of all scenes, so that a scene counts as often as it has photos
-    (which fits the published tables of HolyScenes). `scene_mean`: each scene's mean first, then their mean,
-    so that all scenes that have a category count alike; its `map` is the mean of those over categories.
-    `per_scene`: means and totals of each scene.
+    `image_pooled`: `average` over the photos of all scenes, so that each photo counts alike (which fits the
+    published tables of HolyScenes). `scene_mean`: mean over scenes of each scene's mean, so that each scene
+    with a category counts alike; its `map` is the mean of those over categories. `per_scene`: means and
+    totals of each scene.
     """
     per_scene = {name: average(photos) for name, photos in scenes.items()}
     means = mean_over_photos(

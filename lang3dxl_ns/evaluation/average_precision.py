@@ -1,4 +1,4 @@
-"""Average precision of score maps, and its mean over photos and categories."""
+"""Average precision of score maps, with mean and deviation over photos."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy import ndarray as Array
 
 
 def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"]) -> float | None:
-    """AP = Σ (R_n − R_{n−1}) P_n over all pixels, as scikit-learn computes it; None without a positive.
+    """AP = Σ (R_n − R_{n−1}) P_n over all pixels, as in scikit-learn; None without a positive pixel.
 
-    Equal scores count as one step, so the order of the pixels has no say.
+    Equal scores form one step, so the order of pixels does not matter.
     Raises ValueError on NaN or on shapes that differ.
     """
     from sklearn.metrics import average_precision_score
@@ -25,13 +25,13 @@ def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"
 
 
 def mean_over_photos(photos: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Mean of every name over the photos that have it, names in order of appearance."""
+    """Mean of every figure over the photos that have it, in order of first appearance."""
     values = _by_name(photos)
     return {name: float(np.mean(found)) for name, found in values.items()}
 
 
 def deviation_over_photos(photos: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Standard deviation (of the sample) of every name over the photos that have it; 0 for a single one."""
+    """Sample standard deviation of every figure over the photos that have it; 0 for a single photo."""
     values = _by_name(photos)
     return {name: float(np.std(v, ddof=1)) if len(v) > 1 else 0.0 for name, v in values.items()}
 

@@ -1,12 +1,27 @@
-"""How well decoded features match their targets, and how well the mean feature would."""
+"""Feature metrics: L1, PSNR and cosine of decoded features against targets, beside the mean feature's."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig
+
+
+def match(
+    features: Float[Tensor, "h w c"],
+    target: Float[Tensor, "hd wd c"],
+    crop_sides: Sequence[float],
+    mask: Float[Tensor, "h w"] | None = None,
+) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
+    """Features averaged over the target's crops, and the weight of each cell: the downsampler's kernel
+    without its learned attenuation, the same for every way of training."""
+    kernel = AttenuatedDownsampler(DownsamplerConfig(hidden=0), features.shape[-1])
+    return kernel(features, (target.shape[0], target.shape[1]), crop_sides, mask)
 
 
 def feature_metrics(
@@ -18,8 +33,8 @@ def feature_metrics(
 ) -> dict[str, float]:
     """L1, PSNR (peak 1) and cosine of `predicted`, each beside that of predicting the `mean` everywhere.
 
-    On the raw scale of the encoder, as the encoder ablation of Lang3D-XL does. Cells without any weight
-    (no foreground) do not count. Keys: `{kind}_l1`, `{kind}_psnr`, `{kind}_cosine`, and the same with
+    On the encoder's own scale, as in Lang3D-XL's encoder ablation. Cells of zero weight (no foreground) are
+    ignored. Keys: `{kind}_l1`, `{kind}_psnr`, `{kind}_cosine`, and the same with
     `_of_mean` appended.
     """
     cells = target.new_ones(target.shape[:2], dtype=torch.bool) if weight is None else weight > 0

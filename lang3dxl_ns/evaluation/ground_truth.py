@@ -1,4 +1,4 @@
-"""A scene's ground truth, in whichever of the known layouts it comes."""
+"""Ground truth of a scene, in any of the supported layouts (HolyScenes, LERF-OVS, plain masks)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 from jaxtyping import Bool
 from numpy import ndarray as Array
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth
 from lang3dxl_ns.evaluation.holyscenes import is_holyscenes, read_holyscenes
 from lang3dxl_ns.evaluation.lerf_ovs import is_lerf_ovs, read_lerf_ovs
@@ -24,12 +24,12 @@ _READERS: dict[str, Callable[[Path], Annotations]] = {
 
 
 class GroundTruth:
-    """What a scene's photos show, by category.
+    """Labels of a scene's photos, by category.
 
     Args:
-        folder: of one scene: <category>/NNNN-gt.jpg ("holyscenes"), <photo>.json ("lerf_ovs", as PT-OVS has
-            it too), or <prompt>/<photo>.png ("plain").
-        layout: which of them; "auto" looks.
+        folder: of one scene: <category>/NNNN-gt.jpg ("holyscenes"), <photo>.json ("lerf_ovs", also used by
+            PT-OVS), or <prompt>/<photo>.png ("plain").
+        layout: one of these; "auto" detects it.
 
     Raises UserError for a folder that is missing or holds something else.
     """
@@ -37,27 +37,27 @@ class GroundTruth:
     def __init__(self, folder: Path, layout: Layout | Literal["auto"] = "auto") -> None:
         self.folder = Path(folder).expanduser()
         if not self.folder.is_dir():
-            raise UserError(f"{self.folder} is no folder: pass the one that holds the ground truth")
+            raise UserError(f"{self.folder} is not a folder: pass the one that holds the ground truth")
         self.layout: Layout = _layout(self.folder) if layout == "auto" else layout
         self._annotations = _READERS[self.layout](self.folder)
         self._labelled = {photo for photos in self._annotations.values() for photo in photos}
 
     @property
     def categories(self) -> list[str]:
-        """Names of the categories, which are the prompts, sorted."""
+        """Category names, which are also the prompts, sorted."""
         return list(self._annotations)
 
     @property
     def labelled(self) -> list[str]:
-        """All photos that have a label, sorted, as the labels name them: without suffix."""
+        """All labelled photos, sorted, as named by the labels: without suffix."""
         return sorted(self._labelled)
 
     def photos(self, category: str) -> list[str]:
-        """The photos that have a label of the category, as the labels name them."""
+        """The photos with a label of the category, as named by the labels."""
         return list(self._annotations[category])
 
     def key(self, photo: str) -> str | None:
-        """What the labels call a photo of this name (which may contain folders); None for one without."""
+        """The labels' name for a photo (whose name may contain folders); None if it has no label."""
         path = PurePosixPath(photo)
         names = (path.with_suffix("").as_posix(), path.as_posix(), path.stem, path.name)
         return next((name for name in names if name in self._labelled), None)
@@ -67,15 +67,15 @@ class GroundTruth:
         return next(iter(self._of(photo).values())).size()
 
     def scoring_size(self, height: int, width: int) -> tuple[int, int]:
-        """Size at which maps of a photo are scored: half the photo's for masks, as in Lang3D-XL; the photo's
-        own for LERF-OVS, whose filters are in its pixels."""
+        """Height and width at which maps of a photo are scored: half the photo's for masks, as in Lang3D-XL;
+        the photo's own for LERF-OVS, whose filter sizes are in its pixels."""
         return (height, width) if self.layout == "lerf_ovs" else scoring_size(height, width)
 
     def truths(self, photo: str, size: tuple[int, int]) -> dict[str, Truth]:
         """The photo's labels by category, at `size` (height, width).
 
-        A category without a label of this photo is left out: it wasn't annotated. Raises UserError for an
-        unreadable label, and for one of another shape than `size`.
+        A category without a label in this photo is left out: it wasn't annotated. Raises UserError for an
+        unreadable label, and for one with another aspect ratio than `size`.
         """
         return {category: label.truth(size) for category, label in self._of(photo).items()}
 
@@ -95,18 +95,18 @@ def _layout(folder: Path) -> Layout:
     if is_lerf_ovs(folder):
         found.append("lerf_ovs")
     if len(found) > 1:
-        raise UserError(f"{folder} holds masks NNNN-gt.jpg and labels <photo>.json: name one of them")
+        raise UserError(f"{folder} holds masks NNNN-gt.jpg and labels <photo>.json: name the layout to read")
     if found:
         return found[0]
-    # What fits no layout is told as a mistake in the most common one.
+    # A folder that fits no layout gets the error message of the most common one.
     if any(folder.glob("*/*/*-gt.*")):
         return "holyscenes"
     return "lerf_ovs" if any(folder.glob("*/*.json")) else "plain"
 
 
 def find_ground_truth(data: Path) -> Path | None:
-    """Ground truth that lies with a scene: ground_truth/ or label/ in its folder, or label/<scene> beside it
-    (as LERF-OVS and PT-OVS are published)."""
+    """The ground truth beside a scene's data: ground_truth/ or label/ in its folder, or label/<scene> next to
+    it (as LERF-OVS and PT-OVS are published)."""
     if (data / "ground_truth").is_dir():
         return data / "ground_truth"
     labels = (data / "label", data / "label" / data.name, data.parent / "label" / data.name)
@@ -114,15 +114,14 @@ def find_ground_truth(data: Path) -> Path | None:
 
 
 def scoring_size(height: int, width: int) -> tuple[int, int]:
-    """Half a photo's size, at which Lang3D-XL scores."""
+    """Half a photo's size, as in Lang3D-XL."""
     return max(height // 2, 1), max(width // 2, 1)
 
 
 def held_out_photos(truth: GroundTruth, per_category: int = 5) -> list[str]:
-    """Labelled photos to hold out of training, sorted: up to `per_category` with something to find in each
-    category, those first that another category has chosen already (Lang3D-XL's rule; its own list is not
-    published). The rest are spread evenly over the category's photos, so the same labels always give the
-    same list."""
+    """Labelled photos to hold out of training, sorted: up to `per_category` that show each category,
+    preferring those already chosen for another (Lang3D-XL's rule; its own list is not published). The rest
+    are spread evenly over the category's photos, so the same labels always give the same list."""
     chosen: set[str] = set()
     for category in sorted(truth.categories):
         photos = [p for p in sorted(truth.photos(category)) if _shows(truth, p, category)]

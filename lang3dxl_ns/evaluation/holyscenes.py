@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.annotations import (
     Annotation,
     Annotations,
@@ -15,12 +15,12 @@ from lang3dxl_ns.evaluation.annotations import (
 )
 
 MASK, PHOTO = "-gt", "-img"
-"""Ends of the stems of a mask and of the copy of its photo."""
+"""Suffixes of the file stems of a mask and of the copy of its photo."""
 EXPECTED = "NNNN-gt.jpg (object black on white) in a folder per category, for the photo NNNN.jpg"
 
 
 def is_holyscenes(folder: Path) -> bool:
-    """Whether the folder is a scene's."""
+    """Whether the folder is a scene in this layout."""
     return any(path.stem.endswith(MASK) for path in folder.glob("*/*"))
 
 
@@ -32,7 +32,7 @@ def read_holyscenes(folder: Path) -> Annotations:
     if not is_holyscenes(folder):
         deeper = next(folder.glob(f"**/*{MASK}.*"), None)
         hint = f"; there are masks in {deeper.parent}: pass the folder above that" if deeper else ""
-        raise UserError(f"{folder} holds no ground truth of HolyScenes, {EXPECTED}{hint}")
+        raise UserError(f"{folder} holds no HolyScenes ground truth, {EXPECTED}{hint}")
     found: dict[str, dict[str, Annotation]] = {}
     for category in category_folders(folder):
         masks: dict[str, Annotation] = {}

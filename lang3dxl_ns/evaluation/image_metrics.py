@@ -1,4 +1,4 @@
-"""How close a rendered photo is to the real one."""
+"""Image metrics: PSNR and LPIPS of a rendered photo."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) ->
 
 
 class Lpips:
-    """LPIPS (AlexNet), made at its first use; left out where its weights cannot be had, as offline.
+    """LPIPS (AlexNet), loaded at first use; skipped if its weights are unavailable, as offline.
 
-    Not a module, so that AlexNet stays out of checkpoints.
+    Not an nn.Module, so that AlexNet stays out of checkpoints.
     """
 
     def __init__(self) -> None:
@@ -25,14 +25,14 @@ class Lpips:
         self._available = True
 
     def __call__(self, target: Float[Tensor, "1 3 h w"], predicted: Float[Tensor, "1 3 h w"]) -> float | None:
-        """The distance of two images in [0, 1], or None without weights."""
+        """Distance of two images in [0, 1]; None without weights."""
         if self._metric is None and self._available:
             from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
             try:
                 self._metric = LearnedPerceptualImagePatchSimilarity(normalize=True)
             except (OSError, RuntimeError) as error:  # no Internet; a damaged or intercepted download
-                get_console().log(f"LPIPS is left out: its weights cannot be loaded ({error})")
+                get_console().log(f"LPIPS is skipped: its weights cannot be loaded ({error})")
                 self._available = False
         if self._metric is None:
             return None

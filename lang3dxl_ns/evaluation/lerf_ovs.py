@@ -1,4 +1,4 @@
-"""Labels as LangSplat made them for LERF's scenes (LERF-OVS), and others after it (PT-OVS): polygons in JSON.
+"""Ground truth in the layout of LERF-OVS (LangSplat's labels of LERF's scenes) and PT-OVS: polygons in JSON.
 
 One file per photo, `label/<scene>/<photo>.json`:
 `{"info": {"name", "width", "height"}, "objects": [{"category", "bbox": [left, top, right, bottom],
@@ -16,19 +16,19 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth, check_shape
 
 _MOST_BYTES = 64 * 2**20
 _MOST_PIXELS = 200_000_000
 _SLACK = 0.02
-"""Share of a side by which hand-drawn outlines may run over the photo's edge; they are cut there."""
+"""Share of a side by which hand-drawn outlines may exceed the photo; they are clipped to it."""
 _Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Outlines:
-    """The objects of one category in one photo: their union is the mask, every box stays one."""
+    """The objects of one category in one photo: the mask is their union, the boxes stay separate."""
 
     path: Path
     height: int
@@ -38,11 +38,11 @@ class Outlines:
     boxes: tuple[tuple[float, float, float, float], ...]
 
     def size(self) -> tuple[int, int]:
-        """Height and width of the photo that was labelled, in pixels."""
+        """Height and width of the labelled photo, in pixels."""
         return self.height, self.width
 
     def truth(self, size: tuple[int, int]) -> Truth:
-        """Polygons filled at the labelled size, then resized and split at half; boxes scaled along."""
+        """Polygons filled at the labelled size, then resized and thresholded at half; boxes scaled."""
         check_shape(self.path, self.size(), size)
         image = Image.new("L", (self.width, self.height))
         draw = ImageDraw.Draw(image)
@@ -59,7 +59,7 @@ def is_lerf_ovs(folder: Path) -> bool:
 
 
 def read_lerf_ovs(folder: Path) -> Annotations:
-    """Labels of a scene, `folder`/<photo>.json. Raises UserError, with the file, for whatever is wrong."""
+    """Labels of a scene, `folder`/<photo>.json. Raises UserError naming the file for anything invalid."""
     paths = sorted(folder.glob("*.json"))
     if not paths:
         deeper = next(folder.glob("**/*.json"), None)
@@ -70,12 +70,12 @@ def read_lerf_ovs(folder: Path) -> Annotations:
         for category, outlines in _read_labels(path).items():
             found.setdefault(category, {})[path.stem] = outlines
     if not found:
-        raise UserError(f"the labels in {folder} name no object at all: there is nothing to look for")
+        raise UserError(f"the labels in {folder} contain no objects: there is nothing to score")
     return dict(sorted(found.items()))
 
 
 def _read_labels(path: Path) -> dict[str, Outlines]:
-    """A photo's labels by category. They may come from strangers: nothing in them is trusted."""
+    """A photo's labels by category. Label files come from others, so everything is validated."""
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError(f"it is larger than {_MOST_BYTES >> 20} MiB")
@@ -89,7 +89,7 @@ def _read_labels(path: Path) -> dict[str, Outlines]:
     except KeyError as error:
         raise UserError(f"labels {path} have no {error}: replace or remove the file") from error
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise UserError(f"labels {path} can't be used ({error}): mend or remove the file") from error
+        raise UserError(f"labels {path} can't be used ({error}): fix or remove the file") from error
     by_category: dict[str, Outlines] = {}
     for category, polygon, box in objects:
         known = by_category.get(category, Outlines(path, height, width, (), ()))
@@ -103,10 +103,10 @@ def _read_object(item: Any, height: int, width: int) -> tuple[str, tuple[_Point,
     _check_name(category)
     polygon = tuple((_number(x), _number(y)) for x, y in item["segmentation"])
     if len(polygon) < 3:
-        raise ValueError(f"an outline of {category!r} has {len(polygon)} points, and takes three")
+        raise ValueError(f"an outline of {category!r} has {len(polygon)} points, but needs three")
     left, top, right, bottom = box = tuple(_number(value) for value in item["bbox"])
     if not (left < right and top < bottom):
-        raise ValueError(f"a box of {category!r}, {list(box)}, is not left, top, right, bottom")
+        raise ValueError(f"a box of {category!r}, {list(box)}, is not [left, top, right, bottom]")
     for x, y in (*polygon, (left, top), (right, bottom)):
         if not (_within(x, width) and _within(y, height)):
             raise ValueError(
@@ -116,9 +116,9 @@ def _read_object(item: Any, height: int, width: int) -> tuple[str, tuple[_Point,
 
 
 def _check_name(name: Any) -> None:
-    """Names become parts of paths: none may lead out of its folder."""
+    """Names become parts of paths, so none may lead out of its folder."""
     if not isinstance(name, str) or name in ("", ".", "..") or any(c in name for c in "/\\\0"):
-        raise ValueError(f"{name!r} is no plain name")
+        raise ValueError(f"{name!r} is not a plain name")
 
 
 def _side(value: Any) -> int:
@@ -129,7 +129,7 @@ def _side(value: Any) -> int:
 
 def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{value!r} is no coordinate")
+        raise ValueError(f"{value!r} is not a coordinate")
     return float(value)
 
 

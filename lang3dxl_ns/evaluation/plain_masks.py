@@ -1,10 +1,10 @@
-"""Ground truth that anyone can make: a folder per prompt, in it a mask per photo."""
+"""Ground truth as plain masks: a folder per prompt, with a mask per photo."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.annotations import (
     Annotation,
     Annotations,
@@ -15,7 +15,7 @@ from lang3dxl_ns.evaluation.annotations import (
 )
 
 PHOTOS = "images"
-"""A folder of this name may hold the photos; it is no category."""
+"""A folder of this name may hold the photos; it is not a category."""
 
 
 def read_plain(folder: Path) -> Annotations:

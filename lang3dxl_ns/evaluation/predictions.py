@@ -1,4 +1,4 @@
-"""Maps that anyone made, scored by the code that scores runs."""
+"""Scoring of relevancy maps made by any program, with the code that scores runs."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import slugs
+from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.evaluation.annotations import PICTURES, check_shape, read_grey
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.evaluation.report import progress_bar
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest_level
-from lang3dxl_ns.files import slugs
 from lang3dxl_ns.preparation.foreground import find_mask
 
 
 class PredictedMaps:
-    """A folder of maps, `<prompt>/<photo>.npy` (float, [h, w], or [levels, h, w] as LangSplat has them) or
-    a picture (black 0, white 1), of any size in proportion to the photo.
+    """A folder of maps, `<prompt>/<photo>.npy` (float, [h, w], or LangSplat's [levels, h, w]) or pictures
+    (black 0, white 1), of any size with the photo's aspect ratio.
 
     Prompts and photos are named as in the ground truth, or as `lang3dxl query` names its files.
     """
@@ -31,11 +31,11 @@ class PredictedMaps:
     def __init__(self, folder: Path, categories: Sequence[str]) -> None:
         self.folder = Path(folder).expanduser()
         if not self.folder.is_dir():
-            raise UserError(f"{self.folder} is no folder: pass the one that holds <prompt>/<photo>.npy")
+            raise UserError(f"{self.folder} is not a folder: pass the one that holds <prompt>/<photo>.npy")
         self._folders = {c: (c, slug) for c, slug in zip(categories, slugs(list(categories)), strict=True)}
 
     def read(self, category: str, photo: str, size: tuple[int, int]) -> Float[Tensor, "h w"]:
-        """A map at `size`. Raises UserError where it is missing, damaged or of another shape."""
+        """A map at `size`. Raises UserError if it is missing, damaged or has another aspect ratio."""
         path = self._find(category, photo)
         score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_grey(path, "map")) / 255
         if score.ndim == 3:
@@ -68,12 +68,12 @@ def _read_array(path: Path) -> Float[Array, "*levels h w"]:
         raise UserError(f"map {path} can't be read ({error}): write it with numpy.save") from error
     if not isinstance(score, np.ndarray) or score.ndim not in (2, 3) or 0 in score.shape:
         shape = getattr(score, "shape", "none")
-        raise UserError(f"map {path} has shape {shape}, and [h, w] or [levels, h, w] is expected")
+        raise UserError(f"map {path} has shape {shape}, not [h, w] or [levels, h, w]")
     if score.dtype.kind not in "fiub":
-        raise UserError(f"map {path} holds {score.dtype}: numbers are expected")
+        raise UserError(f"map {path} holds {score.dtype}, not numbers")
     score = score.astype(np.float64)
     if not np.isfinite(score).all():
-        raise UserError(f"map {path} holds NaN or infinity: mend what made it")
+        raise UserError(f"map {path} holds NaN or infinity: fix the program that made it")
     return score
 
 
@@ -84,10 +84,10 @@ def score_predictions(
     masks: Path | None = None,
     temperature: float = 1.0,
 ) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
-    """Figures of every labelled photo, by its name, and the protocol that they go by.
+    """Figures of every labelled photo, by name, and the scoring protocol.
 
-    photos: those to score, by the names of photos or labels; all that have a label without it. masks: folder
-    of foreground masks, white = keep; predictions are 0 elsewhere. temperature: that the maps were made with
+    photos: names of the photos (or labels) to score; by default all with a label. masks: folder of foreground
+    masks, white = keep; predictions become 0 elsewhere. temperature: the one the maps were made with
     (see `MapScorer.variants`). Raises UserError for a missing map.
     """
     scorer, predicted = MapScorer(truth), PredictedMaps(maps, truth.categories)
@@ -105,7 +105,7 @@ def score_predictions(
     masked = sum(keep is not None for keep in keeps.values())
     statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"
     protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(
-        statement if masked else "none but what the maps have"
+        statement if masked else "none beyond those in the maps"
     )
     return figures, protocol
 

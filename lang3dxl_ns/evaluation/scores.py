@@ -1,4 +1,4 @@
-"""How well a map of relevancy finds an object: a photo and a category at a time."""
+"""Scores of relevancy maps against masks and boxes: AP, IoU, F1, localisation, LangSplat's measures."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from lang3dxl_ns.evaluation.average_precision import average_precision
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
 Maps = dict[str, Float[Tensor, "h w"]]
-"""Relevancy by category, 0…1, above 0.5 where it is found."""
+"""Relevancy by category, 0…1, above 0.5 where found."""
 BLUR = 2.5
-"""Pixels at half the photo's size, by which the publication blurs relevancy maps."""
+"""Blur of relevancy maps in Lang3D-XL: pixels at half the photo's size."""
 THRESHOLD = 0.5
-"""Relevancy above which a pixel is found."""
+"""Relevancy above which a pixel counts as found."""
 SMOOTHING = 30
-"""Pixels, the side of LangSplat's mean filter."""
+"""Side of LangSplat's mean filter, pixels."""
 SMOOTH_THRESHOLD = 0.4
-"""Of LangSplat's masks; the same for all photos."""
+"""Threshold of LangSplat's masks, the same for all photos."""
 _VOTERS = 7
 
 
@@ -34,12 +34,11 @@ _VOTERS = 7
 
 
 def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) -> dict[str, float]:
-    """Every measure of a map; none of an object that isn't in the photo, which average precision has no
-    value for.
+    """All measures of a map; empty if the object isn't in the photo, where average precision is undefined.
 
-    `ap`: average precision. `iou`, `f1`, `balanced_accuracy`: of the pixels above 0.5. `located`: 1 where
-    the highest pixel lies in a box, or on the mask where there are no boxes, else 0 (LERF's accuracy).
-    smooth: `smooth_located` and `smooth_iou` too, LangSplat's measures.
+    `ap`: average precision. `iou`, `f1`, `balanced_accuracy`: of the pixels above 0.5. `located`: 1 if
+    the highest pixel lies in a box, or on the mask if there are no boxes, else 0 (LERF's accuracy).
+    smooth: adds `smooth_located` and `smooth_iou`, LangSplat's measures.
     """
     precision = average_precision(score, truth.mask)
     if precision is None:
@@ -53,8 +52,8 @@ def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) ->
 
 
 def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, float]:
-    """Intersection over union, F1 and balanced accuracy of a mask. The truth has a positive; the balanced
-    accuracy of one without a negative is the share that was found."""
+    """Intersection over union, F1 and balanced accuracy of a mask. The truth must have a positive; if it has
+    no negative, balanced accuracy is the share found."""
     both, missed = np.count_nonzero(found & truth), np.count_nonzero(truth & ~found)
     extra = np.count_nonzero(found & ~truth)
     negatives = truth.size - both - missed
@@ -67,7 +66,7 @@ def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, f
 
 
 def located(score: Float[Array, "h w"], truth: Truth) -> float:
-    """1 where any of the highest pixels lies on the object, else 0. A map without a peak locates nothing."""
+    """1 if any of the highest pixels lies on the object, else 0. A constant map locates nothing."""
     highest = score == score.max()
     if highest.all():
         return 0.0
@@ -79,8 +78,8 @@ def located(score: Float[Array, "h w"], truth: Truth) -> float:
 
 
 def smooth_mask(score: Float[Array, "h w"], mean: Float[Array, "h w"]) -> Bool[Array, "h w"]:
-    """LangSplat's mask: half the map and half its mean, stretched to −1…1, above 0.4 by majority of the
-    neighbours (Qin et al. 2024). The threshold is the same everywhere: none is chosen by the truth."""
+    """LangSplat's mask: the mean of the map and its mean-filtered copy, stretched to −1…1, above 0.4 by
+    majority of the neighbours (Qin et al. 2024). The threshold is fixed, not chosen by the truth."""
     mixed = (score + mean) / 2
     lowest, highest = mixed.min(), mixed.max()
     stretched = 2 * (mixed - lowest) / max(highest - lowest, 1e-9) - 1
@@ -89,7 +88,7 @@ def smooth_mask(score: Float[Array, "h w"], mean: Float[Array, "h w"]) -> Bool[A
 
 
 def strongest_level(levels: Float[Array, "l h w"]) -> Float[Array, "h w"]:
-    """Of the maps of several levels (LangSplat has three), the one with the highest peak once smoothed."""
+    """Of maps at several levels (LangSplat has three), the one with the highest smoothed peak."""
     peaks = [uniform_filter(level.astype(np.float64), SMOOTHING, mode="mirror").max() for level in levels]
     return levels[int(np.argmax(peaks))]
 
@@ -98,7 +97,7 @@ def strongest_level(levels: Float[Array, "l h w"]) -> Float[Array, "h w"]:
 
 
 def resize_map(image: Float[Tensor, "n H W"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
-    """Maps or feature channels at another size (height, width), bilinear."""
+    """Maps or feature channels resized to (height, width), bilinear."""
     if tuple(image.shape[-2:]) == size:
         return image
     return F.interpolate(image[None].float(), size, mode="bilinear", align_corners=False)[0]
@@ -110,13 +109,18 @@ def map_size(maps: Maps) -> tuple[int, int]:
     return height, width
 
 
+def resized(maps: Maps, size: tuple[int, int]) -> Maps:
+    """Every map resized to (height, width)."""
+    return {name: resize_map(scores[None], size)[0] for name, scores in maps.items()}
+
+
 def blurred(maps: Maps, sigma: float = BLUR) -> Maps:
-    """Every map under a Gaussian of `sigma` pixels."""
+    """Every map blurred by a Gaussian of `sigma` pixels."""
     return _each(maps, lambda score: gaussian_filter(score, sigma))
 
 
 def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
-    """Every map, 0 outside the foreground `keep`, where there is one."""
+    """Every map, set to 0 outside the foreground `keep` if given."""
     if keep is None:
         return maps
     there = resize_map(keep[None].float(), map_size(maps))[0] >= 0.5
@@ -124,8 +128,8 @@ def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
 
 
 def as_published(maps: Maps) -> Maps:
-    """Every (masked) map as Lang3D-XL makes its predictions: 0 where it is at most 0.5, the rest stretched
-    to 0…1 by the photo's largest, then blurred. All that is rejected is tied, but for what the blur adds."""
+    """Lang3D-XL's processing of every (masked) map: 0 up to 0.5, the rest stretched to 0…1 by the photo's
+    maximum, then blurred. All rejected pixels tie, but for the blur."""
 
     def process(score: Float[Array, "h w"]) -> Float[Array, "h w"]:
         floor = max(float(score.min()), THRESHOLD)
@@ -136,7 +140,7 @@ def as_published(maps: Maps) -> Maps:
 
 
 def softened(maps: Maps, temperature: float) -> Maps:
-    """Relevancy of this temperature as it would be at temperature 1, which the publication uses."""
+    """Relevancy maps of this temperature converted to temperature 1, which the publication uses."""
     if temperature == 1:
         return maps
     return {
@@ -158,7 +162,7 @@ def score_maps(
     prefix: str = "",
     smooth: bool = False,
 ) -> dict[str, float]:
-    """`{prefix}{measure}_{category}` of every category that has a truth and is in the photo."""
+    """`{prefix}{measure}_{category}` for every category that has a truth and is in the photo."""
     scores = {}
     for category, truth in truths.items():
         for measure, value in score_map(maps[category].detach().cpu().numpy(), truth, smooth).items():
@@ -166,22 +170,38 @@ def score_maps(
     return scores
 
 
+def bounds(labels: Maps, truths: Mapping[str, Truth]) -> dict[str, float]:
+    """Average precision by chance and at best, for every category in the photo.
+
+    `chance_ap_{category}`: of a map without information, the share of positives.
+    `limit_ap_{category}`: of `labels`, the exact labels after lifting and rendering (plugin/label_limit.py).
+    """
+    found: dict[str, float] = {}
+    for category, truth in truths.items():
+        if truth.mask.any():
+            found[f"chance_ap_{category}"] = float(truth.mask.mean())
+            best = average_precision(labels[category].cpu().numpy(), truth.mask)
+            assert best is not None  # it has a positive
+            found[f"limit_ap_{category}"] = best
+    return found
+
+
 class MapScorer:
-    """Scores maps against a scene's ground truth: the one way for runs and for anyone's predictions."""
+    """Scores maps against a scene's ground truth, for runs and for predictions of other programs alike."""
 
     def __init__(self, truth: GroundTruth) -> None:
         self.truth = truth
         self.without: dict[str, set[str]] = {}
-        """By category, the scored photos that have a label of it but nothing to find; they are left out."""
+        """By category, the photos left out because their label of it is empty."""
         self._scored: set[str] = set()
 
     def variants(
         self, maps: Maps, keep: Bool[Tensor, "H W"] | None = None, temperature: float = 1.0
     ) -> dict[str, Maps]:
-        """What is scored of a photo's maps, by the prefix of its figures.
+        """The maps to score, by the prefix of their figures.
 
-        For masks: "" blurred, "raw_" as they are, "authors_" `as_published`. For LERF-OVS, whose measures
-        smooth by themselves: "" as they are. keep: 0 outside, before and after the blur.
+        For masks: "" blurred, "raw_" unprocessed, "authors_" `as_published`. For LERF-OVS, whose measures
+        include smoothing: "" unprocessed. keep: maps are 0 outside, before and after the blur.
         """
         raw = inside(maps, keep)
         if self.truth.layout == "lerf_ovs":
@@ -192,9 +212,9 @@ class MapScorer:
     def scores(
         self, photo: str, maps: Maps, prefix: str = "", truths: Mapping[str, Truth] | None = None
     ) -> dict[str, float]:
-        """`{prefix}{measure}_{category}` of every category that the photo shows and has a label of.
+        """`{prefix}{measure}_{category}` for every labelled category that the photo shows.
 
-        truths: the photo's labels at the size of the maps, where they aren't as the files have them.
+        truths: the photo's labels at the size of the maps; by default as the files have them.
         """
         if truths is None:
             truths = self.truth.truths(photo, map_size(maps))
@@ -206,7 +226,7 @@ class MapScorer:
         return score_maps(maps, truths, prefix, smooth=self.truth.layout == "lerf_ovs")
 
     def protocol(self, mask: str) -> dict[str, Any]:
-        """What the figures mean, for a report. mask: what was done about the foreground."""
+        """What the figures mean, for a report. mask: how the foreground was treated."""
         truth = self.truth
         size = "the labels'" if truth.layout == "lerf_ovs" else "half the photo's"
         return {

@@ -1,44 +1,45 @@
-"""From a photo collection to its targets: choose the crop sizes, say why, and prepare."""
+"""Preparation of a photo collection: choose crop sizes, log the reasons, make the targets."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.preparation.photo import Photo
+from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.physical_scale import (
-    Reconstruction,
     ScaleRange,
     physical_scales,
     pixel_sizes,
     propose_scale_range,
     relative_scales,
 )
-from lang3dxl_ns.preparation.prepare import PreparationConfig, PreparedTargets, prepare
-from lang3dxl_ns.preparation.progress import some
+from lang3dxl_ns.preparation.prepare import PreparedTargets, prepare
 from lang3dxl_ns.preparation.regions import RegionSource
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.presets import load_preset
+from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.photo import Photo
 
 SCALE_RATIO = 1.6
-"""Ratio of the physical pixel sizes of far and near photos up to which one pyramid of fixed size serves: each
-photo then lies within half a level (levels are √2 apart) of the middle one."""
+"""Ratio of the physical pixel sizes of far and near photos up to which one pyramid of fixed size suffices:
+each photo is then within half a level (levels are √2 apart) of the middle one."""
 
 
 @dataclass(frozen=True)
 class CropPlan:
-    """Which crops the photos are to have, and why."""
+    """Crop sizes of the photos, with reasons."""
 
     scales: list[float]
     """Sides, ascending: world units, or fractions of a photo's width."""
     pixel_sizes: dict[str, float] | None
-    """World units per pixel of each photo as it is read; None where the scales are fractions."""
+    """World units per pixel of each photo as it is read; None if the scales are fractions."""
     spread: float | None
     """Ratio of the photos' pixel sizes, 95th over 5th percentile; None without 3D points."""
     reasons: list[str]
@@ -47,10 +48,10 @@ class CropPlan:
 def plan_crops(
     photos: Sequence[Photo], reconstruction: Reconstruction, config: PreparationConfig
 ) -> CropPlan:
-    """Choose crop sizes: the configured ones, else proposed from the scene.
+    """Choose crop sizes: the configured ones, or proposed from the scene.
 
-    Crops have one size in the world, unless the scene has no 3D points to measure with, or its photos agree
-    in scale so well (`SCALE_RATIO`) that under "auto" one size in the photo does the same.
+    Crops have one size in the world, unless the scene has no 3D points to measure with, or its photos are so
+    similar in scale (`SCALE_RATIO`) that under "auto" one size in the photo is equivalent.
     """
     if config.scale_mode == "physical" and not len(reconstruction.points):
         raise UserError(
@@ -62,7 +63,7 @@ def plan_crops(
         scales = _resampled(scales, config)
         reasons = [f"crops of {_listed(scales)} of the photo's width"]
         if config.scale_mode != "relative":
-            reasons.insert(0, "the scene has no 3D points: crops have no size in the world")
+            reasons.insert(0, "the scene has no 3D points: crop sizes are relative to the photo")
         return CropPlan(scales, None, None, reasons)
     sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
     chosen = _scale_range(config, reconstruction, sizes)
@@ -95,12 +96,16 @@ def prepare_collection(
     device: torch.device | str,
     log: Callable[[str], None] = print,
     regions: RegionSource | None = None,
+    fine: Collection[str] = (),
 ) -> PreparedTargets:
-    """Make the missing targets of the photos in `cache_dir`; the log says which crops, and why."""
+    """Make the missing targets of the photos in `cache_dir`; the log says which crops, and why. fine: see
+    `prepare`."""
     plan = plan_crops(photos, reconstruction, config)
     for reason in plan.reasons:
         log(reason)
-    return prepare(photos, plan.pixel_sizes, config, plan.scales, FeatureStore(cache_dir), device, regions)
+    return prepare(
+        photos, plan.pixel_sizes, config, plan.scales, FeatureStore(cache_dir), device, regions, fine
+    )
 
 
 def _scale_range(
@@ -118,16 +123,16 @@ def _scale_range(
         raise UserError(
             f"the scale range {smallest} {largest} is not a range: give the smallest crop first, both above 0"
         )
-    return ScaleRange(smallest, largest, f"crops of {smallest:.3g}–{largest:.3g} world units, as asked")
+    return ScaleRange(smallest, largest, f"crops of {smallest:.3g}–{largest:.3g} world units, as configured")
 
 
 def _resampled(scales: list[float], config: PreparationConfig) -> list[float]:
-    """As many sizes as are asked for, evenly over the same range (by ratio); the middle, of one."""
+    """The configured number of sizes, evenly spaced over the same range (by ratio); if one, the middle."""
     if config.scales is None:
         return scales
     if config.scales < 1:
         raise UserError(
-            f"crops of {config.scales} sizes are none: pass --pipeline.datamanager.scales 1 or more"
+            f"{config.scales} crop sizes are too few: pass --pipeline.datamanager.scales 1 or more"
         )
     if config.scales == 1:
         return [math.sqrt(scales[0] * scales[-1])]

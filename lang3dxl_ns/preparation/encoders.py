@@ -1,7 +1,7 @@
-"""The frozen networks that make the targets: CLIP for crops and texts, a vision transformer for dense maps.
+"""Frozen encoders that make the targets: CLIP for crops and texts, a vision transformer for dense maps.
 
-Models are read from a local folder or, by name, through the Hugging Face cache. Nothing runs code that comes
-with a model, and weights are read as plain tensors.
+Models are read from a local folder or, by name, through the Hugging Face cache. Code that comes with a model
+is never run, and weights are read as plain tensors.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections.abc import Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,13 +20,16 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 
 CLIP_OPTION = "--pipeline.datamanager.clip"
 DENSE_OPTION = "--pipeline.datamanager.dense"
 
 BUILTIN = "builtin"
 """Name of the small encoders that ship with this package."""
+_PREFIX = "--pipeline.datamanager."
+option_prefix: ContextVar[str] = ContextVar("option_prefix", default=_PREFIX)
+"""Prefix of the options in the current command: `lang3dxl prepare` has none."""
 _DEMO = Path(__file__).parents[1] / "demo"
 _BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
 _WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
@@ -34,21 +38,21 @@ _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """A model's folder on this disk and a fingerprint of what is in it."""
+    """A model's local folder and a fingerprint of its contents."""
 
     name: str
     folder: Path
     identity: str
-    """Of configuration and weights, not of the name: the same model in another folder keeps its targets."""
+    """Of configuration and weights, not of the name: targets stay valid if the model is moved."""
     option: str
     """The option that chose the model, for messages."""
 
 
 def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
-    """A model's files: a local folder, a Hugging Face name (downloaded once), or "builtin", which is the CLIP
-    or dense encoder that ships with this package, according to the option.
+    """A model's files: a local folder, a Hugging Face name (downloaded once), or "builtin", the CLIP
+    or dense encoder that ships with this package, depending on the option.
 
-    Raises UserError when there is no such folder, the model can't be downloaded, or files are missing.
+    Raises UserError if there is no such folder, the model can't be downloaded, or files are missing.
     """
     name = str(name_or_dir)
     local = Path(name).expanduser()
@@ -59,10 +63,42 @@ def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     return ModelFiles(name, folder, _fingerprint(folder, option), option)
 
 
-class ImageTextEncoder:
-    """CLIP: images and texts to one space. Embeddings are projected, float32 and *not* normalised.
+class _NotDownloaded(UserError):
+    """A model is neither on disk nor can it be downloaded."""
 
-    `dim` channels; `crop_size` pixels is the side that the vision tower takes; `identity` names the weights.
+
+def check_encoders(clip: str, dense: str) -> None:
+    """Find both encoders, downloading missing ones; "none" and "auto" are skipped. Raises a single UserError
+    that names all unavailable ones and the remedy."""
+    wanted = {CLIP_OPTION: clip, DENSE_OPTION: dense}
+    missing: dict[str, str] = {}
+    for option, name in wanted.items():
+        try:
+            if name not in ("none", "auto"):
+                find_model(name, option)
+        except _NotDownloaded:
+            missing[option] = name
+    if missing:
+        folders = {option: f"DIR/{name.split('/')[-1]}" for option, name in missing.items()}
+        fetch = "; ".join(f"hf download {missing[o]} --local-dir {folders[o]}" for o in missing)
+        use = " ".join(f"{spoken(option)} {folder}" for option, folder in folders.items())
+        raise UserError(
+            f"{' and '.join(missing.values())}: neither folders here nor in the Hugging Face cache, and "
+            f"the download fails. Either use the small encoders that come with this package: "
+            f"{spoken(CLIP_OPTION)} {BUILTIN}. Or, on a machine with Internet: {fetch}; copy DIR here, and "
+            f"use {use}"
+        )
+
+
+def spoken(option: str) -> str:
+    """An option as spelled in the current command."""
+    return option.replace(_PREFIX, option_prefix.get())
+
+
+class ImageTextEncoder:
+    """CLIP: images and texts in one space. Embeddings are projected, float32 and *not* normalised.
+
+    `dim`: channels; `crop_size`: side of the vision tower's input in pixels; `identity`: of the weights.
     """
 
     def __init__(
@@ -81,7 +117,7 @@ class ImageTextEncoder:
         self._mean, self._std = _channels(mean, self._device), _channels(std, self._device)
         self._context: int = model.config.text_config.max_position_embeddings
 
-    # no_grad, not inference_mode: an inference tensor can't meet autograd later, an embedding may
+    # no_grad, not inference_mode: embeddings may enter autograd later, inference tensors can't
     @torch.no_grad()
     def encode_images(self, crops: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n c"]:
         """Embeddings of square crops, RGB in 0…1, on the encoder's device; other sizes are resized first."""
@@ -92,7 +128,7 @@ class ImageTextEncoder:
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Float[Tensor, "n c"]:
-        """Embeddings of texts, on the encoder's device; words beyond the model's context are cut."""
+        """Embeddings of texts, on the encoder's device; truncated to the model's context."""
         tokens = self._tokenizer(
             texts, padding=True, truncation=True, max_length=self._context, return_tensors="pt"
         ).to(self._device)
@@ -115,7 +151,7 @@ class DenseEncoder:
             _channels(_IMAGENET_MEAN, self._device),
             _channels(_IMAGENET_STD, self._device),
         )
-        # a plain ViT refuses other image sizes unless asked; DINOv2 interpolates anyway, without the argument
+        # a plain ViT rejects other image sizes by default; DINOv2 always interpolates, without the argument
         interpolates = "interpolate_pos_encoding" in inspect.signature(model.forward).parameters
         self._arguments = {"interpolate_pos_encoding": True} if interpolates else {}
 
@@ -136,7 +172,7 @@ class DenseEncoder:
 def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str) -> ImageTextEncoder:
     """CLIP in Hugging Face format, from a folder, by name, or "builtin".
 
-    Raises UserError when it can't be found or downloaded, isn't a CLIP, or is incomplete.
+    Raises UserError if it can't be found or downloaded, isn't a CLIP, or is incomplete.
     """
     from transformers import CLIPImageProcessor, CLIPModel, CLIPTokenizer
 
@@ -146,28 +182,28 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
     kind = model_type(files)
     if kind != "clip":
         raise UserError(
-            f"{files.name} is a {kind} model: {files.option} takes a CLIP in Hugging Face format, such as "
-            "openai/clip-vit-base-patch32"
+            f"{files.name} is a {kind} model: {spoken(files.option)} needs a CLIP in Hugging Face format, "
+            "such as openai/clip-vit-base-patch32"
         )
     model = load_weights(CLIPModel, files, device)
     if not _has(files.folder, "tokenizer.json") and not _has(files.folder, "vocab.json", "merges.txt"):
-        # transformers would quietly make a tokenizer without words
+        # transformers would silently make a tokenizer without words
         raise UserError(
-            f"{files.folder} holds no tokenizer (tokenizer.json, or vocab.json and merges.txt): "
+            f"{files.folder} has no tokenizer (tokenizer.json, or vocab.json and merges.txt): "
             "copy these files from the model that this one was fine-tuned from"
         )
     tokenizer = CLIPTokenizer.from_pretrained(files.folder, local_files_only=True)
     if _has(files.folder, "preprocessor_config.json") or _has(files.folder, "processor_config.json"):
         processor = CLIPImageProcessor.from_pretrained(files.folder, local_files_only=True)
     else:
-        processor = CLIPImageProcessor()  # fine-tuned weights are often saved alone: CLIP's own statistics
+        processor = CLIPImageProcessor()  # fine-tuned weights are often saved alone; CLIP's own statistics
     return ImageTextEncoder(model, tokenizer, processor.image_mean, processor.image_std, files.identity)
 
 
 def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, tokens: int = 64) -> DenseEncoder:
     """DINOv2 or another vision transformer with patch tokens, read at `tokens`×`tokens`.
 
-    Raises UserError when it can't be found or downloaded, has no patch tokens, or is incomplete.
+    Raises UserError if it can't be found or downloaded, has no patch tokens, or is incomplete.
     """
     from transformers import AutoModel
 
@@ -175,25 +211,26 @@ def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, toke
     model = load_weights(AutoModel, files, device)
     if not isinstance(getattr(model.config, "patch_size", None), int):
         raise UserError(
-            f"{files.name} is a {model.config.model_type} model without patch tokens: give {files.option} a "
-            'vision transformer such as facebook/dinov2-small, or "none"'
+            f"{files.name} is a {model.config.model_type} model without patch tokens: give "
+            f"{spoken(files.option)} "
+            'a vision transformer such as facebook/dinov2-small, or "none"'
         )
     return DenseEncoder(model, tokens, files.identity)
 
 
-@lru_cache(maxsize=1)  # once is enough
+@lru_cache(maxsize=1)  # log once
 def _say_what_builtin_knows() -> None:
     from rich import get_console
 
     get_console().print(
-        "The built-in CLIP knows the demo's landmarks and nothing else; for your photos name a real one: "
-        f"{CLIP_OPTION} openai/clip-vit-base-patch32 {DENSE_OPTION} facebook/dinov2-small",
+        "The built-in CLIP knows landmarks and street façades and nothing else; a real one knows more: "
+        f"{spoken(CLIP_OPTION)} openai/clip-vit-base-patch32",
         soft_wrap=True,
     )
 
 
 def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
-    """The model, frozen and in float32. Weights that the file lacks are an error, not random numbers."""
+    """The model, frozen and in float32. Missing weights are an error, not random numbers."""
     from safetensors import SafetensorError
 
     try:
@@ -207,19 +244,19 @@ def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         raise UserError(
             f"{files.name}: the model in {files.folder} can't be loaded ({error}): download it again, or "
-            f"give {files.option} another folder"
+            f"give {spoken(files.option)} another folder"
         ) from error
-    missing = sorted(name for name in report["missing_keys"] if "pooler" not in name)  # poolers are not read
+    missing = sorted(name for name in report["missing_keys"] if "pooler" not in name)  # poolers are not used
     if missing:
         raise UserError(
-            f"{files.name}: the weights in {files.folder} lack {len(missing)} tensors, the first is "
-            f"{missing[0]}: give {files.option} a complete model"
+            f"{files.name}: the weights in {files.folder} lack {len(missing)} tensors, the first being "
+            f"{missing[0]}: give {spoken(files.option)} a complete model"
         )
     return model.to(device).eval().requires_grad_(False)
 
 
 def model_type(files: ModelFiles) -> str:
-    """The kind of network that a model's configuration names ("clip"). Raises UserError without one."""
+    """The model type in its configuration ("clip"). Raises UserError if there is none."""
     from transformers import AutoConfig
 
     try:
@@ -238,10 +275,10 @@ def _download(name: str, option: str) -> Path:
             if _weight_files(folder):
                 return folder
     except (OSError, ValueError) as error:  # no network, no such model, not a name
-        raise UserError(
+        raise _NotDownloaded(
             f"the model {name} is neither a folder here nor in the Hugging Face cache, and it can't be "
             f"downloaded ({type(error).__name__}). On a machine with Internet: "
-            f"hf download {name} --local-dir DIR; then {option} DIR"
+            f"hf download {name} --local-dir DIR; then {spoken(option)} DIR"
         ) from error
     raise UserError(f"the model {name} has no PyTorch weights ({' or '.join(_WEIGHTS)}): choose another")
 
@@ -252,13 +289,13 @@ def _weight_files(folder: Path) -> list[Path]:
 
 
 def _fingerprint(folder: Path, option: str) -> str:
-    """16 hex digits over everything that decides an image's embedding."""
+    """16 hex digits of everything that affects an image's embedding."""
     config = folder / "config.json"
     weights = _weight_files(folder)
     if not config.is_file() or not weights:
         raise UserError(
             f"{folder} is not a model in Hugging Face format: it needs config.json and "
-            f"{' or '.join(_WEIGHTS)}; give {option} the folder that holds them"
+            f"{' or '.join(_WEIGHTS)}; give {spoken(option)} the folder that holds them"
         )
     preprocessing = sorted(folder.glob("p*processor_config.json"))
     digests = []
@@ -270,7 +307,7 @@ def _fingerprint(folder: Path, option: str) -> str:
 
 @lru_cache(maxsize=64)
 def _digest(path: Path, size: int, modified_ns: int) -> str:
-    """A file's SHA-256 (about a second per gigabyte); size and time make a changed file another entry."""
+    """A file's SHA-256 (about a second per gigabyte), cached by size and modification time."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
@@ -287,7 +324,7 @@ def _channels(values: Sequence[float], device: torch.device) -> Float[Tensor, "3
 
 
 def _resize(images: Float[Tensor, "n 3 h w"], side: int) -> Float[Tensor, "n 3 side side"]:
-    """Images squashed to squares, antialiased bicubic as both models were trained with."""
+    """Images squashed to squares, antialiased bicubic, as in the training of both models."""
     if images.shape[-2:] == (side, side):
         return images
     return F.interpolate(images, (side, side), mode="bicubic", antialias=True).clamp(0.0, 1.0)

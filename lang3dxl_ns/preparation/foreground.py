@@ -1,7 +1,7 @@
-"""Where photos count: masks from a folder, from words, or none.
+"""Foreground masks of photos: from a folder, from prompts, or none.
 
-Every source comes down to one thing: the file that is a photo's mask (`Photo.mask_path`), or None where the
-whole photo counts. `Photo.read_mask` does the rest, for training, evaluation and queries alike.
+Every source reduces to one thing: the file of a photo's mask (`Photo.mask_path`), or None if the whole photo
+is foreground. `Photo.read_mask` does the rest, for training, evaluation and queries alike.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -18,21 +19,24 @@ from jaxtyping import Bool
 from PIL import Image, PngImagePlugin
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.preparation.companions import companion, named_folder
-from lang3dxl_ns.preparation.photo import Photo
-from lang3dxl_ns.preparation.prepare import PreparationConfig
-from lang3dxl_ns.preparation.progress import progress, some
+from lang3dxl_ns.common.console import progress, some
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.segmentation import TextSegmenter, find_text_segmenter, load_text_segmenter
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene.companions import companion, named_folder
+from lang3dxl_ns.scene.photo import Photo
 
 FOREGROUND = "foreground"
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 _LONGER_SIDE = 1024
-"""Pixels at which words are looked for; the networks see no more anyway."""
+"""Pixels at which prompts are searched; the networks take no more anyway."""
+_READERS = 4
+"""Threads."""
 _RULE = 1
-"""Raised when masks are made in another way: those made before are then made again."""
+"""Increased when masks are made in another way, so that older ones are made again."""
 
 Log = Callable[[str], None]
 
@@ -45,9 +49,9 @@ def with_foreground(
     device: torch.device | str,
     log: Log = print,
 ) -> list[Photo]:
-    """The photos with the masks that `config.foreground` asks for; the log says which have none.
+    """The photos with the masks configured in `config.foreground`; logs the photos without one.
 
-    A folder is relative to `data`. Raises UserError when it isn't there or fits no photo, and when a model
+    A folder is relative to `data`. Raises UserError if it is missing or fits no photo, and if a model
     can't be loaded.
     """
     if config.foreground == "none":
@@ -55,22 +59,61 @@ def with_foreground(
     if config.foreground == "text":
         return _prompted(photos, config, FeatureStore(cache_dir), device, log)
     if config.foreground == "auto":
-        masked = list(photos)  # as the dataparser found them
+        masked = list(photos)  # with the masks found by the dataparser
     else:
         masked = _from_folder(photos, named_folder(config.foreground, data, "foreground"))
+    masked = _checked(masked, config.skip_damaged_masks, log)
     without = [photo.name for photo in masked if photo.mask_path is None]
     if 0 < len(without) < len(masked):
-        log(f"{len(without)} of {len(masked)} photos have no mask and count whole: {some(without)}")
+        log(f"{len(without)} of {len(masked)} photos have no mask and are used whole: {some(without)}")
     for path, names in _shared_masks(masked).items():
         log(
-            f"{path} is the mask of {len(names)} photos, {some(names)}: where it belongs to one, name it "
+            f"{path} is the mask of {len(names)} photos, {some(names)}: if it belongs to one, name it "
             f"like {path.parent / (PurePosixPath(names[0]).name + path.suffix)}"
         )
     return masked
 
 
+def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
+    """The photos, once every mask was read. Names those that can't be read all at once (in a UserError, or,
+    with `skip`, in the log: they count whole), and those that are black."""
+    masked = [photo for photo in photos if photo.mask_path is not None]
+    with ThreadPoolExecutor(_READERS) as pool, progress("checking masks", len(masked)) as advance:
+        states = []
+        for state in pool.map(_state, masked):
+            states.append(state)
+            advance()
+    damaged = {p.name: state for p, state in zip(masked, states, strict=True) if isinstance(state, str)}
+    black = [photo.name for photo, state in zip(masked, states, strict=True) if state is False]
+    if damaged and not skip:
+        raise UserError(
+            f"{len(damaged)} masks can't be read: {'; '.join(damaged.values())}. Replace or remove them, or "
+            "let these photos count whole: --pipeline.datamanager.skip-damaged-masks True"
+        )
+    if damaged:
+        log(f"{len(damaged)} masks can't be read, and their photos count whole: {some(list(damaged))}")
+    if black and len(black) == len(photos):
+        raise UserError(
+            f"all {len(black)} masks are black: nothing would count; white is what to keep: invert them, or "
+            "pass --pipeline.datamanager.foreground none"
+        )
+    if black:
+        log(f"the masks of {len(black)} photos are all black, nothing in them counts: {some(black)}")
+    return [replace(photo, mask_path=None) if photo.name in damaged else photo for photo in photos]
+
+
+def _state(photo: Photo) -> bool | str:
+    """Whether a photo's mask keeps anything; why it can't be read."""
+    assert photo.mask_path is not None
+    try:
+        with open_picture(photo.mask_path) as image:
+            return max(image.convert("L").tobytes()) >= 128
+    except (OSError, NoPictureError) as error:
+        return f"{photo.mask_path} ({error})"
+
+
 def _shared_masks(photos: Sequence[Photo]) -> dict[Path, list[str]]:
-    """Masks that several photos take, since these differ in their suffix alone, and the photos."""
+    """Masks used by several photos, whose names differ only in their suffix, with these photos."""
     names: dict[Path, list[str]] = {}
     for photo in photos:
         if photo.mask_path is not None:
@@ -100,10 +143,10 @@ def _prompted(
     device: torch.device | str,
     log: Log,
 ) -> list[Photo]:
-    """Makes the masks that are missing or were made with other settings, photo by photo, and names those in
-    which nothing was found: they count whole."""
+    """Make the masks that are missing or were made with other settings, photo by photo, and log the photos
+    in which nothing was found: they are used whole."""
     if not config.foreground_prompts:
-        raise UserError("foreground text needs words: --pipeline.datamanager.foreground-prompts building")
+        raise UserError("foreground text needs prompts: --pipeline.datamanager.foreground-prompts building")
     files = find_text_segmenter(config.foreground_model, config.sam)
     made_with = {"prompts": sorted(config.foreground_prompts), "model": files.identity, "rule": _RULE}
     masked, missing = [], []
@@ -112,7 +155,7 @@ def _prompted(
         try:
             settings = {**made_with, "photo": photo.content_hash()}
         except UserError:
-            masked.append(photo)  # whoever reads the photo says why it can't be read
+            masked.append(photo)  # reading it later reports the reason
             continue
         masked.append(replace(photo, mask_path=path))
         if _settings(path) != settings:
@@ -121,7 +164,7 @@ def _prompted(
         log(f"looking for {', '.join(config.foreground_prompts)} in {len(missing)} of {len(photos)} photos")
         empty = _make(missing, load_text_segmenter(files, device), config.foreground_prompts, store)
         if empty:
-            log(f"found nothing in {len(empty)} photos, which count whole: {some(empty)}")
+            log(f"found nothing in {len(empty)} photos, which are used whole: {some(empty)}")
     return masked
 
 
@@ -131,7 +174,7 @@ def _make(
     prompts: Sequence[str],
     store: FeatureStore,
 ) -> list[str]:
-    """Writes the masks; returns the names of the photos in which nothing was found."""
+    """Write the masks; returns the names of the photos in which nothing was found."""
     store.remove_leftovers()
     empty = []
     with progress("finding the foreground", len(missing)) as advance:
@@ -151,7 +194,7 @@ def _make(
 
 
 def _png(mask: Bool[Tensor, "h w"], settings: dict[str, Any]) -> bytes:
-    """A black-and-white PNG that carries the settings, so that no mask is ever without them."""
+    """A black-and-white PNG that contains the settings, so that no mask is ever without them."""
     text, content = PngImagePlugin.PngInfo(), io.BytesIO()
     text.add_text("settings", json.dumps(settings))
     Image.fromarray(mask.numpy()).save(content, "PNG", pnginfo=text)
@@ -159,11 +202,11 @@ def _png(mask: Bool[Tensor, "h w"], settings: dict[str, Any]) -> bytes:
 
 
 def _settings(path: Path) -> dict[str, Any] | None:
-    """The settings that made a mask; None where there is no whole mask of ours."""
+    """The settings that made a mask; None if there is no complete mask of ours."""
     try:
-        with Image.open(path) as image:
+        with open_picture(path) as image:
             settings = json.loads(image.info.get("settings", "null"))
             image.verify()  # reads all of it
             return settings
-    except (OSError, SyntaxError, ValueError):
+    except (OSError, NoPictureError):
         return None

@@ -1,4 +1,4 @@
-"""CLIP targets of one photo: square crops on a regular grid per scale, encoded, averaged over the scales."""
+"""Crop pyramid: a photo's CLIP target from square crops on a regular grid per scale, averaged over scales."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.memory import with_less_memory
+from lang3dxl_ns.common.memory import with_less_memory
 
 
 @dataclass
 class ClipTarget:
     """Image embeddings of a photo's crops, averaged over the scales, on the grid of the smallest scale.
 
-    Cell (i, j) of the Hd × Wd grid stands for the photo's pixels around ((j + 0.5) W / Wd, (i + 0.5) H / Hd).
+    Cell (i, j) of the Hd × Wd grid is centred at the photo's pixel ((j + 0.5) W / Wd, (i + 0.5) H / Hd).
     """
 
     features: Float[Tensor, "hd wd c"]
-    """Mean embedding, float32, as the encoder gave it (not normalised)."""
+    """Mean embedding, float32, as output by the encoder (not normalised)."""
     valid: Float[Tensor, "hd wd"]
-    """Mean fraction of the crops' area that lies inside the photo, 0..1; the rest of a crop is black."""
+    """Mean share of the crops' area inside the photo, 0..1; the rest of a crop is black."""
     crop_sides: list[int]
     """Side of each scale's crops in pixels."""
     scales: list[float]
@@ -31,53 +31,44 @@ class ClipTarget:
 
     @property
     def range_factor(self) -> float:
-        """Largest over smallest scale."""
+        """Ratio of the largest to the smallest scale."""
         return max(self.scales) / min(self.scales)
 
 
-def crop_centres(length: int, side: int) -> Int[Tensor, " n"]:
-    """Pixel positions of the crop centres along an axis of `length` pixels: half a crop apart, symmetric.
+HALF, QUARTER = 2, 4
+"""Crops per side: how many steps a crop's own side is, from one centre to the next."""
 
-    They behave like the cells of a regular grid. A crop covers `side // 2` pixels to either side of its
-    centre and may reach out of the photo. Method: Lang3D-XL, crop grid.
+
+def crop_centres(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]:
+    """Pixel positions of the crop centres along an axis of `length` pixels: the middles of n equal cells, as
+    a target is read, n such that they are about a crop over `steps` apart.
+
+    A crop covers `side // 2` pixels to either side of its centre and may reach out of the photo. Method:
+    Lang3D-XL, crop grid; there centres are exactly half a crop apart, up to half a cell beside their cells.
     """
-    shift = _half(side)
-    if length < shift:
-        return torch.tensor([length // 2])
-    first = shift - (shift - length % shift) // 2
-    return first + shift * torch.arange(length // shift)
+    count = max(length // max(2 * _half(side) // steps, 1), 1)
+    return ((2 * torch.arange(count) + 1) * length + count - 1) // (2 * count)  # rounded
 
 
-def valid_fractions(height: int, width: int, side: int) -> Float[Tensor, "ny nx"]:
+def valid_fractions(height: int, width: int, side: int, steps: int = HALF) -> Float[Tensor, "ny nx"]:
     """Fraction of each crop's area that lies inside a photo of `height` × `width` pixels."""
-    return torch.outer(_inside(height, side), _inside(width, side))
+    return torch.outer(_inside(height, side, steps), _inside(width, side, steps))
 
 
 def iterate_crops(
-    photo: Float[Tensor, "h w 3"], side: int, size: int, batch_size: int
+    photo: Float[Tensor, "h w 3"], side: int, size: int, batch_size: int, steps: int = HALF
 ) -> Iterator[Float[Tensor, "n 3 s s"]]:
     """Yield the photo's crops, row by row from the top left, as `size` pixels, `batch_size` at a time.
 
-    Black outside the photo. The resize is CLIP's own, an antialiased bicubic, clamped to 0..1 like the photo.
+    Black outside the photo. The resize is CLIP's own, antialiased bicubic, clamped to 0..1 like the photo.
     """
-    windows = _windows(photo, side)
-    rows, columns = windows.shape[1:3]
-    for batch in torch.arange(rows * columns, device=photo.device).split(batch_size):
-        crops = windows[:, batch // columns, batch % columns].transpose(0, 1)
+    windows, tops, lefts = _windows(photo, side, steps)
+    columns = len(lefts)
+    for batch in torch.arange(len(tops) * columns, device=photo.device).split(batch_size):
+        crops = windows[:, tops[batch // columns], lefts[batch % columns]].transpose(0, 1)
         if crops.shape[-1] != size:
             crops = F.interpolate(crops, (size, size), mode="bicubic", align_corners=False, antialias=True)
         yield crops.clamp(0, 1)
-
-
-def cut_crops(
-    photo: Float[Tensor, "h w 3"], side: int, size: int
-) -> tuple[Float[Tensor, "n 3 s s"], Float[Tensor, "ny nx"]]:
-    """All crops of one scale at once, and the fraction of each that lies inside the photo.
-
-    For few crops; `iterate_crops` gives the same ones in bounded memory.
-    """
-    valid = valid_fractions(photo.shape[0], photo.shape[1], side).to(photo)
-    return next(iterate_crops(photo, side, size, batch_size=valid.numel())), valid
 
 
 @torch.no_grad()
@@ -88,19 +79,20 @@ def build_clip_target(
     encode: Callable[[Float[Tensor, "n 3 s s"]], Float[Tensor, "n c"]],
     crop_size: int,
     batch_size: int,
+    steps: int = HALF,
 ) -> ClipTarget:
     """Encode the crops of every scale and average the scales on the finest scale's grid.
 
-    `photo` holds RGB in 0..1; `crop_sides` (pixels) and `scales` (world units) go together, as `crop_sides()`
-    of physical_scale gives them; `encode` takes crops of `crop_size` pixels in 0..1. Every scale counts the
-    same. Raises ValueError when the two lists differ in length. Method: Lang3D-XL, average over scales.
+    `photo` holds RGB in 0..1; `crop_sides` (pixels) and `scales` (world units) correspond, as returned by
+    `crop_sides()` of physical_scale; `encode` takes crops of `crop_size` pixels in 0..1. All scales have
+    equal weight. Raises ValueError if the two lists differ in length. Method: Lang3D-XL, average over scales.
     """
     if len(crop_sides) != len(scales) or not scales:
         raise ValueError(f"one scale per crop side is needed: {len(crop_sides)} sides, {len(scales)} scales")
-    finest = valid_fractions(photo.shape[0], photo.shape[1], min(crop_sides)).shape
+    finest = valid_fractions(photo.shape[0], photo.shape[1], min(crop_sides), steps).shape
     total = torch.zeros(())
     for side in crop_sides:
-        grid = _encode_scale(photo, side, encode, crop_size, batch_size)
+        grid = _encode_scale(photo, side, encode, crop_size, batch_size, steps)
         total = total + F.interpolate(grid[None], finest, mode="bilinear", align_corners=False)[0]
     mean = (total / len(scales)).permute(1, 2, 0)
     return ClipTarget(mean[..., :-1].contiguous(), mean[..., -1].contiguous(), list(crop_sides), list(scales))
@@ -112,38 +104,46 @@ def _encode_scale(
     encode: Callable[[Tensor], Tensor],
     crop_size: int,
     batch_size: int,
+    steps: int,
 ) -> Float[Tensor, "c+1 ny nx"]:
     """The embeddings of one scale as a grid, with the valid fraction as a last channel; in smaller batches
-    where memory doesn't suffice."""
+    if memory runs out."""
     features = with_less_memory(
         lambda batch: torch.cat(
-            [encode(crops).float() for crops in iterate_crops(photo, side, crop_size, batch)]
+            [encode(crops).float() for crops in iterate_crops(photo, side, crop_size, batch, steps)]
         ),
         batch_size,
     )
-    valid = valid_fractions(photo.shape[0], photo.shape[1], side).to(features)
+    valid = valid_fractions(photo.shape[0], photo.shape[1], side, steps).to(features)
     return torch.cat([features.T.unflatten(1, valid.shape), valid[None]])
 
 
 def _half(side: int) -> int:
-    """Half of a crop's side, which is also the distance between two centres; a crop is twice this wide."""
+    """Half of a crop's side; a crop is twice this wide."""
     if side < 2:
         raise ValueError(f"a crop needs a side of at least 2 pixels, not {side}")
     return side // 2
 
 
-def _inside(length: int, side: int) -> Float[Tensor, " n"]:
+def _inside(length: int, side: int, steps: int) -> Float[Tensor, " n"]:
     """Fraction of each crop that lies inside the photo along one axis."""
-    half, centres = _half(side), crop_centres(length, side)
+    half, centres = _half(side), crop_centres(length, side, steps)
     return ((centres + half).clamp(max=length) - (centres - half).clamp(min=0)) / (2 * half)
 
 
-def _windows(photo: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 ny nx t t"]:
-    """Every crop at its own size, as a view of the photo padded with black: no memory per crop."""
+def _windows(
+    photo: Float[Tensor, "h w 3"], side: int, steps: int
+) -> tuple[Float[Tensor, "3 H W t t"], Int[Tensor, " ny"], Int[Tensor, " nx"]]:
+    """A crop at every pixel, as a view of the photo padded with black (no memory per crop), and the first row
+    and column of those that are wanted."""
     half = _half(side)
     padding: list[int] = []
+    starts = []
     for length in (photo.shape[1], photo.shape[0]):  # F.pad counts from the last axis, the width
-        centres = crop_centres(length, side)
-        padding += [max(0, half - int(centres[0])), max(0, int(centres[-1]) + half - length)]
+        centres = crop_centres(length, side, steps).to(photo.device)
+        before = max(0, half - int(centres[0]))
+        padding += [before, max(0, int(centres[-1]) + half - length)]
+        starts.append(centres - half + before)
     padded = F.pad(photo.permute(2, 0, 1), padding)
-    return padded.unfold(1, 2 * half, half).unfold(2, 2 * half, half)
+    lefts, tops = starts
+    return padded.unfold(1, 2 * half, 1).unfold(2, 2 * half, 1), tops, lefts

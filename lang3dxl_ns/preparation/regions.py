@@ -1,4 +1,4 @@
-"""Segments of a photo whose features should agree: label maps from SAM, from colours, or from a folder."""
+"""Region label maps: segments of a photo whose features should agree, from SAM, colours, or a folder."""
 
 from __future__ import annotations
 
@@ -6,52 +6,51 @@ import hashlib
 from functools import cached_property
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from PIL import Image
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.preparation.companions import companion, named_folder
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.encoders import ModelFiles
-from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.preparation.segmentation import AutomaticSam, find_sam
-
-RegionLevel = Literal["small", "medium", "large"]
+from lang3dxl_ns.preparation.settings import RegionLevel
+from lang3dxl_ns.scene.companions import companion, named_folder
+from lang3dxl_ns.scene.photo import Photo
 
 LONGER_SIDE = 256
-"""Pixels of a stored label map: over twice what training decodes at."""
+"""Pixels of a stored label map: over twice the size at which training decodes."""
 LABEL_SUFFIXES = (".png", ".npy")
 
 _SAM_SIDE = 1024
-"""Pixels that SAM sees."""
+"""Pixels of SAM's input."""
 _FELZENSZWALB = {"scale": 100.0, "sigma": 0.8, "min_size": 20}
-"""Gives some 250 regions of a photo, half of them over 60 pixels."""
+"""Gives about 250 regions per photo, half of them over 60 pixels."""
 _RULE = 1
-"""Raised when label maps are made in another way: those made before are then made again."""
+"""Increased when label maps are made in another way, so that older ones are made again."""
 
 
 class RegionSource(Protocol):
-    """Where the label maps of a scene come from."""
+    """Source of a scene's label maps."""
 
     def settings(self, photo: Photo) -> dict[str, Any] | None:
-        """Everything besides the photo that decides its labels; None for a photo without regions."""
+        """Everything besides the photo that determines its labels; None for a photo without regions."""
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
-        """Labels over the photo as `photo.read()` gives it (`image`), at any size; negative for no region."""
+        """Labels of the photo as read by `photo.read()` (`image`), at any size; negative for no region."""
 
 
 def region_source(
     choice: str, level: RegionLevel, sam: str, data: Path, device: torch.device | str
 ) -> RegionSource | None:
-    """The source that an option names: none, felzenszwalb, sam, a folder (relative to `data`), or auto, the
-    folder regions/ where `data` has one.
+    """The source named by an option: none, felzenszwalb, sam, a folder (relative to `data`), or auto, the
+    folder regions/ if `data` has one.
 
-    Raises UserError when there is no such folder, or SAM can't be found or downloaded.
+    Raises UserError if there is no such folder, or SAM can't be found or downloaded.
     """
     if choice == "auto":
         folder = data / "regions"
@@ -66,7 +65,7 @@ def region_source(
 
 
 class FelzenszwalbRegions:
-    """Regions of like colour (Felzenszwalb and Huttenlocher 2004): no weights, a fraction of a second."""
+    """Regions of similar colour (Felzenszwalb and Huttenlocher 2004): no weights, a fraction of a second."""
 
     def settings(self, photo: Photo) -> dict[str, Any]:
         """As `RegionSource.settings`."""
@@ -103,7 +102,7 @@ class SamRegions:
 
 
 class FolderRegions:
-    """Label maps that somebody made: on the photos as they lie on disk, at any size, named like them."""
+    """User-provided label maps: drawn on the photos' files, at any size, named like them."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -124,10 +123,10 @@ class FolderRegions:
 
 
 def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "h w"]:
-    """One label per pixel from masks that overlap: the smallest mask that a pixel lies in, the largest, or
-    the one in the middle of them by area; −1 in no mask."""
+    """One label per pixel from overlapping masks: the smallest mask that contains it, the largest, or the
+    median by area; −1 outside all masks."""
     masks = masks[masks.sum(dim=(1, 2)).argsort(stable=True)]
-    rank = masks.cumsum(dim=0, dtype=torch.int32)  # of a pixel's masks, the smallest is number 1
+    rank = masks.cumsum(dim=0, dtype=torch.int32)  # the smallest of a pixel's masks has rank 1
     count = rank[-1]
     wanted = {"small": torch.ones_like(count), "medium": (count + 1) // 2, "large": count}[level]
     chosen = (masks & (rank == wanted)).to(torch.uint8).argmax(dim=0)
@@ -135,7 +134,7 @@ def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "
 
 
 def stored_labels(labels: Int[Tensor, "hl wl"]) -> Int[Tensor, "h w"]:
-    """A label map as it is kept: `label_size` (nearest), numbered from 0, −1 for none, on the CPU."""
+    """A label map as stored: `label_size` (nearest), numbered from 0, −1 for none, on the CPU."""
     small = _numbered(_nearest(labels, label_size(*labels.shape)).cpu())
     return small.to(torch.int16 if small.max() < 2**15 else torch.int32)
 
@@ -147,18 +146,18 @@ def label_size(height: int, width: int) -> tuple[int, int]:
 
 
 def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
-    """A file's labels: whole numbers, negative for no region (in a picture, which has no sign, 0)."""
+    """A file's labels: integers, negative for no region (0 in a picture, which has no sign)."""
     try:
         if path.suffix == ".npy":
             labels, first = np.load(path, allow_pickle=False), 0
         else:
-            with Image.open(path) as picture:
+            with open_picture(path) as picture:
                 labels, first = np.asarray(picture), 1
-    except (OSError, SyntaxError, ValueError, EOFError, MemoryError, TokenError) as error:
+    except (OSError, NoPictureError, SyntaxError, ValueError, EOFError, MemoryError, TokenError) as error:
         raise UserError(
             f"regions of {name}: can't read {path} ({error}): make it again, or remove it"
         ) from error
-    if labels.ndim != 2 or labels.dtype.kind not in "iu":
+    if labels.ndim != 2 or not labels.size or labels.dtype.kind not in "iu":
         raise UserError(
             f"regions of {name}: {path} holds {labels.dtype} numbers of shape {labels.shape}, not one whole "
             "number per pixel: save a grey 16-bit PNG, or a .npy of integers [height, width]"
@@ -167,13 +166,13 @@ def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
 
 
 def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """The same regions, numbered without gaps from 0; −1 for none."""
+    """The same regions, renumbered without gaps from 0; −1 for none."""
     regions, numbers = labels.clamp(min=-1).unique(return_inverse=True)
     return numbers - int(regions[0] < 0)
 
 
 def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Whole numbers at another size: every pixel takes the one under its middle."""
+    """Integers resized: every pixel takes the value under its centre."""
     rows, columns = (
         ((torch.arange(n, device=values.device) + 0.5) * length / n).long()
         for n, length in zip(size, values.shape, strict=True)

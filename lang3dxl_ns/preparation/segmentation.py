@@ -1,4 +1,4 @@
-"""Networks that cut photos into masks: from words CLIPSeg, or GroundingDINO with SAM; unasked SAM alone.
+"""Segmentation networks: CLIPSeg or GroundingDINO with SAM for prompts, SAM alone for everything.
 
 All are read from a local folder or by Hugging Face name, like the encoders.
 """
@@ -15,16 +15,16 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.encoders import ModelFiles, find_model, load_weights, model_type
 
 TEXT_OPTION = "--pipeline.datamanager.foreground-model"
 SAM_OPTION = "--pipeline.datamanager.sam"
 
 _BOX_THRESHOLD = 0.3
-"""Confidence from which a box counts (LangSAM's)."""
+"""Minimum confidence of a box (LangSAM's)."""
 # Published for language fields: LangSplat's settings of SAM's automatic masks. Its extra round over crops of
-# the photo is left out: it costs five times the time and finds masks smaller than the label maps show.
+# the photo is omitted: it takes five times as long and finds masks smaller than the label maps resolve.
 _AUTOMATIC = {
     "points_per_crop": 32,
     "pred_iou_thresh": 0.7,
@@ -34,23 +34,23 @@ _AUTOMATIC = {
 
 
 class TextSegmenter(Protocol):
-    """Finds what words name in a picture."""
+    """Finds what prompts name in an image."""
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
-        """Where any of the prompts is seen, at the size of the image, on the CPU."""
+        """Mask of any of the prompts, at the size of the image, on the CPU."""
 
 
 @dataclass(frozen=True)
 class SegmenterFiles:
-    """The networks of a text segmenter on this disk."""
+    """The local files of a text segmenter's networks."""
 
     words: ModelFiles
     sam: ModelFiles | None
-    """Fills the boxes of a detector; None where `words` makes masks itself."""
+    """Segments the boxes of a detector; None if `words` makes masks itself."""
 
     @property
     def identity(self) -> str:
-        """Of both networks' weights."""
+        """Fingerprint of both networks' weights."""
         return self.words.identity if self.sam is None else f"{self.words.identity}+{self.sam.identity}"
 
 
@@ -84,7 +84,7 @@ def load_text_segmenter(files: SegmenterFiles, device: torch.device | str) -> Te
 
 
 class ClipSeg:
-    """CLIPSeg (Lüddecke and Ecker 2022): a probability per pixel and prompt; a mask from 0.5."""
+    """CLIPSeg (Lüddecke and Ecker 2022): a probability per pixel and prompt, thresholded at 0.5."""
 
     def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
         from transformers import CLIPSegForImageSegmentation, CLIPSegProcessor
@@ -99,7 +99,7 @@ class ClipSeg:
 
     @torch.no_grad()
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Of every prompt in every pixel, at the size of the image, on the CPU."""
+        """Probability of every prompt in every pixel, at the size of the image, on the CPU."""
         inputs = self._processor(
             text=list(prompts),
             images=[_picture(image)] * len(prompts),
@@ -109,13 +109,12 @@ class ClipSeg:
             return_tensors="pt",
         ).to(self._model.device)
         logits = self._model(**inputs).logits.cpu()
-        logits = logits.reshape(len(prompts), 1, *logits.shape[-2:])  # of one prompt it comes without an axis
+        logits = logits.reshape(len(prompts), 1, *logits.shape[-2:])  # a single prompt comes without an axis
         return F.interpolate(logits, tuple(image.shape[:2]), mode="bilinear")[:, 0].sigmoid()
 
 
 class BoxesAndSam:
-    """GroundingDINO (Liu et al. 2023) puts boxes around what a prompt names, SAM (Kirillov et al. 2023) finds
-    the thing in each box."""
+    """GroundingDINO (Liu et al. 2023) finds boxes, SAM (Kirillov et al. 2023) segments each."""
 
     def __init__(self, words: ModelFiles, sam: ModelFiles, device: torch.device | str) -> None:
         from transformers import (
@@ -132,7 +131,7 @@ class BoxesAndSam:
 
     @torch.no_grad()
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
-        """As `TextSegmenter.segment`. A pass per prompt, so that no prompt hides what another finds."""
+        """As `TextSegmenter.segment`. One pass per prompt, so that prompts don't compete."""
         boxes = torch.cat([self.boxes(image, prompt) for prompt in prompts])
         if not len(boxes):
             return torch.zeros(image.shape[:2], dtype=torch.bool)
@@ -161,7 +160,7 @@ class BoxesAndSam:
 
 
 class AutomaticSam:
-    """SAM asked at a grid of points: masks of everything, which overlap."""
+    """SAM prompted with a grid of points: overlapping masks of everything."""
 
     def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
         from transformers import SamModel, SamProcessor, pipeline
@@ -171,19 +170,19 @@ class AutomaticSam:
         self._generate = pipeline("mask-generation", model=model, image_processor=processor, device=device)
 
     def masks(self, image: UInt8[Tensor, "h w 3"]) -> list[Bool[Tensor, "h w"]]:
-        """Masks at the size of the image, on the CPU; none where nothing is found."""
+        """Masks at the size of the image, on the CPU; empty if nothing is found."""
         return [
             torch.as_tensor(mask).cpu() for mask in self._generate(_picture(image), **_AUTOMATIC)["masks"]
         ]
 
 
 def _load_processor(processor_class: Any, files: ModelFiles) -> Any:
-    """What turns pictures and words into a network's input. Raises UserError where its files are missing."""
+    """Preprocessor of a network's images and texts. Raises UserError if its files are missing."""
     try:
         return processor_class.from_pretrained(files.folder, local_files_only=True)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise UserError(
-            f"{files.folder} lacks files that prepare the input of {files.name} ({error}): copy its "
+            f"{files.folder} lacks files that preprocess the input of {files.name} ({error}): copy its "
             "preprocessor_config.json and tokenizer files there, or download the model again"
         ) from error
 

@@ -1,4 +1,4 @@
-"""Prepared targets on disk: a file per photo and kind, written whole or not at all, read without loading."""
+"""Feature store: prepared targets on disk, one file per photo and kind, written atomically, memory-mapped."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.files import write_atomically
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import write_atomically
 
 logger = logging.getLogger(__name__)
 
@@ -30,23 +30,23 @@ _LEFTOVER_AGE_S = (
 
 
 class FeatureStore:
-    """A folder of safetensors files: `root/kind/photo.safetensors`, each with the settings that made it.
+    """A folder of safetensors files, `root/kind/photo.safetensors`, each with the settings that made it.
 
-    Floating tensors are kept in float16. Any number of processes may read and write at the same time: the
-    last complete write of an entry stands.
+    Floating-point tensors are stored as float16. Any number of processes may read and write at the same time:
+    the last complete write of an entry wins.
     """
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
 
     def path(self, kind: str, name: str) -> Path:
-        """Where the entry lies. Names that differ in any way never share a file, on any file system."""
+        """The entry's file. Different names never share a file, on any file system."""
         digest = hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:16]
         readable = re.sub(r"[^A-Za-z0-9._-]", "_", name)[-80:]
         return self.root / kind / f"{readable}.{digest}.safetensors"
 
     def write(self, kind: str, name: str, tensors: dict[str, Tensor], settings: dict[str, Any]) -> None:
-        """Stores an entry, atomically: after a failure at any moment the old entry, or none, is there.
+        """Store an entry, atomically: a failure at any moment leaves the old entry, or none.
 
         Raises UserError on NaN or infinity, and when the disk is full.
         """
@@ -58,12 +58,12 @@ class FeatureStore:
         self.write_bytes(self.path(kind, name), content, f"{name} ({kind})")
 
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
-        """Writes a file of the store, atomically. Raises UserError when the disk is full or read-only."""
+        """Write a file of the store, atomically. Raises UserError if the disk is full or read-only."""
         with self._writable(what):
             write_atomically(path, content)
 
     def make_folder(self) -> None:
-        """Raises UserError where the disk is full or read-only."""
+        """Create the folder. Raises UserError if the disk is full or read-only."""
         with self._writable("its folder"):
             self.root.mkdir(parents=True, exist_ok=True)
 
@@ -78,35 +78,38 @@ class FeatureStore:
                     "--pipeline.datamanager.cache-dir DIR (`lang3dxl prepare`: --cache-dir DIR)"
                 ) from error
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
+                raise UserError(
+                    f"{self.root} can't be used ({error.strerror or error}): name a folder with "
+                    "--pipeline.datamanager.cache-dir DIR (`lang3dxl prepare`: --cache-dir DIR)"
+                ) from error
             raise UserError(
                 f"no space left in {self.root} while writing {what}: free some space and run the "
-                "same command again, what was written before is kept"
+                "same command again; what was already written is kept"
             ) from error
 
     def read(self, kind: str, name: str) -> dict[str, Tensor]:
-        """An entry's tensors, mapped into memory: only what is touched is read from disk. CPU, float16.
+        """An entry's tensors, memory-mapped: only what is accessed is read from disk. CPU, float16.
 
-        Raises UserError when the entry is missing or damaged.
+        Raises UserError if the entry is missing or damaged.
         """
         path = self.path(kind, name)
         with _opened(path, f"{kind} of {name}") as file:
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 
     def shapes(self, kind: str, name: str) -> dict[str, tuple[int, ...]]:
-        """The shapes of an entry's tensors, from its header alone. Raises as `read`."""
+        """The shapes of an entry's tensors, from its header alone. Raises like `read`."""
         with _opened(self.path(kind, name), f"{kind} of {name}") as file:
             return {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
 
     def settings(self, kind: str, name: str) -> dict[str, Any]:
-        """The settings that made an entry. Raises as `read`."""
+        """The settings that made an entry. Raises like `read`."""
         with _opened(self.path(kind, name), f"{kind} of {name}") as file:
             return json.loads(file.metadata()["settings"])
 
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
-        """Whether the entry is there, whole, and made with these settings. A damaged one counts as absent.
+        """Whether the entry exists, is complete, and was made with these settings. Damaged counts as absent.
 
-        Reads the whole entry where the settings agree, to compare its checksum.
+        If the settings match, reads the whole entry to verify its checksum.
         """
         path = self.path(kind, name)
         if not path.exists():
@@ -133,7 +136,7 @@ class FeatureStore:
         return sizes
 
     def clean(self, kinds: Collection[str], names: Iterable[str]) -> tuple[int, int]:
-        """Deletes all entries but those of these kinds and photos; returns how many, and their bytes."""
+        """Delete all entries except those of these kinds and photos; returns their number and bytes."""
         self.remove_leftovers()
         keep = {self.path(kind, name).with_suffix("") for name in names for kind in kinds}
         files, freed = 0, 0
@@ -144,7 +147,7 @@ class FeatureStore:
         return files, freed
 
     def remove_leftovers(self) -> None:
-        """Deletes the temporary files of processes that were killed while writing."""
+        """Delete temporary files of processes that were killed while writing."""
         for path in self.root.glob("*/*.tmp"):
             with contextlib.suppress(FileNotFoundError):  # another process may clean up too
                 if time.time() - path.stat().st_mtime > _LEFTOVER_AGE_S:
@@ -152,17 +155,17 @@ class FeatureStore:
 
     @contextlib.contextmanager
     def claim(self, name: str) -> Iterator[bool]:
-        """Whether this process alone may make a photo's entries meanwhile; another may be at it.
+        """Yields whether this process may make a photo's entries; False while another process is at it.
 
-        The claim of a process that is killed ends with it: it is a lock on a byte of one file. Where the file
-        system knows no locks everybody may; then a photo may be made twice, and one of the results stands.
+        The claim is a lock on a byte of one file, so it ends with its process. On file systems without locks
+        every process may; then a photo may be made twice, and the last result wins.
         """
         place = int(hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:12], 16)
         self.make_folder()
         with self._writable("its list of claims"):
             file = (self.root / ".claims").open("ab")
         with file:
-            yield _lock_byte(file, place)  # closing the file gives it back
+            yield _lock_byte(file, place)  # closing the file releases it
 
 
 @contextlib.contextmanager
@@ -183,7 +186,7 @@ def _opened(path: Path, what: str) -> Iterator[Any]:
 
 
 def _compact(tensor: Tensor, what: str) -> Tensor:
-    """The tensor as it is stored: contiguous, on the CPU, floats in half precision where they fit."""
+    """The tensor as stored: contiguous, on the CPU, floats in half precision where they fit."""
     tensor = tensor.detach().cpu().contiguous()
     if not tensor.is_floating_point():
         return tensor
@@ -196,7 +199,7 @@ def _compact(tensor: Tensor, what: str) -> Tensor:
 
 
 def _checksum(tensors: dict[str, Tensor]) -> str:
-    """Of names, shapes and contents."""
+    """Checksum of names, shapes and contents."""
     digest = hashlib.blake2b(digest_size=16)
     for key, tensor in sorted(tensors.items()):
         digest.update(f"{key} {tensor.dtype} {list(tensor.shape)}".encode())
@@ -205,7 +208,7 @@ def _checksum(tensors: dict[str, Tensor]) -> str:
 
 
 def _lock_byte(file: BinaryIO, place: int) -> bool:
-    """Lock a byte of a file until it is closed; False where another process has it."""
+    """Lock a byte of a file until it is closed; False if another process holds it."""
     try:
         import fcntl
     except ImportError:  # Windows

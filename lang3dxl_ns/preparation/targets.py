@@ -1,4 +1,4 @@
-"""The prepared targets of a scene, read photo by photo, and their statistics."""
+"""Reading the prepared targets of a scene, and their channel statistics."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, ImageTextEncoder
 from lang3dxl_ns.preparation.store import FeatureStore
 
-CLIP, DENSE, REGIONS = "clip", "dense", "regions"
+CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
 
 _STD_FLOOR = 0.01
 
 
 @dataclass
 class StoredClipTarget:
-    """A photo's CLIP target, mapped from disk: float16, CPU."""
+    """A photo's CLIP target, memory-mapped: float16, CPU."""
 
     features: Float[Tensor, "hd wd c"]
     """Mean embedding over the scales, not normalised."""
     valid: Float[Tensor, "hd wd"]
-    """Mean fraction of the crops' area inside the photo, 0…1."""
+    """Mean share of the crops' area inside the photo, 0…1."""
     crop_fractions: list[float]
     """Crop sides as fractions of the photo's width, ascending."""
 
     @property
     def range_factor(self) -> float:
-        """Largest over smallest crop."""
+        """Ratio of the largest to the smallest crop."""
         return self.crop_fractions[-1] / self.crop_fractions[0]
 
 
 @dataclass
 class ChannelStatistics:
-    """Mean and standard deviation per channel; the deviation is floored at 1 % of the channels' average."""
+    """Mean and standard deviation per channel; deviations are at least 1 % of the channels' average."""
 
     mean: Float[Tensor, " c"]
     std: Float[Tensor, " c"]
@@ -45,14 +45,14 @@ class ChannelStatistics:
 
 @dataclass
 class FeatureStatistics:
-    """Of the CLIP and the dense targets, for whitening the field's output."""
+    """Statistics of the CLIP and the dense targets, for whitening the field's output."""
 
     clip: ChannelStatistics
     dense: ChannelStatistics | None
 
 
 class TargetReader:
-    """The prepared targets of a scene's photos, by photo name; nothing is loaded before it is touched."""
+    """The prepared targets of a scene's photos, by photo name; loaded on access."""
 
     def __init__(
         self,
@@ -60,18 +60,23 @@ class TargetReader:
         names: Sequence[str],
         with_dense: bool = True,
         with_regions: Collection[str] = (),
+        fine: Collection[str] = (),
     ) -> None:
-        self.names = list(names)
+        self.names, self._fine = list(names), frozenset(fine)
         self._store, self._with_dense, self._with_regions = store, with_dense, frozenset(with_regions)
-        self.clip_dim: int = store.shapes(CLIP, self.names[0])["features"][-1]
+        self.clip_dim: int = store.shapes(self._clip_kind(self.names[0]), self.names[0])["features"][-1]
         self.dense_dim: int = store.shapes(DENSE, self.names[0])["features"][-1] if with_dense else 0
 
+    def _clip_kind(self, name: str) -> str:
+        return FINE if name in self._fine else CLIP
+
     def clip(self, name: str) -> StoredClipTarget:
-        """The CLIP target of a photo. Raises UserError when it isn't prepared."""
-        settings = self._store.settings(CLIP, name)
+        """The CLIP target of a photo. Raises UserError if it isn't prepared."""
+        settings = self._store.settings(self._clip_kind(name), name)
         width = settings["size"][0]
         return StoredClipTarget(
-            **self._store.read(CLIP, name), crop_fractions=[side / width for side in settings["crop_sides"]]
+            **self._store.read(self._clip_kind(name), name),
+            crop_fractions=[side / width for side in settings["crop_sides"]],
         )
 
     def clip_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "hd wd c"]]:
@@ -79,23 +84,25 @@ class TargetReader:
         return (self.clip(name).features for name in names)
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
-        """The dense features of the squashed photo, float16; None when prepared without."""
+        """The dense features of the photo squashed to a square, float16; None if prepared without."""
         return self._store.read(DENSE, name)["features"] if self._with_dense else None
 
     def regions(self, name: str) -> Int[Tensor, "h w"] | None:
-        """Region labels of the photo, −1 for none; None (and nothing is read) for a photo without regions."""
+        """Region labels of the photo, −1 for none; None (no file is read) for a photo without regions."""
         return self._store.read(REGIONS, name)["labels"] if name in self._with_regions else None
 
     def bytes_of(self, name: str) -> int:
-        """Size of a photo's targets."""
-        kinds = [CLIP] + [DENSE] * self._with_dense + [REGIONS] * (name in self._with_regions)
+        """Bytes of a photo's targets on disk."""
+        kinds = (
+            [self._clip_kind(name)] + [DENSE] * self._with_dense + [REGIONS] * (name in self._with_regions)
+        )
         return sum(self._store.path(kind, name).stat().st_size for kind in kinds)
 
     def check(self, encoder: ImageTextEncoder) -> None:
-        """Raises UserError when a photo's target is missing or comes from another CLIP than `encoder`."""
+        """Raises UserError if a photo's target is missing or was made by another CLIP than `encoder`."""
         for name in self.names:
-            width = self._store.shapes(CLIP, name)["features"][-1]
-            made_with = self._store.settings(CLIP, name)["encoder"]
+            width = self._store.shapes(self._clip_kind(name), name)["features"][-1]
+            made_with = self._store.settings(self._clip_kind(name), name)["encoder"]
             if (width, made_with) != (encoder.dim, encoder.identity):
                 raise UserError(
                     f"the target of {name} has {width} channels and was made with another CLIP ({made_with}) "

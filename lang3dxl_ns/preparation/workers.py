@@ -1,6 +1,6 @@
-"""Work on many items at once: in this process, in several of this machine, or on a Ray cluster.
+"""Parallel work on many items: in this process, in several processes, or on a Ray cluster.
 
-Which item goes where is left to Python's process pool, or to Ray.
+Scheduling is left to Python's process pool or to Ray.
 """
 
 from __future__ import annotations
@@ -17,35 +17,38 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 
 import torch
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
 
+PATIENCE_S = 30.0
+"""Seconds to wait for a Ray cluster."""
 Item = TypeVar("Item", contravariant=True)
 Result = TypeVar("Result", covariant=True)
 
 
 class Maker(Protocol[Item, Result]):
-    """What a worker needs to begin; can be sent to another process."""
+    """Setup of a worker; can be sent to another process."""
 
     def start(self, device: str) -> Callable[[Item], Result]:
-        """Load what the work needs on a device, once per worker."""
+        """Load what the work needs onto a device, once per worker."""
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does the work."""
+    """Number and kind of workers."""
 
     count: int = 1
-    """Processes."""
+    """Number of processes."""
     engine: Literal["local", "ray"] = "local"
-    """Processes of this machine, or of a Ray cluster (which must see the same folders)."""
+    """Processes on this machine, or on a Ray cluster (which must see the same folders)."""
     address: str | None = None
-    """Of the Ray cluster; None starts one on this machine."""
+    """Address of the Ray cluster; None starts one on this machine."""
 
     def run(
         self, maker: Maker[Item, Result], items: Sequence[Item], device: str
     ) -> Iterator[tuple[Item, Result]]:
-        """Every item with its result, as they are done. Raises what the work raises, and UserError when a
-        process dies: what is done by then is kept."""
+        """Every item with its result, as they finish. Raises what the work raises, and UserError if a process
+        dies; results until then are kept."""
         if self.engine == "ray":
             return _run_on_ray(self, maker, items, device)
         if self.count <= 1 or len(items) <= 1:
@@ -62,7 +65,7 @@ def _run_here(maker: Maker[Item, Result], items: Sequence[Item], device: str):
 # --- processes of this machine ----------------------------------------------------------------------------
 
 _work: Any = None
-"""A worker process's own."""
+"""The work function of this worker process."""
 
 
 def _run_in_processes(count: int, maker: Maker[Item, Result], items: Sequence[Item], device: str):
@@ -77,15 +80,15 @@ def _run_in_processes(count: int, maker: Maker[Item, Result], items: Sequence[It
             yield futures[future], future.result()
     except BrokenProcessPool as error:
         raise UserError(
-            f"one of the {count} processes ended before its time, perhaps because memory ran out: what they "
-            "have made is kept; run the same command again, with fewer --workers"
+            f"one of the {count} processes died, perhaps because memory ran out: what they have made is "
+            "kept; run the same command again, with fewer --workers"
         ) from error
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _start(maker: Maker, device: str, count: int, turn: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of them; the first process decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with turn.get_lock():
         number, turn.value = turn.value, turn.value + 1
@@ -94,7 +97,7 @@ def _start(maker: Maker, device: str, count: int, turn: Any) -> None:
 
 
 def _end_with_parent() -> None:
-    """A process whose parent was killed would wait for ever."""
+    """Exit when the parent is killed, instead of waiting for ever."""
     parent = parent_process()
     assert parent is not None
     parent.join()
@@ -106,7 +109,7 @@ def _do(item: Any) -> Any:
 
 
 def _device(device: str, number: int, count: int) -> str:
-    """The worker's share of the machine: a GPU in turn, or some of the cores."""
+    """The worker's share of the machine: one of the GPUs, or some of the cores."""
     if device.startswith("cuda"):
         return f"cuda:{number % torch.cuda.device_count()}"
     torch.set_num_threads(max(torch.get_num_threads() // count, 1))
@@ -117,7 +120,7 @@ def _device(device: str, number: int, count: int) -> str:
 
 
 class _Actor(Generic[Item, Result]):
-    """A worker on a cluster. Ray starts another one in place of one that died, and repeats its item."""
+    """A worker on a cluster. If it dies, Ray starts another and repeats its item."""
 
     def __init__(self, maker: Maker[Item, Result], device: str) -> None:
         self._work = maker.start(device)
@@ -153,17 +156,41 @@ def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[It
             ray.shutdown()
 
 
+def _within(seconds: float, job: Callable[[], Any]) -> None:
+    """Run a job with a time limit. Raises TimeoutError when it is reached (the job stays in a daemon
+    thread), otherwise what the job raises."""
+    trouble: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            job()
+        except BaseException as error:  # raised below, in the waiting thread
+            trouble.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if thread.is_alive():
+        raise TimeoutError(f"no answer within {seconds:.0f} s")
+    if trouble:
+        raise trouble[0]
+
+
 def _connect(ray: Any, workers: Workers, attempts: int = 2) -> None:
-    """Ray gives its processes half a minute to start; the second attempt finds them in the disk's cache."""
-    # A cluster of our own listens on this machine alone.
+    """Ray allows its processes half a minute to start; the second attempt finds them in the disk cache."""
+    # A cluster started here listens on this machine only.
     own = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-    settings = {"address": workers.address} if workers.address else own
     try:
-        ray.init(log_to_driver=False, **settings)
-    except Exception as error:  # Ray raises this very class where its processes don't start in time
-        ray.shutdown()
-        if attempts > 1:
-            return _connect(ray, workers, attempts - 1)
+        if workers.address:
+            say(f"connecting to the Ray cluster at {workers.address}: {PATIENCE_S:.0f} s at most")
+            _within(PATIENCE_S, lambda: ray.init(log_to_driver=False, address=workers.address))
+        else:
+            ray.init(log_to_driver=False, **own)
+    except Exception as error:  # the class that Ray raises if its processes don't start in time
+        if not isinstance(error, TimeoutError):
+            ray.shutdown()
+            if attempts > 1 and not workers.address:
+                return _connect(ray, workers, attempts - 1)
         raise UserError(
             f"no Ray cluster answers at {workers.address or 'this machine'} ({error}): give --address, or "
             "start one with `ray start --head`"

@@ -1,4 +1,4 @@
-"""Synonyms from a chat model behind an OpenAI-compatible endpoint; off unless asked for."""
+"""Synonyms from a chat model behind an OpenAI-compatible endpoint; off by default."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from http.client import HTTPException
 from pathlib import Path
 
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.files import write_atomically
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import write_atomically
 
 _QUESTION = (
     "You help to find parts of buildings in photos. List up to five synonyms of the given term that are at "
@@ -25,16 +25,16 @@ _MOST_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class ChatSettings:
-    """Which endpoint to ask, and where its answers are kept."""
+    """Endpoint of the chat model, and the file of its answers."""
 
     url: str
     """Base URL, such as http://127.0.0.1:8080/v1."""
     key: str = field(default="", repr=False)
     """Sent as bearer token, if any."""
     model: str = "default"
-    """Name that the endpoint knows the model by."""
+    """Name of the model at the endpoint."""
     timeout: float = 10.0
-    """Seconds until the table is taken instead."""
+    """Time limit in seconds, after which the table is used instead."""
     cache: Path = Path("~/.cache/lang3dxl_ns/synonyms.json")
     """Answers so far, by model and term."""
 
@@ -44,7 +44,7 @@ class ChatSettings:
         url = os.environ.get("LANG3DXL_CHAT_URL")
         if not url or not url.startswith(("http://", "https://")):
             raise UserError(
-                f"synonyms are to come from a chat model, but LANG3DXL_CHAT_URL is {url or 'not set'}: set "
+                f"synonyms should come from a chat model, but LANG3DXL_CHAT_URL is {url or 'not set'}: set "
                 f"it to the base URL of an OpenAI-compatible endpoint, such as http://127.0.0.1:8080/v1"
             )
         key, model = os.environ.get("LANG3DXL_CHAT_KEY", ""), os.environ.get("LANG3DXL_CHAT_MODEL", "default")
@@ -52,7 +52,7 @@ class ChatSettings:
 
 
 class ChatSynonyms:
-    """Asks once per term; whatever goes wrong is a warning, and `fallback` answers instead."""
+    """Asks once per term; any failure is a warning, and `fallback` answers instead."""
 
     def __init__(self, settings: ChatSettings, fallback: Callable[[str], list[str]]) -> None:
         self.settings = settings
@@ -104,7 +104,7 @@ class ChatSynonyms:
 
 
 def _parse_answer(content: str) -> list[str]:
-    """The synonyms in an answer. Raises ValueError where it isn't a list of short phrases."""
+    """The synonyms in an answer. Raises ValueError if it isn't a list of short phrases."""
     content = content.strip().strip(".")
     if not content:
         raise ValueError("the answer is empty")

@@ -1,4 +1,4 @@
-"""From matching pixels to a place in the scene."""
+"""Places in 3D: back-projection of matching pixels, and boxes around them."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.rendering import Camera
+from lang3dxl_ns.scene.camera import Camera
 
 _OUTLIERS = 0.02
-"""Share of a match's points that its box leaves out on either side of each axis."""
+"""Share of a match's points that its box excludes at either end of each axis."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box along the axes of the model's frame."""
+    """An axis-aligned box in the model's frame."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     share: float
-    """How much of all that matched is connected to it, 0…1."""
+    """Share of the total match weight that is connected to it, 0…1."""
 
     @property
     def centre(self) -> tuple[float, ...]:
-        """Its middle."""
+        """The box's centre."""
         return tuple((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
 
 
 def world_points(
     camera: Camera, depth: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
 ) -> Float[Tensor, "n 3"]:
-    """Where the masked pixels' centres lie in the camera's world, by depth along its axis."""
+    """World positions of the masked pixels' centres, from depth along the camera's axis."""
     rows, columns = mask.nonzero().T
     view, k = camera.view_matrix.to(depth), camera.intrinsics.to(depth)
     z = depth[rows, columns]
@@ -43,7 +43,7 @@ def world_points(
 
 
 def strongest_match(points: Float[Tensor, "n 3"], weights: Float[Tensor, " n"], gap: float) -> Box:
-    """Box of the connected points of the largest total weight; `gap`, about, separates (world units)."""
+    """Box of the connected points with the largest total weight; gaps of about `gap` (world units) divide."""
     cells, cell_of = (points / gap).floor().long().unique(dim=0, return_inverse=True)
     group = _connected(cells)[cell_of.cpu()].to(points.device)
     totals = torch.zeros(int(group.max()) + 1, dtype=weights.dtype, device=points.device)
@@ -54,12 +54,12 @@ def strongest_match(points: Float[Tensor, "n 3"], weights: Float[Tensor, " n"], 
 
 
 def _quantile(points: Float[Tensor, "n 3"], q: float) -> Float[Tensor, "3"]:
-    """Along each axis; torch.quantile takes 16 million values at most."""
+    """Quantile along each axis; torch.quantile takes at most 16 million values."""
     return points.sort(dim=0).values[round(q * (len(points) - 1))]
 
 
 def _connected(cells: Int[Tensor, "n 3"]) -> Int[Tensor, " n"]:
-    """Group of every cell; cells that touch, be it at a corner, are of one group."""
+    """Group of every cell; cells that touch, even at a corner, are in one group."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -69,7 +69,7 @@ def _connected(cells: Int[Tensor, "n 3"]) -> Int[Tensor, " n"]:
     strides[2] = strides[1] * (cells[:, 1].max() + 2)
     keys, order = (cells * strides).sum(1).sort()
     sources, targets = [], []
-    for step in list(product((-1, 0, 1), repeat=3))[14:]:  # half of the neighbours; the others see us
+    for step in list(product((-1, 0, 1), repeat=3))[14:]:  # half of the neighbours: the rest is symmetric
         wanted = keys + (torch.tensor(step) * strides).sum()
         place = torch.searchsorted(keys, wanted).clamp_max(len(keys) - 1)
         touching = keys[place] == wanted

@@ -1,4 +1,4 @@
-"""How relevant a feature is to a prompt: the prompt against canonical phrases that mean nothing special."""
+"""Relevancy of features to prompts, against negatives (LERF's formula)."""
 
 from __future__ import annotations
 
@@ -10,31 +10,32 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.memory import with_less_memory
+from lang3dxl_ns.common.memory import with_less_memory
 
 CANONICAL = ("object", "things", "stuff", "texture")
-"""Phrases that fit anything (LERF): a prompt is found where it fits better than all of these."""
+"""Phrases that fit anything (LERF): a prompt matches where it fits better than all of them."""
 TEMPERATURE = 10.0
-"""As in LERF's code. The ranking of pixels and the 0.5 contour don't depend on it."""
+"""As in LERF's code. Neither the ranking of pixels nor the 0.5 contour depends on it."""
 Decode = Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]]
 """Codes to raw CLIP features: `SemanticField.decode_clip`."""
 _CPU_CHUNK = 8192
-"""Codes that a CPU decodes at a time."""
+"""Codes decoded at a time on a CPU."""
 
 
 @dataclass(frozen=True)
 class Queries:
-    """Several prompts as vectors: each has synonyms, any of which may fit, and phrases that it must beat.
+    """Several prompts as vectors: each has synonyms, any of which may fit, and phrases to compete with.
 
+    Vectors shared by several prompts are stored once.
     Vectors are kept once, however many prompts share them.
     """
 
     vectors: Float[Tensor, "v c"]
     """Unit length."""
     positive: tuple[tuple[int, ...], ...]
-    """Of every prompt, the rows that mean it."""
+    """For every prompt, the rows of its synonyms."""
     negative: tuple[tuple[int, ...], ...]
-    """Of every prompt, the rows that it competes with: canonical phrases and negatives of its own."""
+    """For every prompt, the rows it competes with: canonical phrases and its own negatives."""
 
     @classmethod
     def of(
@@ -42,22 +43,24 @@ class Queries:
         prompts: Sequence[Float[Tensor, "s c"]],
         canonical: Float[Tensor, "p c"],
         negatives: Sequence[Float[Tensor, "m c"]] | None = None,
+        against: Sequence[Sequence[int]] | None = None,
     ) -> Queries:
-        """Prompts (a row per synonym) against the canonical phrases and, for each prompt, `negatives`.
+        """Prompts (a row per synonym) against shared phrases, and `negatives` of each prompt.
 
-        Vectors need no unit length. Raises ValueError where a prompt has no vector, or nothing to beat.
+        against: for every prompt, the shared phrases it competes with; default all. Vectors need not have
+        unit length. Raises ValueError if a prompt has no vector, or nothing to compete with.
         """
         own = [canonical[:0]] * len(prompts) if negatives is None else negatives
-        if any(len(p) == 0 or len(canonical) + len(n) == 0 for p, n in zip(prompts, own, strict=True)):
+        chosen = [range(len(canonical))] * len(prompts) if against is None else against
+        if any(len(p) == 0 or len(c) + len(n) == 0 for p, n, c in zip(prompts, own, chosen, strict=True)):
             raise ValueError("every prompt needs a vector, and a phrase to compete with")
         blocks = [canonical]
-        shared = tuple(range(len(canonical)))
         positive, negative, rows = [], [], len(canonical)
-        for prompt, extra in zip(prompts, own, strict=True):
+        for prompt, extra, shared in zip(prompts, own, chosen, strict=True):
             blocks += [prompt, extra]
             positive.append(tuple(range(rows, rows + len(prompt))))
             rows += len(prompt)
-            negative.append(shared + tuple(range(rows, rows + len(extra))))
+            negative.append((*shared, *range(rows, rows + len(extra))))
             rows += len(extra)
         return cls(F.normalize(torch.cat(blocks), dim=-1), tuple(positive), tuple(negative))
 
@@ -69,14 +72,14 @@ class Queries:
         return Queries(self.vectors.to(device), self.positive, self.negative)
 
     def cosines(self, features: Float[Tensor, "... c"]) -> Float[Tensor, "... v"]:
-        """Cosine of every feature to every vector; a zero feature has 0 to all."""
+        """Cosine of every feature with every vector; 0 for a zero feature."""
         return F.normalize(features, dim=-1) @ self.vectors.T
 
     def relevancy_of_cosines(
         self, cosines: Float[Tensor, "... v"], temperature: float = TEMPERATURE
     ) -> Float[Tensor, "q ..."]:
-        """sigmoid(τ (max over synonyms − max over competitors)), which is the smallest of the softmaxes of
-        the best synonym against each competitor (LERF, Kerr et al. 2023): 0…1, above 0.5 where it wins."""
+        """sigmoid(τ (max over synonyms − max over competitors)), the smallest softmax of the best synonym
+        against each competitor (LERF, Kerr et al. 2023): 0…1, above 0.5 where it wins."""
         margins = [
             _largest(cosines, mine) - _largest(cosines, theirs)
             for mine, theirs in zip(self.positive, self.negative, strict=True)
@@ -85,7 +88,7 @@ class Queries:
 
 
 def _largest(cosines: Float[Tensor, "... v"], rows: tuple[int, ...]) -> Float[Tensor, "..."]:
-    """Largest of some columns; column by column, which needs no copy of them all."""
+    """Largest of some columns; column by column, to avoid copying them all."""
     largest = cosines[..., rows[0]]
     for row in rows[1:]:
         largest = torch.maximum(largest, cosines[..., row])
@@ -100,8 +103,8 @@ def relevancy(
 ) -> Float[Tensor, "q ..."]:
     """min over c of exp(τ s_q) / (exp(τ s_q) + exp(τ s_c)) = sigmoid(τ (s_q − max_c s_c)), s = cosine.
 
-    0…1; above 0.5 where the query fits better than every canonical phrase. Vectors need no unit length; a
-    zero feature (nothing rendered) gives 0.5. Source: LERF, Kerr et al. 2023.
+    0…1; above 0.5 where the query fits better than every canonical phrase. Vectors need not have unit length;
+    a zero feature (nothing rendered) gives 0.5. Source: LERF, Kerr et al. 2023.
     """
     prompts = Queries.of(queries[:, None].unbind(), canonical)
     return prompts.relevancy_of_cosines(prompts.cosines(features), temperature)
@@ -111,10 +114,10 @@ def relevancy(
 def cosines_of_codes(
     decode: Decode, codes: Float[Tensor, "n code"], queries: Queries, max_mb: float = 256.0
 ) -> Float[Tensor, "n v"]:
-    """Exact cosines of rendered codes, decoded a chunk at a time: no feature map of an image ever exists.
+    """Exact cosines of rendered codes, decoded in chunks, so that no feature map of a whole image is made.
 
-    max_mb: memory of a chunk's features, about (three copies of float32 live at once); less where there is
-    not that much, and on a CPU, where small chunks stay in its cache and take half the time.
+    max_mb: approximate memory of a chunk's features (three float32 copies live at once); reduced if memory is
+    short, and on a CPU, where small chunks stay in its cache and take half the time.
     """
     chunk = max(int(max_mb * 2**20 / (3 * 4 * queries.vectors.shape[-1])), 1)
     if not codes.is_cuda:

@@ -1,4 +1,4 @@
-"""Gaussians as a PLY file in the layout of 3D Gaussian splatting, which ordinary splat viewers open."""
+"""Splat PLY export, in the layout of 3D Gaussian splatting."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lang3dxl_ns.files import write_atomically
+from lang3dxl_ns.common.files import write_atomically
 
 _SH_OF_GREY = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 √π): colour = 0.5 + this × coefficient."""
@@ -42,7 +42,7 @@ def write_splats(
 
 def _columns(g: Mapping[str, Tensor]) -> dict[str, Float[Tensor, " n"]]:
     means, rest = g["means"], g["features_rest"]
-    # Without harmonics the model keeps logits of colours.
+    # Without harmonics the model stores logits of colours.
     base = g["features_dc"] if rest.shape[1] else (g["features_dc"].sigmoid() - 0.5) / _SH_OF_GREY
     blocks = {
         ("x", "y", "z"): means,

@@ -1,4 +1,4 @@
-"""What people type: prompts with negatives, synonyms for specialist words, and their vectors."""
+"""Prompts and text vectors: parsing, negatives, synonyms for specialist words."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.presets import load_preset
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.query.chat_synonyms import ChatSettings, ChatSynonyms
-from lang3dxl_ns.query.relevancy import CANONICAL, Queries
+from lang3dxl_ns.query.negatives import NEGATIVES, competitors
+from lang3dxl_ns.query.relevancy import Queries
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """`ImageTextEncoder.encode_texts`."""
@@ -28,20 +29,20 @@ _CURLY_QUOTES = str.maketrans("“”„«»", '"""""')
 
 @dataclass(frozen=True)
 class Prompt:
-    """Something to look for."""
+    """A text to search for."""
 
     text: str
     negatives: tuple[str, ...] = ()
-    """What it is to be told apart from, beside the canonical phrases."""
+    """Phrases it competes with, besides the configured ones."""
 
 
 def parse_prompts(typed: str) -> list[Prompt]:
-    """Prompts separated by `;`, each perhaps with negatives: `"windows" not "decorative opening"; dome`.
+    """Prompts separated by `;`, each with optional negatives: `"windows" not "decorative opening"; dome`.
 
-    `not` counts only before a quoted phrase (several: `not "a", "b"`), so that phrases may contain the word;
-    a `;` in quotes doesn't separate. Raises UserError where nothing is asked for.
+    `not` is special only before a quoted phrase (several: `not "a", "b"`), so that phrases may contain the
+    word; a `;` in quotes doesn't separate. Raises UserError if there is no prompt.
     """
-    # Half of a UTF-16 pair, as a broken paste leaves it, is no text: tokenizers refuse it.
+    # An unpaired UTF-16 surrogate, as from a broken paste, is invalid text: tokenizers reject it.
     clean = typed.encode("utf-8", "ignore").decode().translate(_CURLY_QUOTES)
     parts = re.findall(rf"(?:{_QUOTED}|[^;])+", clean)
     prompts = [_parse_prompt(part) for part in parts if part.strip(' "\t\r\n\0')]
@@ -54,7 +55,7 @@ def _parse_prompt(part: str) -> Prompt:
     negatives = [_tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
     text = _tidy(_NEGATIVES.sub(" ", part))
     if not text:
-        raise UserError(f"{part.strip()!r} says what not to find, but not what to find: put that first")
+        raise UserError(f"{part.strip()!r} has only negatives: put what to find first")
     return Prompt(text, tuple(negative for negative in negatives if negative))
 
 
@@ -67,21 +68,27 @@ def _tidy(text: str) -> str:
 
 @dataclass
 class TextConfig:
-    """How words become vectors."""
+    """How prompts become vectors."""
 
     synonyms: Literal["off", "table", "chat"] = "table"
-    """Where common words for specialist ones come from: nowhere; the list of architectural terms that ships
-    with this package; or a chat model behind any OpenAI-compatible endpoint, named by the environment
-    (LANG3DXL_CHAT_URL, LANG3DXL_CHAT_KEY, LANG3DXL_CHAT_MODEL), and the list where that fails."""
+    """Source of common words for specialist ones: off; the shipped table of architectural terms; or a chat
+    model behind an OpenAI-compatible endpoint, set by the environment
+    (LANG3DXL_CHAT_URL, LANG3DXL_CHAT_KEY, LANG3DXL_CHAT_MODEL), with the table as fallback."""
     combine: Literal["joined", "mean", "max"] = "joined"
-    """A prompt and its synonyms as one string with commas (the paper's way), as the mean of their vectors, or
-    each on its own, the best at each pixel counting."""
-    canonical: tuple[str, ...] = CANONICAL
-    """Phrases that fit anything: a prompt is found where it fits better than all of these."""
+    """How a prompt and its synonyms are combined: as one string with commas (the paper's way), as the mean of
+    their vectors, or separately, with the best at each pixel."""
+    negatives: tuple[str, ...] = NEGATIVES
+    """A prompt matches where it fits better than all of these: phrases that fit anything, and other contents
+    of building photos. Phrases named by a prompt or its synonyms don't compete with it."""
+
+    def __post_init__(self) -> None:
+        """Raises UserError if nothing competes with a prompt: it would match everywhere."""
+        if not any(phrase.strip() for phrase in self.negatives):
+            raise UserError("--negatives is empty: give at least one phrase, such as object")
 
 
 class SynonymTable:
-    """The list that ships: configs/synonyms/architecture.yaml."""
+    """The shipped table: configs/synonyms/architecture.yaml."""
 
     @cached_property
     def terms(self) -> dict[str, list[str]]:
@@ -95,7 +102,7 @@ class SynonymTable:
 
 
 def _singulars(words: str) -> list[str]:
-    """The words as they are, and what they may be the plural of."""
+    """The words, and what they may be the plural of."""
     endings = (("", ""), ("s", ""), ("es", ""), ("ies", "y"), ("es", "is"), ("ia", "ion"), ("a", "um"))
     irregular = {"oculi": "oculus", "abaci": "abacus"}
     forms = [words.removesuffix(plural) + single for plural, single in endings if words.endswith(plural)]
@@ -124,7 +131,7 @@ class TextEncoder:
         return ChatSynonyms(ChatSettings.from_environment(), fallback=self._table)
 
     def synonyms(self, text: str) -> list[str]:
-        """Common words for a prompt, most common first; none where it is common itself."""
+        """Common words for a prompt, most common first; none if it is common itself."""
         if self.config.synonyms == "off":
             return []
         if text not in self._synonyms:
@@ -133,16 +140,24 @@ class TextEncoder:
         return self._synonyms[text]
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
-        """Vectors of prompts, their synonyms combined as configured, and of what they compete with."""
+        """Vectors of prompts, with synonyms combined as configured, and of their competitors."""
         return Queries.of(
             [self._positive(prompt.text) for prompt in prompts],
-            self.vectors(self.config.canonical),
+            self.vectors(self.config.negatives),
             [self.vectors(prompt.negatives) for prompt in prompts],
+            [self._against(prompt.text) for prompt in prompts],
         )
 
     def plain_queries(self, texts: Sequence[str]) -> Queries:
-        """Vectors of texts as they are, without synonyms, against the canonical phrases."""
-        return Queries.of(self.vectors(texts)[:, None].unbind(), self.vectors(self.config.canonical))
+        """Vectors of texts without synonyms, against the negatives."""
+        return Queries.of(
+            self.vectors(texts)[:, None].unbind(),
+            self.vectors(self.config.negatives),
+            against=[self._against(text) for text in texts],
+        )
+
+    def _against(self, text: str) -> list[int]:
+        return competitors(self.config.negatives, [text, *self.synonyms(text)])
 
     def _positive(self, text: str) -> Float[Tensor, "s c"]:
         words = [*self.synonyms(text), text]

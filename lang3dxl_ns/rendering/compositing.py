@@ -1,4 +1,4 @@
-"""Screen ellipses to pixels on any device: the differentiable torch rasteriser's entry."""
+"""Compositing of screen ellipses on any device: entry of the differentiable torch rasterizer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lang3dxl_ns.rendering.tile_plan import Rows, make_footprints, make_rows
 
 @dataclass
 class _Segment:
-    """One range of the depth order, and what its backward needs."""
+    """One range of the depth order, with its data for the backward pass."""
 
     extent: tuple[int, int]
     live: Bool[Tensor, " tiles"] | None
@@ -39,10 +39,10 @@ def composite(
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]:
     """Composite screen ellipses front to back over black: image, detached image, alpha.
 
-    Pixels, conics and variances as in `Splats`. Rules of gsplat: alpha at most 0.999, skipped below 1/255;
+    Pixels, conics and variances as in `Splats`. gsplat's rules: alpha at most 0.999, skipped below 1/255;
     a pixel stops before its transmittance reaches 1e-4. The gradient of the detached image reaches only
-    `detached_channels`. `absgrad`: the backward sets `means2d.absgrad`, the sums of absolute values of the
-    pixels' gradients.
+    `detached_channels`. `absgrad`: the backward pass sets `means2d.absgrad`, the sums of the absolute pixel
+    gradients.
     """
     if detached_channels is None:
         detached_channels = channels.new_empty(len(channels), 0)
@@ -52,7 +52,7 @@ def composite(
 
 
 class _Compositing(torch.autograd.Function):
-    """Memory is bounded by compositing the depth order in segments; the last one's rows are kept."""
+    """Composites the depth order in segments to bound memory; only the last segment's rows are kept."""
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -72,7 +72,7 @@ class _Compositing(torch.autograd.Function):
             means2d.view(-1, 2), conics, variances, depths, opacities, width, height
         )
         basis = grid.basis(channels)
-        # In depth order, because tiles read neighbours in depth at about the same time.
+        # In depth order, because tiles read Gaussians adjacent in depth at about the same time.
         seen = [part.index_select(0, footprints.gaussians) for part in (detached_channels, channels)]
         table = torch.cat([*seen, channels.new_ones(len(footprints.gaussians), 1)], dim=1)
         transmittance = table.new_ones(grid.tiles, grid.pixels)
@@ -120,7 +120,7 @@ class _Compositing(torch.autograd.Function):
 
 
 def _upstream(ctx: Any, images: tuple[Tensor | None, ...]) -> Float[Tensor, "tiles pixels c"]:
-    """The gradients of the outputs in tile layout, in the order of the table; absent ones are 0."""
+    """The gradients of the outputs in tile layout, in the order of the table; missing ones are 0."""
     upstream = ctx.table.new_zeros(ctx.grid.tiles, ctx.grid.pixels, ctx.table.shape[1])
     for part, image in zip(upstream.split(ctx.sizes, dim=2), images, strict=True):
         if image is not None:
@@ -158,5 +158,5 @@ def _segment_gradients(
 
 
 def _scatter(values: Tensor, index: Tensor, count: int) -> Tensor:
-    """Values at their places among `count` zeros."""
+    """Values placed at `index` among `count` zeros."""
     return values.new_zeros(count, *values.shape[1:]).index_copy_(0, index, values)

@@ -1,4 +1,4 @@
-"""The CUDA backend: gsplat's kernels behind the signature of `rasterize`."""
+"""gsplat backend: CUDA kernels behind the signature of `rasterize`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.rendering.gaussians import Camera, Gaussians, Rendering
+from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
+from lang3dxl_ns.scene.camera import Camera
 
 _STRATEGY_KEYS = ("width", "height", "n_cameras", "radii", "gaussian_ids", "means2d")
 
@@ -46,7 +47,7 @@ def rasterize_with_gsplat(
         feature_map = maps[..., count : channels.shape[1]]
     elif features is not None:
         black = background.new_zeros(features.shape[1])
-        feature_map, _, _ = _render(gaussians.detach(), _detached(camera), features, black, **settings)
+        feature_map, _, _ = _render(gaussians.detach(), camera.detach(), features, black, **settings)
     return Rendering(
         image=image,
         features=feature_map,
@@ -54,10 +55,6 @@ def rasterize_with_gsplat(
         depth=maps[..., -1:] if render_depth else None,
         info={key: info[key] for key in _STRATEGY_KEYS},
     )
-
-
-def _detached(camera: Camera) -> Camera:
-    return Camera(camera.view_matrix.detach(), camera.intrinsics.detach(), camera.width, camera.height)
 
 
 def _render(

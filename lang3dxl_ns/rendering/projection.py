@@ -1,4 +1,4 @@
-"""Gaussians to screen ellipses: the local affine (EWA) projection with its gradients."""
+"""Projection of Gaussians to screen ellipses: the local affine (EWA) approximation with gradients."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.rendering.gaussians import Camera, Gaussians
+from lang3dxl_ns.rendering.gaussians import Gaussians
+from lang3dxl_ns.scene.camera import Camera
 
-# The affine approximation is bad far outside the image, so the place at which it is taken is held
-# within the image plus this part of its half size on every side (the rule of gsplat 1.4).
+# The affine approximation is poor far outside the image, so it is evaluated at a position clamped to the
+# image plus this share of its half size on every side (gsplat 1.4's rule).
 FRUSTUM_MARGIN = 0.3
-# Larger ellipses overflow float32 in the determinant; only Gaussians that enclose the camera get there.
+# Larger ellipses overflow float32 in the determinant; only Gaussians that enclose the camera are so large.
 MAX_SIGMA_PIXELS = 1e8
 
 
 @dataclass
 class Splats:
-    """Screen ellipses, one for every Gaussian; those that are out of sight have radius and opacity 0."""
+    """Screen ellipses, one for every Gaussian; radius and opacity are 0 for those not visible."""
 
     means2d: Float[Tensor, "1 n 2"]
     """Centres, pixels from the top-left corner. One tensor with gsplat's leading camera axis, because
@@ -33,7 +34,7 @@ class Splats:
     """Distance along the camera's z axis, world units."""
     opacities: Float[Tensor, " n"]
     radii: Int[Tensor, "1 n"]
-    """Three standard deviations along the long axis, whole pixels; 0 where out of sight."""
+    """Three standard deviations along the long axis, whole pixels; 0 if not visible."""
 
 
 def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool) -> Splats:
@@ -64,7 +65,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, 
     axes_x, axes_y = torch.bmm(jacobian, _rotations(gaussians.quats) * scales[:, None]).unbind(1)
     # The determinant as the squared area of the parallelogram of the two rows (Cauchy-Binet), and that
     # of the blurred covariance as a sum of positive terms: nothing cancels, so float32 is enough for
-    # needles, where xx·yy − xy² loses every digit.
+    # needles, where xx·yy − xy² would lose all digits.
     area = torch.linalg.vector_norm(torch.linalg.cross(axes_x, axes_y), dim=1)
     xx, yy, xy = axes_x.square().sum(1), axes_y.square().sum(1), (axes_x * axes_y).sum(1)
     determinant = (area.square() + eps2d * (xx + yy) + eps2d**2).clamp_min(1e-10)
@@ -87,7 +88,7 @@ def _drawable(
     intrinsics: Float[Tensor, "3 3"],
     near: float,
 ) -> Bool[Tensor, " n"]:
-    """In front of the near plane, and not so large on the screen that numbers overflow."""
+    """In front of the near plane, and not so large on screen that numbers overflow."""
     z = points[:, 2]
     sigma = scales.amax(1) * torch.maximum(intrinsics[0, 0], intrinsics[1, 1])
     return (z > near) & (sigma < MAX_SIGMA_PIXELS * z)
@@ -102,7 +103,7 @@ def _jacobian_row(
     centre: Tensor,
     size: int,
 ) -> Float[Tensor, "n 3"]:
-    """Derivative of one pixel coordinate by the world position; `axis`, `forward`: camera axes in it."""
+    """Derivative of a pixel coordinate by the world position; `axis`, `forward`: camera axes in the world."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     slope = slope.clamp(-centre / focal - margin, (size - centre) / focal + margin)
     return (focal / z)[:, None] * (axis - slope[:, None] * forward)

@@ -1,21 +1,25 @@
-"""`rasterize`: the one way from Gaussians to pixels, whatever the device."""
+"""`rasterize`: differentiable rendering of Gaussians on any device."""
 
 from __future__ import annotations
 
-from typing import Literal
+import functools
+from collections.abc import Callable
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.precision import in_full_precision
+from lang3dxl_ns.common.kernels import takes_kernels
+from lang3dxl_ns.common.precision import in_full_precision
 from lang3dxl_ns.rendering.compositing import composite
-from lang3dxl_ns.rendering.gaussians import Camera, Gaussians, Rendering
+from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
 from lang3dxl_ns.rendering.gsplat_backend import rasterize_with_gsplat
-from lang3dxl_ns.rendering.projection import project
+from lang3dxl_ns.rendering.projection import Splats, project
 from lang3dxl_ns.rendering.tile_plan import ALPHA_MIN
+from lang3dxl_ns.scene.camera import Camera
 
-Backend = Literal["auto", "torch", "gsplat"]
+Backend = Literal["auto", "torch", "numba", "gsplat"]
 
 
 @in_full_precision
@@ -34,40 +38,81 @@ def rasterize(
     eps2d: float = 0.3,
     backend: Backend = "auto",
 ) -> Rendering:
-    """Render Gaussians by alpha compositing (3D Gaussian Splatting, Kerbl et al. 2023; rules of gsplat).
+    """Render Gaussians by alpha compositing (3D Gaussian Splatting, Kerbl et al. 2023; gsplat's rules).
 
     Differentiable in the Gaussians, channels, features, background and the camera's view matrix.
 
     Args:
-        channels: what to composite over the background, such as colours after activation.
+        channels: values to composite over the background, such as activated colours.
         background: one value per channel; black by default.
-        features: composited in the same way over black, not divided by alpha.
+        features: composited likewise over black, not divided by alpha.
         detach_features: the features' gradient reaches only `features`, not geometry or opacity.
-        render_depth: also make the expected depth, world units.
+        render_depth: also render the expected depth, world units.
         antialiased: dim small Gaussians by what the screen-space blur adds to their area.
-        absgrad: the backward fills `info["means2d"].absgrad` for gsplat's densification.
-        near: Gaussians whose centres are nearer than this are left out, world units.
-        eps2d: variance added on the screen, pixels².
-        backend: "auto" takes gsplat for tensors on a GPU, else torch (which works on any device).
+        absgrad: the backward pass sets `info["means2d"].absgrad` for gsplat's densification.
+        near: Gaussians with centres nearer than this are left out, world units.
+        eps2d: variance added on screen, pixels².
+        backend: "auto" uses gsplat for tensors on a GPU; on the CPU numba, if it is installed and the
+            environment variable LANG3DXL_CPU_KERNELS is not torch; otherwise torch (which works on any
+            device).
 
-    Gaussians with a NaN or infinite value are not rendered and get no gradient.
+    Gaussians with a NaN or infinite value, in their channels and features too, are not rendered and get no
+    gradient: one would spoil every pixel of its tiles.
 
     Raises:
-        ValueError: sizes that don't fit together.
+        ValueError: sizes that don't fit together, a camera with a NaN or infinite value.
     """
     _check_sizes(gaussians, channels, background, features)
+    if not (camera.view_matrix.isfinite().all() and camera.intrinsics.isfinite().all()):
+        raise ValueError("the camera has a NaN or infinite value: nothing can be rendered from it")
     if background is None:
         background = channels.new_zeros(channels.shape[1])
     if backend == "auto":
-        backend = "gsplat" if gaussians.means.is_cuda else "torch"
-    # gsplat's kernels can't be launched over nothing.
-    render = rasterize_with_gsplat if backend == "gsplat" and len(channels) else _rasterize_with_torch
+        on_cpu: Backend = "numba" if takes_kernels(gaussians.means) else "torch"
+        backend = "gsplat" if gaussians.means.is_cuda else on_cpu
+    # gsplat's kernels can't be launched on empty input.
+    render: Callable[..., Rendering] = functools.partial(_rasterize, backend)
+    if backend == "gsplat" and len(channels):
+        render = rasterize_with_gsplat
+    gaussians, channels, features = _without_broken(gaussians, channels, features)
     camera, place = camera.at_origin(gaussians.means)
     return render(
-        gaussians.without_broken().moved(-place), camera, channels, background,
+        gaussians.moved(-place), camera, channels, background,
         features=features, detach_features=detach_features, render_depth=render_depth,
         antialiased=antialiased, absgrad=absgrad, near=near, eps2d=eps2d,
     )  # fmt: skip
+
+
+def _without_broken(
+    gaussians: Gaussians, channels: Float[Tensor, "n c"], features: Float[Tensor, "n d"] | None
+) -> tuple[Gaussians, Float[Tensor, "n c"], Float[Tensor, "n d"] | None]:
+    """Gaussians with a NaN or infinite value become transparent, black and get no gradient; the rest stay."""
+    g = gaussians
+    with torch.no_grad():
+        total = g.means.sum(1) + g.quats.sum(1) + g.scales.sum(1) + g.opacities + channels.sum(1)
+        if features is not None:
+            total = total + features.sum(1)
+        sound = torch.isfinite(total)
+    if bool(sound.all()):
+        return gaussians, channels, features
+
+    def clean(values: Tensor) -> Tensor:
+        return torch.where(sound.view(-1, *[1] * (values.dim() - 1)), values, 0.0)
+
+    return (
+        Gaussians(*map(clean, vars(g).values())),
+        clean(channels),
+        None if features is None else clean(features),
+    )
+
+
+def _kernels(backend: Backend) -> tuple[Callable[..., Splats], Callable[..., Any]]:
+    """Projection and compositing."""
+    if backend == "numba":
+        from lang3dxl_ns.rendering import fused_compositing, fused_projection
+
+        return fused_projection.project, fused_compositing.composite
+    return project, composite
 
 
 def _check_sizes(
@@ -84,7 +129,8 @@ def _check_sizes(
         raise ValueError(f"{channels.shape[1]} channels, but a background of shape {tuple(background.shape)}")
 
 
-def _rasterize_with_torch(
+def _rasterize(
+    backend: Backend,
     gaussians: Gaussians,
     camera: Camera,
     channels: Float[Tensor, "n c"],
@@ -98,14 +144,15 @@ def _rasterize_with_torch(
     near: float,
     eps2d: float,
 ) -> Rendering:
-    """One pass for everything: depth and features are further channels of the image."""
-    splats = project(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
+    """One pass for everything: depth and features are extra channels of the image."""
+    to_screen, to_pixels = _kernels(backend)
+    splats = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
     attached = [channels]
     if features is not None and not detach_features:
         attached.append(features)
     if render_depth:
         attached.append(splats.depths[:, None])
-    maps, detached_map, alpha = composite(
+    maps, detached_map, alpha = to_pixels(
         splats.means2d, splats.conics, splats.variances, splats.depths, splats.opacities,
         torch.cat(attached, dim=1) if len(attached) > 1 else channels, camera.width, camera.height,
         detached_channels=features if detach_features else None, absgrad=absgrad,

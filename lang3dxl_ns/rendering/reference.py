@@ -1,6 +1,6 @@
-"""A second rasteriser, written for clarity: every Gaussian against every pixel, gradients by autograd.
+"""Reference rasterizer, written for clarity: every Gaussian against every pixel, gradients by autograd.
 
-It shares no arithmetic with the tiled one, and is what that one is tested and measured against. Use float64.
+It shares no arithmetic with the tiled one, which is tested and measured against it. Use float64.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from lang3dxl_ns.rendering.gaussians import Camera, Gaussians, Rendering
+from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
+from lang3dxl_ns.scene.camera import Camera
 
 PIXELS_AT_A_TIME = 64
 
@@ -54,7 +55,7 @@ def rasterize_reference(
 def project_reference(
     gaussians: Gaussians, camera: Camera
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
-    """Pixel centres, axes A with screen covariance A Aᵀ (pixels), and depths by the textbook's matrices."""
+    """Pixel centres, axes A with screen covariance A Aᵀ (pixels), and depths, by textbook formulas."""
     q = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
     identity = torch.eye(3).to(q).expand(len(q), 3, 3)
     cross = torch.linalg.cross(q[:, None, 1:].expand(-1, 3, 3), identity).mT
@@ -80,7 +81,7 @@ def project_reference(
 def whitening_reference(axes: Float[Tensor, "n 2 3"], eps2d: float) -> Float[Tensor, "n 2 2"]:
     """W with W Wᵀ the inverse of the blurred covariance A Aᵀ + ε.
 
-    By QR, which never squares the axes: of a needle a million pixels long the covariance itself has too many
+    By QR, which never squares the axes: for a needle a million pixels long the covariance itself has too many
     digits for float64.
     """
     blur = eps2d**0.5 * torch.eye(2).to(axes).expand(len(axes), 2, 2)
@@ -112,7 +113,7 @@ def composite_reference(
 
     maps = []
     for block in pixels.split(PIXELS_AT_A_TIME):
-        # Leaving out what is skipped in every pixel of the block changes nothing and saves the memory.
+        # Dropping Gaussians skipped in every pixel of the block changes nothing and saves memory.
         with torch.no_grad():
             used = (pixel_alphas(block, means2d, whitening, opacities) > 0).any(0)
         splats = [value[used] for value in (means2d, whitening, opacities, attached, detached)]
@@ -127,7 +128,7 @@ def pixel_weights(
     whitening: Float[Tensor, "n 2 2"],
     opacities: Float[Tensor, " n"],
 ) -> Float[Tensor, "p n"]:
-    """Alpha × transmittance; 0 from the Gaussian on that would take the transmittance to 1e-4 or below."""
+    """Alpha × transmittance; 0 from the first Gaussian that would bring transmittance to 1e-4 or below."""
     alphas = pixel_alphas(pixels, means2d, whitening, opacities)
     after = torch.cumprod(1 - alphas, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)

@@ -1,4 +1,4 @@
-"""View-dependent colour: real spherical harmonics up to degree 3."""
+"""View-dependent color: real spherical harmonics up to degree 3."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.precision import in_full_precision
+from lang3dxl_ns.common.precision import in_full_precision
 
 _BAND_0 = math.sqrt(1 / (4 * math.pi))
 _BAND_1 = math.sqrt(3 / (4 * math.pi))
@@ -22,7 +22,7 @@ _BAND_3_ZONAL = math.sqrt(7 / (16 * math.pi))
 
 
 def _basis(degree: int, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
-    """The basis functions at unit directions, with the signs that Gaussian splatting stores."""
+    """The basis functions at unit directions, with the signs used in Gaussian splatting files."""
     x, y, z = directions.unbind(1)
     columns = [torch.full_like(x, _BAND_0)]
     if degree >= 1:
@@ -55,7 +55,7 @@ def spherical_harmonics(
     directions: Float[Tensor, "n 3"],
     coefficients: Float[Tensor, "n k 3"],
 ) -> Float[Tensor, "n 3"]:
-    """Evaluate one colour per Gaussian from its coefficients; adding 0.5 and clamping is the caller's.
+    """Evaluate one colour per Gaussian from its coefficients; the caller adds 0.5 and clamps.
 
     Directions (camera centre to Gaussian, world frame) may have any length. Bands above `degree` (0…3)
     are ignored. Signs and order are those of Kerbl et al. 2023 (3D Gaussian Splatting).

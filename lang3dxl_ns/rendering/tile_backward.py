@@ -1,9 +1,9 @@
-"""The gradient of compositing: the chunks of the forward in reverse order, recomputed.
+"""Backward pass of compositing: the forward's chunks in reverse order, recomputed.
 
 With transmittance T, alpha a, weight w = a·T and v = Σ channel × upstream, a row's gradient with respect to
 ln(a) in a pixel is w·v − S·a/(1−a) = w·(v − S/T'), where S sums w·v over everything behind it and T' is the
-transmittance there. The channel of ones, which accumulates alpha, makes the light that passes all Gaussians
-need no term of its own.
+transmittance there. The channel of ones, which accumulates alpha, also covers the light that passes all
+Gaussians, without a separate term.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from lang3dxl_ns.rendering.tile_forward import (
 from lang3dxl_ns.rendering.tile_plan import LOG2_E, Rows
 
 SHAPE_COLUMNS = 6
-"""Gradients that every row collects: conic xx, xy, yy; first moments x, y; ln opacity."""
+"""Gradients per row: conic xx, xy, yy; first moments x, y; ln opacity."""
 ABSOLUTE_COLUMNS = 2
 """Sums of the absolute pixel gradients of the screen position, x and y."""
 
@@ -46,9 +46,9 @@ def backward_rows(
 ) -> Float[Tensor, "v columns"]:
     """Gradients of one segment, per Gaussian in depth order.
 
-    Columns: the six of the shape, two absolute ones if asked for, one per channel. `behind` is S of the
-    segments behind this one and is updated in place. The first `detached` channels don't act on the shape.
-    `clamped`: some opacity exceeds ALPHA_MAX, so that alpha may be at its clamp.
+    Columns: the six of the shape, two absolute ones if requested, one per channel. `behind` is S of the
+    segments behind this one, updated in place. The first `detached` channels have no gradient to the shape.
+    `clamped`: some opacity exceeds ALPHA_MAX, so that alpha may be clamped.
     """
     extra = ABSOLUTE_COLUMNS if absolute else 0
     height = sum(len(chunk.tiles) * chunk.depth for chunk in chunks)
@@ -85,7 +85,7 @@ def _chunk_slope(
     detached: int,
     clamped: bool,
 ) -> Float[Tensor, "m pixels"]:
-    """Gradient with respect to ln(alpha) in every pixel; stores the channels' gradient on the way."""
+    """Gradient with respect to ln(alpha) in every pixel; also stores the channels' gradient."""
     shape = (chunk.depth, len(chunk.tiles), basis.shape[1])
     alpha = chunk_alpha(rows, index, basis, scratch).view(shape)
     passing = chunk_transmittance(alpha, chunk.transmittance, scratch)
@@ -117,9 +117,9 @@ def _suffix_sums(
     behind: Float[Tensor, "tiles pixels"],
     out: Float[Tensor, "k b pixels"],
 ) -> Float[Tensor, "k b pixels"]:
-    """For each row the sum over the rows behind it; `behind` is carried on to the chunk in front.
+    """For each row the sum over the rows behind it; `behind` is passed on to the next chunk in front.
 
-    Summed from the back: the total minus a prefix sum loses digits behind nearly opaque Gaussians.
+    Summed from the back, since the total minus a prefix sum loses digits behind nearly opaque Gaussians.
     """
     sums, steps = out.unbind(0), weighted.unbind(0)
     sums[-1].copy_(behind.index_select(0, tiles))

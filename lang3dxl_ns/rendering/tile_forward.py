@@ -1,8 +1,8 @@
-"""Compositing the rows of a segment over the tiles, front to back.
+"""Forward compositing of a segment's rows over the tiles, front to back.
 
 Tiles are composited in *waves* of at most `WAVE` rows each, so that tiles whose pixels have all stopped can
-be dropped early. A wave is cut into *chunks* of tiles with a similar number of rows left, small enough for
-the processor's cache. Only a chunk's transmittance at its start is kept; the backward recomputes the rest.
+be dropped early. A wave is divided into *chunks* of tiles with similar numbers of rows left, small enough for
+the processor's cache. Only the transmittance at a chunk's start is kept; the backward recomputes the rest.
 
 The arrays of a chunk are laid out depth by tile by pixel, so that the scans over depth, which are most of
 the work, read and write contiguous slices.
@@ -24,41 +24,41 @@ from lang3dxl_ns.rendering.tile_plan import ALPHA_MIN, Rows
 
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
-"""A pixel stops before the Gaussian that would take its transmittance to this or below."""
+"""A pixel stops before the Gaussian that would bring its transmittance to this or below."""
 
 WAVE = 32
 CHUNK_ELEMENTS = 1 << 19
 """Elements (tiles × rows × pixels) of one chunk's largest arrays: 2 MB in float32."""
 _MIN_CHUNK_TILES = 64
 _LOG2_ALPHA_MAX = math.log2(ALPHA_MAX)
-# Anything below log2(1/255) serves; exp2 of arguments that underflow is ten times slower.
+# Any value below log2(1/255) works; exp2 of arguments that underflow is ten times slower.
 _LOG2_ALPHA_FLOOR = -10.0
 
 
 @dataclass
 class Chunk:
-    """Tiles composited together, and what the backward needs to do it again."""
+    """Tiles composited together, and the data to repeat it in the backward pass."""
 
     tiles: Int[Tensor, " b"]
     first: int
     """First row of the wave, counted from each tile's start."""
     depth: int
-    """Rows per tile; tiles with fewer are filled up with the padding row."""
+    """Rows per tile; tiles with fewer are padded with the padding row."""
     transmittance: Float[Tensor, "b pixels"]
-    """Before the chunk; 0 where the pixel has stopped."""
+    """At the chunk's start; 0 where the pixel has stopped."""
     stops: bool
-    """Whether some pixel is stopped at the chunk's end."""
+    """Whether some pixel has stopped at the chunk's end."""
 
 
 class Scratch:
-    """Buffers that are reused from chunk to chunk: fresh memory costs more than the arithmetic in it."""
+    """Buffers reused from chunk to chunk: allocating memory costs more than the arithmetic."""
 
     def __init__(self, like: Tensor):
         self._like = like
         self._buffers: dict[str, Tensor] = {}
 
     def take(self, name: str, *shape: int) -> Tensor:
-        """An uninitialised tensor; it holds until the next `take` of the same name."""
+        """An uninitialised tensor, valid until the next `take` of the same name."""
         size = math.prod(shape)
         buffer = self._buffers.get(name)
         if buffer is None or buffer.numel() < size:
@@ -75,8 +75,8 @@ def composite_rows(
 ) -> list[Chunk]:
     """Composite one segment: adds weight × table to `totals` and updates `transmittance`, both in place.
 
-    `table` holds the channels of the visible Gaussians in depth order. Returns the chunks in the order of
-    their computation.
+    `table` holds the channels of the visible Gaussians in depth order. Returns the chunks in order of
+    computation.
     """
     scratch = Scratch(table)
     chunks = []
@@ -98,7 +98,7 @@ def composite_rows(
 def _cut_wave(
     active: Int[Tensor, " t"], remaining: Int[Tensor, " t"], pixels: int
 ) -> Iterator[tuple[Int[Tensor, " b"], int]]:
-    """Cut the active tiles into (tiles, rows per tile) of similar length and bounded size."""
+    """Divide the active tiles into groups (tiles, rows per tile) of similar length and bounded size."""
     lengths, order = torch.sort(remaining.clamp_max(WAVE).int(), descending=True, stable=True)
     active = active.index_select(0, order)
     descending = lengths.neg().tolist()
@@ -139,7 +139,7 @@ def _composite_chunk(
 
 
 def chunk_rows(rows: Rows, tiles: Int[Tensor, " b"], first: int, depth: int) -> Int[Tensor, " depth*b"]:
-    """Row numbers of a chunk, the front of all tiles first; the padding row beyond a tile's last."""
+    """Row numbers of a chunk, depth by depth across its tiles; the padding row beyond a tile's last."""
     step = torch.arange(first, first + depth, device=tiles.device)[:, None]
     index = rows.start.index_select(0, tiles) + step
     return index.masked_fill_(step >= rows.count.index_select(0, tiles), len(rows)).view(-1)
@@ -171,7 +171,7 @@ def gather_coefficients(rows: Rows, index: Int[Tensor, " m"], scratch: Scratch) 
 def chunk_transmittance(
     alpha: Float[Tensor, "k b pixels"], before: Float[Tensor, "b pixels"], scratch: Scratch
 ) -> Float[Tensor, "k+1 b pixels"]:
-    """Transmittance before each row and after the last, without regard to stopping.
+    """Transmittance before each row and after the last, ignoring stops.
 
     Slice by slice, because `cumprod` is slower and a scan over all tiles loses digits.
     """
@@ -185,6 +185,6 @@ def chunk_transmittance(
 
 
 def _just_below(value: float, dtype: torch.dtype) -> float:
-    """`threshold` keeps what is greater; the rule keeps what is equal as well."""
+    """A value for `threshold`, which keeps only what is greater, that also keeps what is equal."""
     rounded = torch.tensor(value, dtype=dtype)
     return float(torch.nextafter(rounded, torch.zeros_like(rounded)))

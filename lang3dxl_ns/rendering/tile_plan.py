@@ -1,4 +1,4 @@
-"""Which Gaussian touches which tile, front to back: the rows that compositing works on. No gradients here.
+"""Tile plan: rows of (tile, Gaussian) pairs, front to back, for compositing. No gradients here.
 
 A *row* is one (tile, Gaussian) pair. Rows are kept as separate one-dimensional columns, because gathering
 those is several times cheaper than gathering rows of a matrix.
@@ -16,19 +16,19 @@ from torch import Tensor
 
 LOG2_E = math.log2(math.e)
 ALPHA_MIN = 1 / 255
-"""A Gaussian is skipped in the pixels where its alpha is below this."""
+"""Alpha below which a Gaussian is skipped in a pixel."""
 
 SMALL_SPLAT_PIXELS = 5
-"""Up to this median reach the smaller tiles are the faster ones (measured: up to 30 %)."""
+"""Up to this median reach, smaller tiles are faster (measured: up to 30 %)."""
 ROWS_PER_SEGMENT = 1 << 20
-"""Rows that are expanded at a time; bounds the memory when Gaussians near the camera cover every tile."""
-# Pixel ranges and the cull test are widened by this much, so that rounding cannot lose a visible pair.
+"""Rows expanded at a time; bounds the memory when Gaussians near the camera cover every tile."""
+# Pixel ranges and the cull test are widened by this much, so that rounding never drops a visible pair.
 _SLACK = 1e-3
 
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The image cut into tiles, and the way between the two layouts."""
+    """The image divided into tiles, and conversion between the two layouts."""
 
     width: int
     height: int
@@ -68,7 +68,7 @@ class TileGrid:
         return image[: self.height, : self.width].contiguous()
 
     def to_tiles(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "tiles pixels c"]:
-        """The pixels beyond the image's edge are 0."""
+        """Pixels outside the image are 0."""
         channels = image.shape[2]
         right = self.columns * self.tile_width - self.width
         below = self.rows * self.tile_height - self.height
@@ -80,7 +80,7 @@ class TileGrid:
 
 @dataclass
 class Footprints:
-    """The Gaussians that may be seen, front to back, each with its conic and its range of tiles.
+    """The potentially visible Gaussians, front to back, each with its conic and its range of tiles.
 
     The quadratic form is kept as steepness·(dx + shear·dy)² + rise·dy²: unlike the conic itself this stays
     accurate in float32 far from the centre of a needle.
@@ -95,7 +95,7 @@ class Footprints:
     rise: Float[Tensor, " v"]
     log2_opacity: Float[Tensor, " v"]
     first_column: Float[Tensor, " v"]
-    """Leftmost tile; a float, as all that is computed from it."""
+    """Leftmost tile; a float, like everything computed from it."""
     first_row: Float[Tensor, " v"]
     columns: Float[Tensor, " v"]
     """Number of tiles along x."""
@@ -103,7 +103,7 @@ class Footprints:
     """Number of tiles in the range."""
 
     def segments(self, budget: int = ROWS_PER_SEGMENT) -> Iterator[tuple[int, int]]:
-        """Cut the depth order into ranges of at most `budget` rows (but at least one Gaussian)."""
+        """Divide the depth order into ranges of at most `budget` rows (but at least one Gaussian)."""
         ends = torch.cumsum(self.tiles, 0)
         first, count = 0, len(ends)
         while first < count:
@@ -118,7 +118,7 @@ class Rows:
     """The rows of one segment, sorted by tile and front to back within a tile; one padding row at the end."""
 
     ranks: Int[Tensor, " r+1"]
-    """Places of the Gaussians in the depth order; the padding row has that of a visible one."""
+    """Positions of the Gaussians in the depth order; the padding row has that of a visible one."""
     coefficients: tuple[Tensor, ...]
     """Six columns: log2 of alpha as a polynomial over the tile's basis."""
     offset_x: Float[Tensor, " r+1"]
@@ -146,7 +146,7 @@ def make_footprints(
 ) -> tuple[Footprints, TileGrid]:
     """Find the Gaussians that may reach 1/255 in some pixel, sort them by depth, choose the tile size."""
     x, y = (column.contiguous() for column in means2d.unbind(1))
-    # Alpha falls to 1/255 where the quadratic form equals this; −inf at opacity 0, NaN stays NaN: both fail.
+    # Alpha falls to 1/255 where the quadratic form equals this; −inf at opacity 0 and NaN both fail the test.
     bound = 2 * torch.log(255 * opacities)
     reach = (bound.clamp_min(0)[:, None] * variances).sqrt() + _SLACK
     reach_x, reach_y = reach.unbind(1)
@@ -154,7 +154,7 @@ def make_footprints(
     top, bottom = _pixel_range(y, reach_y, height)
     seen = (bound >= 0) & (left <= right) & (top <= bottom)
     visible = seen.nonzero().squeeze(1)
-    order = visible.index_select(0, _depth_order(depths.index_select(0, visible)))
+    order = visible.index_select(0, depth_order(depths.index_select(0, visible)))
 
     grid = _choose_grid(width, height, torch.maximum(reach_x, reach_y).index_select(0, order))
     first_column, columns = _tile_range(left, right, grid.tile_width, order)
@@ -177,7 +177,7 @@ def make_footprints(
 
 
 def _pixel_range(centre: Tensor, reach: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """First and last pixel whose centre is within reach; the last is less than the first for none."""
+    """First and last pixel whose centre is within reach; if none is, the last is less than the first."""
     first = (centre - reach - 0.5).ceil_().clamp_(0, size)
     last = (centre + reach - 0.5).floor_().clamp_(-1, size - 1)
     return first, last
@@ -189,8 +189,8 @@ def _tile_range(first: Tensor, last: Tensor, tile: int, order: Tensor) -> tuple[
     return first_tile, (last.index_select(0, order) / tile).floor_() - first_tile + 1
 
 
-def _depth_order(depths: Float[Tensor, " v"]) -> Int[Tensor, " v"]:
-    """Front to back. Positive floats sort like their bits, and for integers there is a radix sort."""
+def depth_order(depths: Float[Tensor, " v"]) -> Int[Tensor, " v"]:
+    """Indices front to back. Positive floats sort like their bits, and integers have a radix sort."""
     keys = depths.view(torch.int32) if depths.dtype == torch.float32 else depths
     return torch.sort(keys, stable=True).indices
 
@@ -205,7 +205,7 @@ def make_rows(
 ) -> Rows:
     """Expand the footprints of one segment to rows, drop those that stay below 1/255, sort by tile.
 
-    `live`: leave out the other tiles (None: all are live).
+    `live`: restrict to these tiles (None: all).
     """
     parts = {name: column[segment[0] : segment[1]] for name, column in vars(footprints).items()}
     slots, columns, rows = _expand(
@@ -246,7 +246,7 @@ def _expand(
     first_row: Float[Tensor, " v"],
     width: Float[Tensor, " v"],
 ) -> tuple[Int[Tensor, " r"], Float[Tensor, " r"], Float[Tensor, " r"]]:
-    """For every tile of every range: which Gaussian, tile column, tile row."""
+    """For every tile of every range: Gaussian, tile column, tile row."""
     starts = torch.cumsum(tiles, 0) - tiles
     slots = torch.repeat_interleave(tiles)
     index = torch.arange(len(slots), device=tiles.device) - starts.index_select(0, slots)
@@ -268,8 +268,8 @@ def _touches(
 ) -> Bool[Tensor, " r"]:
     """Whether the Gaussian at (x, y) from the tile's centre reaches 1/255 on the tile's rectangle of pixels.
 
-    The least value of a convex form over a rectangle that doesn't hold its minimum lies on one of the two
-    edges that face the minimum; on an edge it is the one-dimensional minimum, clamped.
+    The minimum of a convex form over a rectangle that doesn't contain the form's minimum lies on one of the
+    two edges facing it; on an edge it is the one-dimensional minimum, clamped.
     """
     edge_x, edge_y = (grid.tile_width - 1) / 2, (grid.tile_height - 1) / 2
     near_x, near_y = x.clamp(-edge_x, edge_x).sub_(x), y.clamp(-edge_y, edge_y).sub_(y)

@@ -1,4 +1,4 @@
-"""Laws of the encoders that the semantic field is compared with."""
+"""Laws of the baselines' feature decoders."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
 from lang3dxl_ns.baselines.fmgs import neighbour_similarity, pixel_alignment_loss
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
-NAMES = ("lang3dxl", "feature3dgs", "fmgs", "langsplat", "direct")
+NAMES = ("paper", "feature3dgs", "fmgs", "langsplat", "direct")
 CLIP, DENSE = 16, 6
 
 
@@ -48,7 +48,7 @@ def test_gradients_reach_the_codes_and_everything_that_is_trained_and_nothing_el
     if name in ("feature3dgs", "direct"):
         gaussians["codes"] = (
             codes.detach() + 0.1
-        ).requires_grad_()  # they start at 0, where a square is flat
+        ).requires_grad_()  # they start at 0, where a square has no gradient
     clip, dense = encoder(encoder.carried(gaussians))
     (clip.square().sum() + (0 if dense is None else dense.square().sum())).backward()
     trained = [p for group in encoder.parameter_groups().values() for p in group]
@@ -98,7 +98,7 @@ def test_neighbours_are_the_eight_around():
     features[2, 2] = torch.tensor([0.0, 1.0])
     similarity = neighbour_similarity(features)
     assert (similarity[2, 2] == 0).all()
-    assert (similarity == 0).sum() == 16  # the odd one, and once in each of its neighbours
+    assert (similarity == 0).sum() == 16  # the odd one, and once in each neighbour
     assert similarity.shape == (5, 5, 8)
 
 

@@ -9,17 +9,18 @@ import pytest
 import torch
 
 from lang3dxl_ns.benchmarks import rasterizer as benchmark
+from lang3dxl_ns.benchmarks.dense_rasterizer import count_pairs, render_dense
 from lang3dxl_ns.benchmarks.rasterizer import (
     DENSE,
     OURS,
+    TORCH,
     RasterizerBenchmark,
     error_against,
     forward_backward,
     pass_costs,
 )
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.evaluation.dense_rasterizer import count_pairs, render_dense
-from lang3dxl_ns.evaluation.rasterizer_scenes import Case, make_problem, synthetic_cloud
+from lang3dxl_ns.benchmarks.rasterizer_scenes import Case, make_problem, synthetic_cloud
+from lang3dxl_ns.common.errors import UserError
 
 SMALL = [Case("A", 400, 50, 37), Case("B", 400, 50, 37)]
 
@@ -59,7 +60,7 @@ def test_the_dense_baseline_over_a_background_of_one_colour_keeps_that_colour(fl
 def test_the_baseline_does_not_depend_on_its_tile_size(float64_problem, monkeypatch):
     image, _ = render_dense(float64_problem)
     kept, evaluated = count_pairs(float64_problem)
-    monkeypatch.setattr("lang3dxl_ns.evaluation.dense_rasterizer.DENSE_TILE", 50)
+    monkeypatch.setattr("lang3dxl_ns.benchmarks.dense_rasterizer.DENSE_TILE", 50)
     torch.testing.assert_close(render_dense(float64_problem)[0], image)
     assert count_pairs(float64_problem)[0] == kept
     assert kept < evaluated < count_pairs(float64_problem)[1]
@@ -93,7 +94,7 @@ def test_too_few_points_name_the_file_and_the_remedy(tmp_path):
         make_problem(Case("A", 300, 32, 24), scene)
 
 
-def test_a_file_that_is_no_scene_is_refused_with_its_name(tmp_path):
+def test_a_file_that_is_not_a_scene_is_named(tmp_path):
     np.savez(tmp_path / "other.npz", points=np.zeros(3))
     for name in ("other.npz", "missing.npz"):
         with pytest.raises(UserError, match=name):
@@ -141,6 +142,6 @@ def test_a_baseline_that_needs_too_much_memory_is_left_out_and_said_so(tmp_path,
     monkeypatch.setattr(benchmark, "peak_memory", lambda *_: 0)
     RasterizerBenchmark(tmp_path, quick=True, device="cpu", baseline_gigabytes=0).main()
     case = json.loads((tmp_path / "rasterizer.json").read_text())["cases"][0]
-    assert set(case["forward_ms"]) == {OURS, DENSE}
-    assert set(case["forward_backward_ms"]) == {OURS}
+    assert set(case["forward_ms"]) == {OURS, TORCH, DENSE}
+    assert set(case["forward_backward_ms"]) == {OURS, TORCH}
     assert "would need more than 0 GB" in (tmp_path / "rasterizer.md").read_text()

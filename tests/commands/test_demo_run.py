@@ -1,4 +1,4 @@
-"""The demo: its report says what it should, no work is done twice, and a stop keeps what is there."""
+"""The demo command: its report, repeated runs, interruption."""
 
 import json
 import signal
@@ -6,17 +6,18 @@ import signal
 import pytest
 
 from lang3dxl_ns.commands.demo import Demo
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 
 pytestmark = pytest.mark.slow
+
+
+SCENE = {"photos": 8, "test_views": 6, "quick": True, "wild": False}
 
 
 @pytest.fixture(scope="module")
 def demo(tiny_clip, tiny_dense, tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    settings = Demo(
-        out=out, photos=8, steps=6, quick=True, wild=False, clip=str(tiny_clip), dense=str(tiny_dense)
-    )
+    settings = Demo(out=out, clip=str(tiny_clip), dense=str(tiny_dense), steps=6, **SCENE)
     settings.main()
     return settings
 
@@ -28,13 +29,16 @@ def run(demo):
 
 def test_the_report_holds_precision_quality_time_and_memory(run):
     report = json.loads((run / "report.json").read_text())
-    for who in ("field", "teacher"):
-        values = report[who]["AP"].values()
-        assert all(0 <= value <= 1 for value in values)
-        assert report[who]["mAP"] == pytest.approx(sum(values) / len(values))
-    assert report["field"]["psnr"] > 5
+    assert [split["photos"] for split in report["splits"].values()] == [6, 1]
+    for split in report["splits"].values():
+        for who in ("field", "teacher", "limit", "chance"):
+            values = split[who]["AP"].values()
+            assert all(0 <= value <= 1 for value in values)
+            assert split[who]["mAP"] == pytest.approx(sum(values) / len(values))
+        assert split["limit"]["mAP"] > 2 * split["chance"]["mAP"]
+        assert split["colors"]["psnr"] > 5
     assert set(report["seconds"]) == set(report["peak_mb"]) == {"scene", "prepare", "train", "evaluate"}
-    assert report["features"]["clip_l1"] > 0
+    assert report["splits"]["Test views"]["features"]["clip_l1"] > 0
     assert "2-D teacher" in (run / "report.md").read_text()
     assert (run / "report.png").stat().st_size > 10_000
 
@@ -53,21 +57,22 @@ def test_the_same_command_does_nothing_twice_but_goes_on_when_asked_for_more(dem
 
 def test_another_scene_in_the_same_folder_is_refused(demo):
     with pytest.raises(UserError, match="seed 2, and 3 was asked for"):
-        Demo(out=demo.out, seed=3, photos=8, wild=False).main()
+        Demo(out=demo.out, seed=3, **SCENE).main()
 
 
 def test_flags_of_training_reach_it(demo, tmp_path):
     (tmp_path / "scene").symlink_to(demo.out / "scene")
-    settings = Demo(out=tmp_path, photos=8, steps=2, quick=True, wild=False, clip="none", dense="none")
+    settings = Demo(out=tmp_path, steps=2, clip="none", dense="none", **SCENE)
     settings.ns_train = "--pipeline.model.sky-gaussians 0"
     settings.main()
     report = json.loads((tmp_path / "run" / "lang3dxl" / "demo" / "report.json").read_text())
-    assert set(report["field"]) == {"psnr", "cc_psnr", "ssim"}
-    assert "features" not in report
+    for split in report["splits"].values():
+        assert set(split["colors"]) == {"psnr", "cc_psnr", "ssim"}
+        assert not {"field", "features"} & set(split)
 
 
 def test_ctrl_c_while_training_keeps_the_run(demo, tmp_path, monkeypatch):
-    from lang3dxl_ns.model import Lang3DXLModel
+    from lang3dxl_ns.plugin.model import Lang3DXLModel
 
     (tmp_path / "scene").symlink_to(demo.out / "scene")
     original = Lang3DXLModel.get_loss_dict
@@ -78,8 +83,8 @@ def test_ctrl_c_while_training_keeps_the_run(demo, tmp_path, monkeypatch):
         return original(self, *args)
 
     monkeypatch.setattr(Lang3DXLModel, "get_loss_dict", interrupted)
-    settings = Demo(out=tmp_path, photos=8, steps=6, quick=True, wild=False, clip=demo.clip, dense=demo.dense)
-    with pytest.raises(SystemExit, match="same command goes on"):
+    settings = Demo(out=tmp_path, steps=6, clip=demo.clip, dense=demo.dense, **SCENE)
+    with pytest.raises(SystemExit, match="same command continues"):
         settings.main()
     checkpoints = tmp_path / "run" / "lang3dxl" / "demo" / "nerfstudio_models"
     assert [path.name for path in checkpoints.glob("*")] == ["step-000000003.ckpt"]

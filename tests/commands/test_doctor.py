@@ -1,4 +1,4 @@
-"""What the doctor finds, and that every finding that isn't fine says what to do."""
+"""`lang3dxl doctor`: its checks and their remedies."""
 
 import sys
 
@@ -9,7 +9,7 @@ from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands import doctor
 
 
-def test_all_that_is_not_fine_comes_with_a_remedy_and_nothing_secret(tmp_path, monkeypatch, capsys):
+def test_every_problem_comes_with_a_remedy_and_without_secrets(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("LANG3DXL_CHAT_KEY", "sesame-open")
     monkeypatch.setenv("HF_TOKEN", "sesame-open")
     found = list(doctor.findings(tmp_path))
@@ -27,7 +27,7 @@ def test_all_that_is_not_fine_comes_with_a_remedy_and_nothing_secret(tmp_path, m
 @pytest.mark.parametrize(
     ("probe", "verdict", "words"),
     [
-        ("pass", "ok", "draw"),
+        ("pass", "ok", "work"),
         ("raise RuntimeError('no kernel image')", "problem", "no kernel image"),
         ("import time; time.sleep(60)", "note", "not built within"),
     ],
@@ -48,7 +48,7 @@ def test_a_gpu_that_torch_does_not_see_is_a_problem(monkeypatch, tmp_path):
     assert found.verdict == "note"
 
 
-def test_versions_are_held_against_what_the_package_asks_for(monkeypatch, capsys):
+def test_versions_are_checked_against_the_requirements(monkeypatch, capsys):
     monkeypatch.setattr(doctor, "version", lambda name: "1.0" if name == "gsplat" else "9999.1")
     monkeypatch.setattr(doctor, "_requirements", lambda: {"gsplat": "==1.4.0", "torch": ">=2.6"})
     found = {finding.what: finding for finding in doctor.versions()}
@@ -56,7 +56,7 @@ def test_versions_are_held_against_what_the_package_asks_for(monkeypatch, capsys
     assert found["gsplat"].verdict == "problem"
     assert "gsplat==1.4.0" in found["gsplat"].remedy
     monkeypatch.setattr(doctor, "findings", lambda *_: iter([found["gsplat"]]))
-    with pytest.raises(SystemExit, match="1 thing"):
+    with pytest.raises(SystemExit, match="1 problem"):
         main(["doctor"])
 
 

@@ -1,4 +1,4 @@
-"""Laws of the appearance field: what it may change, what it may not, and whose vector is whose."""
+"""Laws of the appearance field: what it may change, and the photos' vectors."""
 
 import io
 import math
@@ -7,15 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
-from lang3dxl_ns.errors import UserError
 from lang3dxl_ns.rendering import Gaussians
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg"]
 
 
 def make_field(names=NAMES, trained=False, scale=1.0, seed=0, **settings) -> AppearanceField:
-    """In float64; `trained` stands for any values that training may have given the weights."""
+    """In float64; `trained` gives the weights arbitrary values, as after training."""
     config = AppearanceConfig(preset="short", **settings)
     generator = torch.Generator().manual_seed(seed)
     field = AppearanceField(config, names, torch.tensor([1.0, -2.0, 0.5]) * scale, scale, generator=generator)
@@ -36,7 +36,7 @@ def make_cloud(n=40, seed=1):
 
 
 def shine(field, cloud, name="a.jpg", visible=None, seed=None):
-    """Colours and opacities in the light of a photo."""
+    """Colours and opacities under a photo's look."""
     gaussians, colours = cloud
     visible = torch.arange(len(colours)) if visible is None else torch.tensor(visible, dtype=torch.long)
     colours, gaussians = field(gaussians, colours, field.vector(name), visible, seed)
@@ -81,7 +81,7 @@ def test_gradients_agree_with_finite_differences():
     field, cloud = make_field(trained=True, opacity_shift=True), make_cloud()
     with torch.no_grad():
         field.output.bias[:3] += 2.0  # away from the clamp at zero
-        field.output.weight[3] *= 0.05  # and the coins undecided
+        field.output.weight[3] *= 0.05  # and opacity shifts undecided
     generator = torch.Generator().manual_seed(2)
     inputs = [cloud[1].requires_grad_(), cloud[0].opacities.requires_grad_(), *field.parameters()]
     weights = [torch.randn(t.shape, generator=generator).double() for t in inputs[:2]]
@@ -123,7 +123,7 @@ def test_every_place_has_a_coordinate_of_its_own_inside_the_unit_cube():
     coordinates = field._unit_cube(field.centre + distances * direction)
     assert (coordinates >= 0).all() and (coordinates <= 1).all()
     assert ((coordinates - 0.5).norm(dim=1).diff() > 0).all()
-    # Inside the scene lengths keep their proportions.
+    # Inside the scene, lengths keep their ratios.
     assert float((coordinates[1] - 0.5).norm()) == pytest.approx(0.3 / 4)
 
 
@@ -171,7 +171,7 @@ def test_chance_of_being_taken_out_is_the_sigmoid_of_the_output(logit):
 
 
 def saved(field):
-    """The field's state as a checkpoint gives it back, read safely."""
+    """The field's state after a round trip through a checkpoint, read safely."""
     file = io.BytesIO()
     torch.save(field.state_dict(), file)
     file.seek(0)
@@ -202,12 +202,12 @@ def test_loading_keeps_the_parameter_that_the_optimiser_holds():
 
 
 def test_unknown_look_names_the_photos():
-    with pytest.raises(UserError, match=r"dusk\.jpg is not a photo .* a\.jpg, b\.jpg"):
+    with pytest.raises(UserError, match=r"dusk\.jpg is not a training photo .* a\.jpg, b\.jpg"):
         make_field().vector("dusk.jpg")
 
 
 def learned_field(unseen, scale=1.0):
-    """Photo a stands at the origin, b beside it and turned round, c far off; d was never learned."""
+    """Photo a is at the origin, b beside it and turned around, c far away; d was never trained."""
     field = make_field([*NAMES, "d.jpg"], unseen=unseen)
     poses = {"a.jpg": (0.0, 1.0), "b.jpg": (1.0, -1.0), "c.jpg": (10.0, 1.0)}
     for name, (x, z) in poses.items():

@@ -47,7 +47,7 @@ def downsampler(kernel="pyramid", hidden=0, bound=10.0, channels=4, trained=Fals
 
 
 def axis_window(size, centre, side):
-    """Average over [centre ± side/2], pixel piece by pixel piece, each read at its middle."""
+    """Average over [centre ± side/2], pixel piece by pixel piece, each sampled at its middle."""
     weights = np.zeros(size)
     for pixel in range(size):
         start, end = max(centre - side / 2, pixel), min(centre + side / 2, pixel + 1)
@@ -65,7 +65,7 @@ def axis_footprint(size, cells, cell, side, finest):
     weights = np.zeros(size)
     for crop in range(count):
         share = np.interp((cell + 0.5) / cells, (np.arange(count) + 0.5) / count, np.eye(count)[crop])
-        weights += share * axis_window(size, size / 2 + (crop - (count - 1) / 2) * shift, side)
+        weights += share * axis_window(size, (crop + 0.5) * size / count, side)
     return weights
 
 
@@ -134,7 +134,7 @@ def test_a_constant_map_stays_constant_up_to_its_borders_and_under_any_mask(
 
 
 def ramp_and_error(name, size, grid, sides):
-    """How far each cell's mean of the pixels' positions is from the cell's centre, in parts of the image."""
+    """Distance of each cell's mean pixel position from the cell's centre, as a fraction of the image."""
     positions = [
         torch.cartesian_prod(*((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in shape)).view(
             *shape, 2
@@ -148,8 +148,8 @@ def ramp_and_error(name, size, grid, sides):
 @pytest.mark.parametrize("name", ["pyramid", "box"])
 @pytest.mark.parametrize("rho", [1, 5, 15])
 def test_a_ramp_keeps_its_position_where_the_window_is_inside(name, rho):
-    """Exactly, for any ratio of map to grid. A window that hangs over the edge lacks that part, so its mean
-    lies at the middle of what is left: the crops of the target have nothing but black out there either."""
+    """Exactly, for any ratio of map to grid. A window over the edge lacks that part, so its mean
+    lies at the middle of the rest: the target's crops are black out there too."""
     error, inside = ramp_and_error(name, (80, 100), (48, 61), [2 / 61, 2 / 61 * rho])
     assert inside.sum() > 500
     assert float(error[inside].max()) < 1e-12
@@ -162,11 +162,11 @@ def test_footprints_keep_a_ramp_where_crops_tile_the_image(rho):
     assert float(error[inside].max()) < 1e-12
 
 
-def test_footprints_repeat_the_displacement_of_crops_that_do_not_tile_the_image():
-    """7 crops, 14 pixels apart, in 100 pixels: the second is centred at 22, its cell at 21.4."""
-    result = downsampler("footprint", channels=2)(seeded(100, 100, 2), (7, 7), [0.28])[0]
-    photo = seeded(100, 100, 2)
-    torch.testing.assert_close(result[3, 1], photo[36:64, 8:36].mean((0, 1)))
+def test_footprints_of_crops_that_do_not_tile_the_image_lie_at_the_middles_of_its_cells():
+    """6 crops of 28 pixels in 99: the second is centred at 24.75, or a quarter."""
+    result = downsampler("footprint", channels=2)(seeded(99, 96, 2), (5, 6), [28 / 96])[0]
+    photo = seeded(99, 96, 2)
+    torch.testing.assert_close(result[2, 1], photo[36:63, 10:38].mean((0, 1)), atol=0.05, rtol=0)
 
 
 def test_at_the_border_the_mean_lies_at_the_middle_of_what_the_window_still_covers():
@@ -180,15 +180,16 @@ def test_at_the_border_the_mean_lies_at_the_middle_of_what_the_window_still_cove
 
 def test_the_footprint_kernel_is_the_mean_over_scales_of_resized_grids_of_crop_means():
     height, width = 96, 120
-    crops = [12, 20, 36]
+    crops = [12, 16, 24]  # all tile the photo, so that none is rounded to a pixel
     photo = seeded(height, width, 3)
     sums = torch.zeros(3, 16, 20, dtype=torch.float64)
     valid = torch.zeros(1, 16, 20, dtype=torch.float64)
     for crop in crops:
         shift = crop // 2
+        counts = [a // shift for a in (height, width)]
         starts = [
-            [shift - (shift - a % shift) // 2 + i * shift - shift for i in range(a // shift)]
-            for a in (height, width)
+            [round((i + 0.5) * a / n - shift) for i in range(n)]
+            for a, n in zip((height, width), counts, strict=True)
         ]
         grid = torch.zeros(4, len(starts[0]), len(starts[1]), dtype=torch.float64)
         for (i, y), (k, x) in itertools.product(enumerate(starts[0]), enumerate(starts[1])):
@@ -205,7 +206,7 @@ def test_the_pyramid_weighs_its_nested_squares_by_the_published_factor():
     kernel = separable_kernel("pyramid", (99, 99), (1, 1), (16 / 99, 64 / 99), torch.float64, CPU)
     weight = torch.einsum("jap,jaq->pq", kernel.rows, kernel.columns)
     centre = 49
-    # Distances on the axis that lie between the half sides 8, 11.3, 16, 22.6, 32 of the five squares.
+    # Distances on the axis between the half sides 8, 11.3, 16, 22.6, 32 of the five squares.
     ring = [float(weight[centre, centre + d]) for d in (0, 9, 13, 19, 27)]
     steps = [a - b for a, b in zip(ring, [*ring[1:], 0.0], strict=True)]
     np.testing.assert_allclose(np.array(steps) / steps[0], [(2 * math.sqrt(2)) ** -j for j in range(5)])

@@ -119,7 +119,7 @@ def test_coordinates_have_a_gradient_at_the_ends_of_the_range_and_on_vertices(va
 
 @pytest.mark.parametrize("dim", [2, 3, 4])
 def test_dense_levels_keep_every_vertex_apart(dim):
-    """Each vertex that [0, 1] touches, both ends included, has an entry of its own; none is left over."""
+    """Each vertex touched by [0, 1], both ends included, has its own entry; none is unused."""
     resolution = 5
     grid = HashGrid(dim, 1, 1, 10, resolution, resolution)
     corners = torch.tensor(list(itertools.product(range(resolution), repeat=dim)))

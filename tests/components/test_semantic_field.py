@@ -6,10 +6,10 @@ import math
 import pytest
 import torch
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.semantic_field import PRESETS, FieldSettings, SemanticField, SemanticFieldConfig
-from lang3dxl_ns.errors import UserError
 
-# Every preset in its form, at a size that a test can afford.
+# Every preset, at a size affordable in a test.
 CONFIGS = {
     "default": {"preset": "default", "log2_table_size": 10, "hidden_width": 32},
     "short": {"preset": "short"},
@@ -50,19 +50,19 @@ def test_paper_preset_has_the_printed_size():
     assert encoding == 16 * 2**8 * 8
     assert field.grid.dense_levels == 0
     assert decoder == 3 * (512 * 512 + 512) + 512 * 896 + 896
-    kinds = [type(layer).__name__ for layer in field.hidden]
+    kinds = [type(layer).__name__ for layer in field.layers]
     assert kinds == ["Linear", "Linear", "Linear", "ReLU"]
 
 
 def test_default_preset_reads_as_many_channels_as_the_official_one():
     field, _ = parameters_on_paper("default")
-    assert field.hidden[0].in_features == parameters_on_paper("official")[0].hidden[0].in_features == 512
-    assert [type(layer).__name__ for layer in field.hidden] == ["Linear", "ReLU", "Linear", "ReLU"]
+    assert field.layers[0].in_features == parameters_on_paper("official")[0].layers[0].in_features == 512
+    assert [type(layer).__name__ for layer in field.layers] == ["Linear", "ReLU", "Linear", "ReLU"]
 
 
 def test_short_preset_puts_fourier_features_beside_eight_levels():
     field, _ = parameters_on_paper("short")
-    assert field.hidden[0].in_features == 3 + 3 * 2 * 4 + 8 * 4
+    assert field.layers[0].in_features == 3 + 3 * 2 * 4 + 8 * 4
 
 
 def test_fourier_features_are_unit_circles_that_turn_once_to_eight_times():
@@ -158,7 +158,7 @@ def test_four_index_passes_make_512_channels_that_do_not_share_coarse_entries():
     assert torch.stack(touched).sum(0).max() == 1
 
 
-def test_index_passes_go_on_until_there_are_as_many_channels_as_clip_has():
+def test_index_passes_continue_until_there_are_as_many_channels_as_clip_has():
     field = make_field("paper", clip_dim=300)
     assert field._read_grid(torch.rand(2, 3)).shape == (2, 300)
 
@@ -291,7 +291,7 @@ def test_the_config_can_be_set_on_a_command_line():
 
 
 def test_short_preset_learns_a_labelled_scene_in_300_steps():
-    """Codes and field together: 400 codes find places that decode to their class' features."""
+    """Codes and field together: 400 codes move to where they decode to their class' features."""
     generator = torch.Generator().manual_seed(0)
     prototypes = 1 + 0.5 * torch.randn(12, 24, generator=generator)
     targets = prototypes[torch.randint(12, (400,), generator=generator)]
@@ -318,33 +318,6 @@ def test_short_preset_learns_a_labelled_scene_in_300_steps():
         schedule.step()
     error = (torch.cat(field(codes), 1) - targets).abs().mean()
     assert error < 0.15 * (targets - targets.mean(0)).abs().mean()
-
-
-def test_dropping_levels_is_the_same_as_closing_them():
-    """What is left decodes as if the dropped levels had held zeros."""
-    field = SemanticField(
-        SemanticFieldConfig(preset="short"), 16, 8, generator=torch.Generator().manual_seed(0)
-    )
-    codes = torch.randn(40, 3)
-    with torch.no_grad():
-        field.grid.table.uniform_(-1, 1)
-        kept = field.grid._ends[2]
-        field.grid.table[kept:] = 0
-    expected = field.decode_clip(codes)
-    for shrunk in field.keep_levels(3):
-        assert torch.equal(shrunk.cut(shrunk.old), shrunk.new)
-    assert field.grid.entries == kept == len(field.grid.table)
-    torch.testing.assert_close(field.decode_clip(codes), expected)
-    field.decode_clip(codes).sum().backward()
-    assert field.grid.table.grad.shape == field.grid.table.shape
-
-
-def test_a_grid_keeps_at_least_one_level_and_not_more_than_it_has():
-    grid = SemanticField(SemanticFieldConfig(preset="short"), 16).grid
-    assert grid.resolved_levels(1.0) == 1 and grid.resolved_levels(0.0) == 8
-    assert grid.levels_in(len(grid.table)) == 8 and grid.levels_in(3) is None
-    with pytest.raises(ValueError, match="8 levels"):
-        grid.keep_levels(9)
 
 
 def test_fourier_features_alone_decode_and_teach_the_codes():

@@ -1,9 +1,9 @@
-"""Captions say what is true of a crop, in the words that people will type."""
+"""Captions of crops: true, and in the words that people type."""
 
 import numpy as np
 import pytest
 
-from lang3dxl_ns.demo.captions import (
+from lang3dxl_ns.demo.clip_training.captions import (
     ADJECTIVES,
     CANONICAL,
     CLASS,
@@ -14,8 +14,8 @@ from lang3dxl_ns.demo.captions import (
     draw_caption,
     words_of,
 )
-from lang3dxl_ns.demo.labels import CATEGORIES
-from lang3dxl_ns.demo.materials import MATERIALS
+from lang3dxl_ns.demo.landmark.labels import CATEGORIES
+from lang3dxl_ns.demo.landmark.materials import MATERIALS
 
 
 @pytest.fixture(scope="module")

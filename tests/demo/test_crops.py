@@ -1,11 +1,11 @@
-"""Soft labels follow what a crop shows, and cutting keeps picture and labels together."""
+"""Soft labels of crops, and cutting that keeps picture and labels together."""
 
 import numpy as np
 import pytest
 import torch
 
-from lang3dxl_ns.demo.captions import CLASS, CLASSES
-from lang3dxl_ns.demo.crops import (
+from lang3dxl_ns.demo.clip_training.captions import CLASS, CLASSES
+from lang3dxl_ns.demo.clip_training.crops import (
     OUTSIDE,
     SAMPLES,
     Crops,
@@ -17,15 +17,15 @@ from lang3dxl_ns.demo.crops import (
     patch_labels,
     soft_labels,
 )
-from lang3dxl_ns.demo.labels import ELEMENT, PART
-from lang3dxl_ns.demo.materials import MATERIALS
-from lang3dxl_ns.demo.views import LandmarkViews
+from lang3dxl_ns.demo.clip_training.views import LandmarkViews
+from lang3dxl_ns.demo.landmark.labels import ELEMENT, PART
+from lang3dxl_ns.demo.landmark.materials import MATERIALS
 
 TOWER, WALL, SKY, DOME = PART["tower"], PART["wall"], PART["sky"], PART["dome"]
 
 
 def crops_of(parts, elements=None, materials=None):
-    """Crops from their sample labels alone."""
+    """Crops made from sample labels alone."""
     parts = np.asarray(parts, np.uint8)
     zeros = np.zeros_like(parts)
     images = torch.zeros(len(parts), 3, 48, 48, dtype=torch.uint8)
@@ -62,7 +62,7 @@ def test_shares_sum_to_one_whatever_a_crop_shows(view):
     assert (shares >= 0).all()
 
 
-def test_a_plain_crop_is_its_class_alone():
+def test_a_crop_of_one_class_has_only_that_class():
     shares = soft_labels(crops_of(filled(DOME)))
     assert shares[0, CLASS["dome"]] == 1
 
@@ -89,14 +89,14 @@ def test_samples_outside_the_view_count_nothing():
     assert shares[0, CLASS["dome"]] == 1
 
 
-def test_a_window_in_a_tower_tells_of_the_tower_and_one_in_a_wall_not_of_the_wall():
+def test_a_window_counts_for_its_tower_but_not_for_its_wall():
     window = filled(ELEMENT["window"])
     tower, wall = (soft_labels(crops_of(filled(part), window))[0] for part in (TOWER, WALL))
     assert tower[CLASS["window"]] > tower[CLASS["tower"]] > 0.01
     assert wall[CLASS["window"]] == 1
 
 
-def test_sky_says_less_than_a_dome_of_the_same_area():
+def test_sky_weighs_less_than_a_dome_of_the_same_area():
     shares = soft_labels(crops_of(filled(DOME, slice(0, SAMPLES // 2), SKY)))[0]
     assert shares[CLASS["dome"]] > 2 * shares[CLASS["sky"]]
 

@@ -1,4 +1,4 @@
-"""Scenes for measuring: as many photos as asked for, of mixed sizes, with tracks, the same for one seed."""
+"""Synthetic collections for the scale benchmark, and its report."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import numpy as np
 from PIL import Image
 
 from lang3dxl_ns.benchmarks.scale import ScaleBenchmark, markdown
-from lang3dxl_ns.demo.crowd import SIZES, write_crowd
-from lang3dxl_ns.preparation.physical_scale import read_reconstruction
+from lang3dxl_ns.demo.landmark.crowd import SIZES, write_crowd
+from lang3dxl_ns.scene.colmap import read_reconstruction
 
 
 def test_a_crowd_is_a_scene_of_mixed_sizes_with_tracks_and_depends_on_its_seed_alone(tmp_path):
@@ -21,7 +21,7 @@ def test_a_crowd_is_a_scene_of_mixed_sizes_with_tracks_and_depends_on_its_seed_a
     for photo in model.photos.values():
         assert len(photo.points) >= 20
         x, _y, z = photo.camera_from_world @ np.column_stack([photo.points, np.ones(len(photo.points))]).T
-        assert np.allclose(photo.fx * x / z + photo.cx, photo.pixels[:, 0], atol=1e-3)
+        assert np.allclose(photo.lens.fx * x / z + photo.lens.cx, photo.pixels[:, 0], atol=1e-3)
         with Image.open(scenes[0] / "images" / photo.name) as image:
             assert image.size == (photo.width, photo.height)
     first, again, other = ([p.read_bytes() for p in sorted(s.rglob("*.jpg"))] for s in scenes)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from lang3dxl_ns.demo.labels import (
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.demo.landmark.labels import (
     BUILDING_PARTS,
     CATEGORIES,
     ELEMENT,
@@ -13,14 +14,13 @@ from lang3dxl_ns.demo.labels import (
     building_mask,
     category_masks,
 )
-from lang3dxl_ns.demo.landmark import FAMILIES, Landmark
-from lang3dxl_ns.demo.materials import MATERIALS
-from lang3dxl_ns.demo.openings import OUTLINES, Openings
-from lang3dxl_ns.demo.photography import random_photo_size, random_view, take_photo
-from lang3dxl_ns.demo.raycast import Camera, cast
-from lang3dxl_ns.demo.shading import ShadowMap
-from lang3dxl_ns.demo.shapes import MISS, Box, Ellipsoid, Frustum, Polytope, gable, prism
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.demo.landmark.landmark import FAMILIES, Landmark
+from lang3dxl_ns.demo.landmark.materials import MATERIALS
+from lang3dxl_ns.demo.landmark.openings import OUTLINES, Openings
+from lang3dxl_ns.demo.landmark.photography import random_photo_size, random_view, take_photo
+from lang3dxl_ns.demo.landmark.raycast import Camera, cast
+from lang3dxl_ns.demo.landmark.shading import ShadowMap
+from lang3dxl_ns.demo.landmark.shapes import MISS, Box, Ellipsoid, Frustum, Polytope, gable, prism
 
 FOOT = (0.3, -0.2, 0.1)
 SOLIDS = {
@@ -101,7 +101,7 @@ def test_projection_inverts_rays():
     np.testing.assert_allclose(z, 7.0, rtol=1e-5)
 
 
-def test_things_between_a_point_and_the_sun_shade_it():
+def test_objects_between_a_point_and_the_sun_shade_it():
     box = Box(PART["wall"], 0, (0.0, 0.0, 0.0), 0.0, 0, (4.0, 4.0, 10.0))
     landmark = Landmark.from_seed(0, "hall")
     weather = random_view(landmark, np.random.default_rng(0), wild=False).weather
@@ -113,7 +113,7 @@ def test_things_between_a_point_and_the_sun_shade_it():
     )
 
 
-def test_one_seed_is_one_photo():
+def test_the_same_seed_gives_the_same_photo():
     first, second, other = (shot_of(seed) for seed in (3, 3, 4))
     for field in ("image", "parts", "elements", "depth", "materials"):
         np.testing.assert_array_equal(getattr(first, field), getattr(second, field))

@@ -1,4 +1,4 @@
-"""The demo's picture: which photos it shows, and that what it shows lies where it should."""
+"""The demo's picture: its choice of photos, and the placement of its panels."""
 
 import numpy as np
 from PIL import Image

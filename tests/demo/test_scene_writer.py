@@ -1,4 +1,4 @@
-"""The demo scene's folder: what COLMAP, a trainer and a scorer read back is what was photographed."""
+"""The demo scene's folder: what COLMAP, a trainer and a scorer read back matches what was rendered."""
 
 import json
 from functools import cache
@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lang3dxl_ns.demo.contact_sheet import contact_sheet
-from lang3dxl_ns.demo.labels import PART, SMALLEST_POSITIVE, building_mask, category_masks
-from lang3dxl_ns.demo.landmark import Landmark
-from lang3dxl_ns.demo.photography import take_photo
-from lang3dxl_ns.demo.scene_writer import DemoScene, photo_view, write_scene
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.preparation.physical_scale import read_reconstruction
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.demo.landmark.contact_sheet import contact_sheet
+from lang3dxl_ns.demo.landmark.labels import PART, SMALLEST_POSITIVE, building_mask, category_masks
+from lang3dxl_ns.demo.landmark.landmark import Landmark
+from lang3dxl_ns.demo.landmark.photography import take_photo
+from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, photo_view, write_scene
+from lang3dxl_ns.scene.colmap import read_reconstruction
 
 PHOTOS, SIZE, SEED = 12, (120, 90), 6
 
@@ -37,7 +37,7 @@ def write(out, **changes):
 
 @cache
 def shot(number):
-    """Photo `number`, taken once more."""
+    """Photo `number`, rendered again."""
     landmark = Landmark.from_seed(SEED, "mosque")
     view, width, height = photo_view(landmark, SEED, number, True, SIZE)
     return take_photo(landmark, view, width, height)
@@ -67,11 +67,11 @@ def photos(folder):
 def projected(photo):
     """Pixels and depths (COLMAP units) of the points that a photo has tracked."""
     x, y, z = photo.camera_from_world @ np.column_stack([photo.points, np.ones(len(photo.points))]).T
-    return np.column_stack([photo.fx * x / z + photo.cx, photo.fy * y / z + photo.cy]), z
+    return np.column_stack([photo.lens.fx * x / z + photo.lens.cx, photo.lens.fy * y / z + photo.lens.cy]), z
 
 
 def test_tracks_respect_visibility(folder):
-    """What a photo shows at a keypoint is at the point's depth, and nothing that walks by."""
+    """A photo's surface at a keypoint is at the point's depth, and not a passer-by."""
     scale = json.loads((folder / "scene.json").read_text())["colmap_from_metres"]["scale"]
     agree, passing = [], []
     for name, photo in photos(folder).items():
@@ -156,7 +156,7 @@ def test_held_out_names_are_those_of_the_interval_split(folder):
 
 def test_calm_photos_share_one_camera_and_exposure(tmp_path):
     folder = write(tmp_path / "calm", photos=4, wild=False)
-    cameras = {(p.width, p.height, p.fx) for p in photos(folder).values()}
+    cameras = {(p.width, p.height, p.lens.fx) for p in photos(folder).values()}
     assert len(cameras) == 1
     assert next(iter(cameras))[:2] == SIZE
     # The sky's top rows are the same sky under the same exposure.

@@ -1,4 +1,4 @@
-"""Training, interrupted or not, gives the same model; the preparation reads it; the shipped one can see."""
+"""Training of the small CLIP: exact resume, losses, and the shipped model's quality."""
 
 import dataclasses
 
@@ -8,21 +8,27 @@ import torch
 from safetensors.torch import load_file
 from transformers import CLIPModel
 
-from lang3dxl_ns.demo import train_dense
-from lang3dxl_ns.demo.captions import ADJECTIVES, CANONICAL, CLASS, GENERIC, Caption
-from lang3dxl_ns.demo.labels import CATEGORIES, ELEMENT, PART, category_masks
-from lang3dxl_ns.demo.materials import MATERIALS
-from lang3dxl_ns.demo.teacher import score_teacher
-from lang3dxl_ns.demo.train_clip import ClipTraining, caption_fit, contrastive_loss, learning_rate, train
-from lang3dxl_ns.demo.views import render_landmark
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.demo.clip_training import train_dense
+from lang3dxl_ns.demo.clip_training.captions import ADJECTIVES, CANONICAL, CLASS, GENERIC, Caption
+from lang3dxl_ns.demo.clip_training.teacher import score_teacher
+from lang3dxl_ns.demo.clip_training.train_clip import (
+    ClipTraining,
+    caption_fit,
+    contrastive_loss,
+    learning_rate,
+    train,
+)
+from lang3dxl_ns.demo.clip_training.views import render_landmark
+from lang3dxl_ns.demo.landmark.labels import CATEGORIES, ELEMENT, PART, category_masks
+from lang3dxl_ns.demo.landmark.materials import MATERIALS
 from lang3dxl_ns.preparation import encoders
 from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
 
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
-    """Coloured noise in place of rendered landmarks: training doesn't mind."""
+    """Coloured noise in place of rendered landmarks, for speed."""
     folder = tmp_path_factory.mktemp("cache")
     rng = np.random.default_rng(0)
     (folder / "train").mkdir()
@@ -66,7 +72,7 @@ def test_a_checkpoint_of_another_model_is_refused(cache, tmp_path):
         train(settings(tmp_path, tmp_path / "clip", resume=True))
 
 
-def test_a_cache_with_too_few_landmarks_is_an_error_where_nobody_renders(cache, tmp_path):
+def test_too_few_landmarks_are_an_error_without_rendering_processes(cache, tmp_path):
     with pytest.raises(UserError, match="holds 2 landmarks"):
         train(settings(cache, tmp_path / "clip", landmarks=3))
 
@@ -162,7 +168,7 @@ def test_the_shipped_models_are_small_and_whole():
 
 
 @pytest.mark.slow
-def test_the_shipped_model_finds_what_it_is_asked_for_on_a_landmark_it_has_never_seen(tmp_path):
+def test_the_shipped_model_finds_prompts_on_an_unseen_landmark(tmp_path):
     views = [np.load(render_landmark(tmp_path, seed, 1))[0] for seed in (0, 1)]
     score = score_teacher(load_image_text_encoder("builtin", "cpu"), views)
     chance = np.mean([[mask.mean() for mask in category_masks(view[3], view[4]).values()] for view in views])

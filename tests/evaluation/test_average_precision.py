@@ -1,4 +1,4 @@
-"""Average precision against values worked out by hand, and what its means leave out."""
+"""Average precision and its means, against values worked out by hand."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def test_values_worked_out_by_hand():
 
 
 def test_pixels_with_one_score_count_as_one_step():
-    """Their order, which is arbitrary, must not decide."""
+    """Their arbitrary order must not matter."""
     truth = np.array([True, False, False, True])
     assert average_precision(np.zeros(4), truth) == pytest.approx(0.5)
     assert average_precision(np.zeros(4), truth[::-1]) == pytest.approx(0.5)
@@ -36,7 +36,7 @@ def test_the_order_of_pixels_and_any_rising_function_of_the_score_change_nothing
     assert average_precision(np.exp(5 * score), truth) == pytest.approx(expected)
 
 
-def test_without_a_positive_there_is_no_value():
+def test_average_precision_is_undefined_without_a_positive():
     assert average_precision(np.zeros((2, 2)), np.zeros((2, 2), bool)) is None
 
 

@@ -21,7 +21,7 @@ def test_predicting_the_mean_scores_as_the_mean():
         assert metrics[f"dense_{name}"] == pytest.approx(metrics[f"dense_{name}_of_mean"])
 
 
-def test_cells_without_weight_have_no_say():
+def test_cells_without_weight_do_not_count():
     target, weight = torch.randn(4, 4, 8), torch.ones(4, 4)
     predicted = target.clone()
     predicted[0] += 100

@@ -1,10 +1,10 @@
-"""One interface to three layouts: the right one is found, and what fits none is told with its file."""
+"""Ground truth in three layouts: detection, and errors that name the file."""
 
 import numpy as np
 import pytest
 from label_sets import box_object, write_holyscenes, write_labels, write_plain
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import (
     GroundTruth,
     find_ground_truth,
@@ -60,13 +60,13 @@ def test_a_photo_of_another_shape_is_refused_with_both_sizes(tmp_path, mask, siz
             GroundTruth(tmp_path / layout).masks("0001", size)
 
 
-def test_a_pixel_of_rounding_is_no_other_shape(tmp_path):
+def test_a_pixel_of_rounding_is_allowed(tmp_path):
     write_plain(tmp_path, "dome", "0001", np.ones((75, 97), bool))
     assert GroundTruth(tmp_path).masks("0001", (37, 48))["dome"].all()
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(UserError, match="nowhere is no folder"):
+    with pytest.raises(UserError, match="nowhere is not a folder"):
         GroundTruth(tmp_path / "nowhere")
 
 
@@ -75,15 +75,15 @@ def test_an_empty_folder_says_what_is_expected(tmp_path):
         GroundTruth(tmp_path)
 
 
-def test_two_layouts_in_one_folder_are_for_the_user_to_tell_apart(tmp_path, mask):
+def test_two_layouts_in_one_folder_are_an_error(tmp_path, mask):
     write_holyscenes(tmp_path, "dome", "0001", mask)
     write_labels(tmp_path, "0001", [box_object("dome", 1, 1, 9, 9)])
-    with pytest.raises(UserError, match="name one of them"):
+    with pytest.raises(UserError, match="name the layout"):
         GroundTruth(tmp_path)
     assert GroundTruth(tmp_path, "lerf_ovs").layout == "lerf_ovs"
 
 
-def test_one_folder_too_high_is_told_where_the_scene_is(tmp_path, mask):
+def test_one_folder_too_high_names_the_scenes_folder(tmp_path, mask):
     write_holyscenes(tmp_path / "all" / "cathedral" / "milano", "dome", "0001", mask)
     with pytest.raises(UserError, match="cathedral"):
         GroundTruth(tmp_path / "all" / "cathedral")
@@ -125,7 +125,7 @@ def test_two_masks_of_one_photo_are_refused(tmp_path, mask):
         GroundTruth(tmp_path)
 
 
-# ── what lies with a scene, and what is held out ────────────────────────────────────────────────────────
+# ── ground truth beside a scene, and held-out photos ────────────────────────────────────────────────────
 
 
 def test_ground_truth_is_found_where_benchmarks_have_it(tmp_path):

@@ -1,10 +1,10 @@
-"""HolyScenes' layout: masks survive JPEG, and what is missing is named."""
+"""Ground truth of HolyScenes: masks in JPEG, and errors that name the file."""
 
 import numpy as np
 import pytest
 from label_sets import write_holyscenes
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
 

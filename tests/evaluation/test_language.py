@@ -1,4 +1,4 @@
-"""The field and its teacher are scored by the same rules."""
+"""Language scores of the field and its teacher, by the same rules."""
 
 import numpy as np
 import torch
@@ -27,6 +27,8 @@ def test_field_and_teacher_are_scored_by_the_same_rules(tmp_path):
     features[..., 7] = 1
     features[torch.from_numpy(mask)] = torch.eye(8)[0]
     size = (20, 30)
-    field, teacher = scorer.field_maps(lambda f: f, features, size), scorer.teacher_maps(features, size)
+    cosines = scorer.queries.cosines(features)
+    field = scorer.named(scorer.queries.relevancy_of_cosines(cosines), size)
+    teacher = scorer.teacher_maps(features, size)
     assert scorer.scores("0001.jpg", field)["ap_domes"] == 1.0
     assert scorer.scores("0001.jpg", teacher, "teacher_")["teacher_ap_domes"] == 1.0

@@ -1,4 +1,4 @@
-"""Labels in JSON: read as drawn, and refused, with the file's name, where anything in them is amiss."""
+"""Ground truth of LERF-OVS: polygons and boxes in JSON, and errors that name the file."""
 
 import json
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from label_sets import box_object, write_labels
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
 
@@ -33,7 +33,7 @@ def test_boxes_follow_the_size_of_the_map(tmp_path):
     assert 100 <= half.mask.sum() <= 121
 
 
-def test_an_outline_may_run_over_the_edge_by_a_hair(tmp_path):
+def test_an_outline_may_exceed_the_edge_slightly(tmp_path):
     write_labels(tmp_path, "0001", [box_object("bear", -1, -0.5, 60.5, 40.5)])
     assert GroundTruth(tmp_path).masks("0001", (40, 60))["bear"].all()
 
@@ -47,24 +47,24 @@ def broken(**changes):
     [
         (broken(segmentation=[[1, 1], [9, 1], [9, 400]]), r"'bear' reaches \(9, 400\), outside the photo"),
         (broken(bbox=[1, 1, 900, 9]), r"reaches \(900, 9\), outside"),
-        (broken(bbox=[9, 1, 1, 9]), "is not left, top, right, bottom"),
+        (broken(bbox=[9, 1, 1, 9]), "is not .left, top, right, bottom"),
         (broken(bbox=[1, 1, 9]), "can't be used"),
         (broken(segmentation=[[1, 1], [9, 1]]), "has 2 points"),
         (broken(segmentation=[[1, 1, 1], [9, 1, 1], [2, 2, 2]]), "can't be used"),
-        (broken(segmentation=[[1, "1"], [9, 1], [2, 2]]), "'1' is no coordinate"),
-        (broken(segmentation=[[1, float("nan")], [9, 1], [2, 2]]), "nan is no coordinate"),
-        (broken(segmentation=[[1, True], [9, 1], [2, 2]]), "True is no coordinate"),
-        (broken(category=""), "no plain name"),
-        (broken(category=7), "no plain name"),
-        (broken(category="../../etc"), "no plain name"),
-        (broken(category=" .. "), "no plain name"),
+        (broken(segmentation=[[1, "1"], [9, 1], [2, 2]]), "'1' is not a coordinate"),
+        (broken(segmentation=[[1, float("nan")], [9, 1], [2, 2]]), "nan is not a coordinate"),
+        (broken(segmentation=[[1, True], [9, 1], [2, 2]]), "True is not a coordinate"),
+        (broken(category=""), "not a plain name"),
+        (broken(category=7), "not a plain name"),
+        (broken(category="../../etc"), "not a plain name"),
+        (broken(category=" .. "), "not a plain name"),
         ({"category": "bear", "bbox": [1, 1, 9, 9]}, "have no 'segmentation'"),
         ({"bbox": [1, 1, 9, 9], "segmentation": []}, "have no 'category'"),
         ("bear", "can't be used"),
         (None, "can't be used"),
     ],
 )
-def test_an_object_that_is_amiss_is_refused_with_the_file(tmp_path, item, message):
+def test_an_invalid_object_is_refused_with_the_file(tmp_path, item, message):
     write_labels(tmp_path, "0001", [item])
     with pytest.raises(UserError, match=message) as error:
         GroundTruth(tmp_path)
@@ -74,17 +74,17 @@ def test_an_object_that_is_amiss_is_refused_with_the_file(tmp_path, item, messag
 @pytest.mark.parametrize(
     ("info", "message"),
     [
-        ({"name": "../../0001.jpg"}, "no plain name"),
-        ({"name": "/etc/passwd"}, "no plain name"),
-        ({"name": "..\\0001.jpg"}, "no plain name"),
-        ({"name": None}, "no plain name"),
+        ({"name": "../../0001.jpg"}, "not a plain name"),
+        ({"name": "/etc/passwd"}, "not a plain name"),
+        ({"name": "..\\0001.jpg"}, "not a plain name"),
+        ({"name": None}, "not a plain name"),
         ({"width": 0}, "a side of 0 pixels"),
         ({"width": 60.5}, "a side of 60.5 pixels"),
         ({"height": "40"}, "a side of '40' pixels"),
         ({"height": 10**9}, "too large"),
     ],
 )
-def test_what_they_say_of_the_photo_is_not_trusted(tmp_path, info, message):
+def test_photo_names_and_sizes_in_labels_are_validated(tmp_path, info, message):
     write_labels(tmp_path, "0001", [box_object("bear", 1, 1, 9, 9)], **info)
     with pytest.raises(UserError, match=message):
         GroundTruth(tmp_path)
@@ -93,13 +93,13 @@ def test_what_they_say_of_the_photo_is_not_trusted(tmp_path, info, message):
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "7", "null", '{"info": {}}', '{"objects": []}', "[" * 100_000]
 )
-def test_a_file_that_is_no_label_is_named(tmp_path, text):
+def test_a_file_that_is_not_a_label_is_named(tmp_path, text):
     (tmp_path / "0001.json").write_text(text)
     with pytest.raises(UserError, match=r"0001\.json"):
         GroundTruth(tmp_path)
 
 
-def test_bytes_that_are_no_text_are_named(tmp_path):
+def test_bytes_that_are_not_text_are_named(tmp_path):
     (tmp_path / "0001.json").write_bytes(b"\xff\xfe{")
     with pytest.raises(UserError, match=r"0001\.json"):
         GroundTruth(tmp_path)
@@ -108,5 +108,5 @@ def test_bytes_that_are_no_text_are_named(tmp_path):
 def test_labels_without_any_object_are_refused(tmp_path):
     path = write_labels(tmp_path, "0001", [])
     assert json.loads(path.read_text())["objects"] == []
-    with pytest.raises(UserError, match="name no object"):
+    with pytest.raises(UserError, match="contain no objects"):
         GroundTruth(tmp_path)

@@ -1,4 +1,4 @@
-"""Anyone's maps, from files to a report: values by hand, and what is amiss is named."""
+"""Scoring of predicted maps: values by hand, and errors that name the file."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ from label_sets import box_object, write_holyscenes, write_labels, write_plain
 from PIL import Image
 
 from lang3dxl_ns import cli
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.average_precision import average_precision
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.predictions import PredictedMaps, score_predictions
@@ -99,7 +99,7 @@ def test_a_missing_map_is_named(scene):
     (maps / "spires" / "0002.npy").unlink()
     with pytest.raises(UserError, match=r"make .*spires/0002\.npy"):
         score_predictions(GroundTruth(truth), maps)
-    with pytest.raises(UserError, match="nowhere is no folder"):
+    with pytest.raises(UserError, match="nowhere is not a folder"):
         PredictedMaps(maps / "nowhere", ["spires"])
 
 
@@ -109,12 +109,12 @@ def test_a_missing_map_is_named(scene):
         (np.zeros(7), r"has shape \(7,\)"),
         (np.zeros((0, 7)), r"has shape \(0, 7\)"),
         (np.full((20, 30), np.nan), "NaN"),
-        (np.zeros((20, 30), complex), "numbers are expected"),
-        (np.array([[{}] * 30] * 20), "can't be read"),  # takes pickle, which runs what a stranger wrote
-        (np.zeros((30, 20)), "another shape"),
+        (np.zeros((20, 30), complex), "not numbers"),
+        (np.array([[{}] * 30] * 20), "can't be read"),  # needs pickle, which can run code
+        (np.zeros((30, 20)), "another aspect ratio"),
     ],
 )
-def test_a_map_that_is_amiss_is_named(scene, score, message):
+def test_an_invalid_map_is_named(scene, score, message):
     truth, maps = scene
     path = write_map(maps, "spires", "0002", score)
     with pytest.raises(UserError, match=message) as error:
@@ -160,7 +160,7 @@ def test_the_command_reports_and_reports_are_put_together(scene, tmp_path, mask,
     with pytest.raises(SystemExit, match="second report of the scene milano"):
         cli.main(["evaluate", "pool", "--reports", reports[0], reports[0], "--out", str(both)])
     (tmp_path / "other.json").write_text('{"results": {}}')
-    with pytest.raises(SystemExit, match=r"other\.json is no report"):
+    with pytest.raises(SystemExit, match=r"other\.json is not a report"):
         cli.main(["evaluate", "pool", "--reports", str(tmp_path / "other.json"), "--out", str(both)])
 
 

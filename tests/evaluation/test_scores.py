@@ -117,7 +117,7 @@ def test_any_of_several_peaks_will_do_but_a_flat_map_locates_nothing():
 
 
 def test_langsplats_smoothing_passes_over_a_lonely_pixel():
-    """The highest pixel is alone, far from the broad object: only smoothing finds that."""
+    """The highest pixel is alone, far from the broad object: only smoothing finds the object."""
     score = np.zeros((120, 160))
     score[40:90, 20:70] = 0.8
     score[10, 150] = 1
@@ -148,7 +148,7 @@ def test_the_majority_of_neighbours_removes_specks():
     assert found[30, 30] and not found[5, 5]
 
 
-def test_of_several_levels_the_one_with_the_highest_smoothed_peak_counts():
+def test_the_level_with_the_highest_smoothed_peak_counts():
     levels = np.zeros((3, 80, 80))
     levels[0, 40, 40] = 1.0
     levels[1, 20:60, 20:60] = 0.6
@@ -156,7 +156,7 @@ def test_of_several_levels_the_one_with_the_highest_smoothed_peak_counts():
     assert np.array_equal(strongest_level(levels), levels[1])
 
 
-# ── what is done to maps before ─────────────────────────────────────────────────────────────────────────
+# ── processing before scoring ───────────────────────────────────────────────────────────────────────────
 
 
 def test_resizing_a_constant_map_keeps_it():

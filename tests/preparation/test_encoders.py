@@ -1,4 +1,4 @@
-"""The real loading code, on saved folders of tiny random models; transformers itself is the reference."""
+"""Encoders: the real loading code on folders of tiny random models, against transformers itself."""
 
 from __future__ import annotations
 
@@ -9,9 +9,16 @@ import pytest
 import torch
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.preparation import encoders
-from lang3dxl_ns.preparation.encoders import find_model, load_dense_encoder, load_image_text_encoder
+from lang3dxl_ns.preparation.encoders import (
+    check_encoders,
+    find_model,
+    load_dense_encoder,
+    load_image_text_encoder,
+    option_prefix,
+)
 
 TEXTS = ["a rose window", "minaret", "the dome of a mosque, seen from far away in the evening light"]
 
@@ -160,7 +167,7 @@ def test_the_builtin_models_say_once_what_they_know(capsys):
     assert load_dense_encoder("builtin", "cpu", tokens=8).encode(torch.rand(30, 40, 3)).shape[:2] == (8, 8)
     load_image_text_encoder("builtin", "cpu")
     said = capsys.readouterr().out
-    assert said.count("knows the demo's landmarks and nothing else") == 1
+    assert said.count("knows landmarks and street façades and nothing else") == 1
     assert "openai/clip-vit-base-patch32" in said
 
 
@@ -230,3 +237,45 @@ def test_half_precision_on_the_gpu_stays_close_to_the_cpu(clip_folder, dino_fold
         assert found.dtype == torch.float32
         assert found.device.type == "cuda"
         assert (found.cpu() - expected).norm() < 0.01 * expected.norm()
+
+
+@pytest.mark.parametrize(
+    ("clip", "dense", "learned", "expected"),
+    [
+        ("builtin", "auto", True, "builtin"),
+        ("openai/clip-vit-base-patch32", "auto", True, "facebook/dinov2-small"),
+        ("builtin", "mine", True, "mine"),
+        ("builtin", "auto", False, "none"),
+        ("none", "auto", True, "none"),
+    ],
+)
+def test_the_built_in_clip_takes_the_built_in_dense_encoder_along(clip, dense, learned, expected):
+    config = Lang3DXLDataManagerConfig(clip=clip, dense=dense)
+    config.settle_targets(learned)
+    assert config.dense == expected
+
+
+def test_whoever_is_offline_is_told_of_both_encoders_and_both_ways_out():
+    with pytest.raises(UserError) as told:
+        check_encoders("openai/clip-vit-base-patch32", "facebook/dinov2-small")
+    message = str(told.value)
+    assert "--pipeline.datamanager.clip builtin" in message
+    assert "hf download openai/clip-vit-base-patch32" in message
+    assert "hf download facebook/dinov2-small" in message
+    assert "--pipeline.datamanager.dense DIR/dinov2-small" in message
+
+
+def test_each_command_is_told_its_own_options():
+    token = option_prefix.set("--")
+    try:
+        with pytest.raises(UserError, match=r"this package: --clip builtin.*use --clip DIR/\S+ --dense DIR/"):
+            check_encoders("openai/clip-vit-base-patch32", "facebook/dinov2-small")
+    finally:
+        option_prefix.reset(token)
+
+
+def test_an_encoder_that_is_here_is_not_asked_for(tiny_clip):
+    with pytest.raises(UserError) as told:
+        check_encoders(str(tiny_clip), "facebook/dinov2-small")
+    assert "openai" not in str(told.value)
+    assert "--pipeline.datamanager.clip DIR" not in str(told.value)

@@ -1,4 +1,4 @@
-"""Where photos count: every source gives the photos a mask file, or none; nothing is made twice."""
+"""Foreground masks from a folder or from prompts."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import torch
 from PIL import Image
 from tiny_models import make_tiny_clipseg
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import foreground
 from lang3dxl_ns.preparation.foreground import find_mask, with_foreground
-from lang3dxl_ns.preparation.photo import Photo
-from lang3dxl_ns.preparation.prepare import PreparationConfig
 from lang3dxl_ns.preparation.segmentation import ClipSeg
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.photo import Photo
 
 NAMES = ["north/a.png", "north/b.png", "c.png"]
 
@@ -54,7 +55,7 @@ def make_photo(folder, name, seed, size=(40, 30)):
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
     Image.fromarray(pixels).save(path)
-    return Photo(name, path, None, *size, fx=40.0, fy=40.0, cx=size[0] / 2, cy=size[1] / 2)
+    return Photo(name, path, None, Lens(*size, fx=40.0, fy=43.0, cx=size[0] / 2, cy=size[1] / 2))
 
 
 def make_mask(path, size=(8, 6), bright=200):
@@ -78,7 +79,7 @@ def test_a_folder_gives_masks_of_any_size_and_the_log_names_photos_without(photo
     assert torch.equal(masked[0].read_mask(), right)
     assert torch.equal(masked[2].read_mask(), right)
     assert masked[1].read_mask() is None  # the whole photo
-    assert lines == ["1 of 3 photos have no mask and count whole: north/b.png"]
+    assert lines == ["1 of 3 photos have no mask and are used whole: north/b.png"]
 
 
 def test_masks_count_from_half_brightness(photos, tmp_path):
@@ -103,7 +104,7 @@ def test_auto_keeps_what_the_data_has_and_none_drops_it(photos, tmp_path):
     assert "north/a.png, north/b.png" in lines[0]
     assert run(found, PreparationConfig(foreground="none"), tmp_path, lines.append) == photos
     assert run(photos, PreparationConfig(), tmp_path, lines.append) == photos
-    assert len(lines) == 1  # without any mask there is nothing to say
+    assert len(lines) == 1  # without any mask there is no message
     assert not (tmp_path / "cache").exists()
 
 
@@ -129,7 +130,8 @@ def test_words_give_the_networks_masks(photos, config, tmp_path):
 
 def test_masks_of_a_distorting_lens_lie_on_the_file(config, tmp_path, seen):
     """So they are undistorted once, with the photo; large photos are shrunk for the network alone."""
-    photo = replace(make_photo(tmp_path, "wide.png", 0, (2000, 1500)), distortion=(0.2, 0.0, 0.0, 0.0))
+    photo = make_photo(tmp_path, "wide.png", 0, (2000, 1500))
+    photo = replace(photo, lens=replace(photo.lens, distortion=(0.2, 0.0, 0.0, 0.0)))
     (masked,) = run([photo], config, tmp_path)
     assert seen == [(768, 1024, 3)]
     with Image.open(masked.mask_path) as image:
@@ -182,10 +184,10 @@ def test_a_photo_in_which_nothing_is_found_counts_whole_and_is_named(photos, con
     monkeypatch.setattr(ClipSeg, "segment", lambda self, image, _: torch.zeros(image.shape[:2]) > 0)
     lines = []
     assert all(photo.read_mask().all() for photo in run(photos, config, tmp_path, lines.append))
-    assert "found nothing in 3 photos, which count whole: north/a.png" in lines[-1]
+    assert "found nothing in 3 photos, which are used whole: north/a.png" in lines[-1]
 
 
-def test_an_unreadable_photo_is_nobody_elses_trouble(photos, config, tmp_path, seen):
+def test_an_unreadable_photo_affects_no_other(photos, config, tmp_path, seen):
     photos[0].path.write_bytes(b"not a photo")
     photos[1].path.unlink()
     masked = run(photos, config, tmp_path)

@@ -8,32 +8,34 @@ import numpy as np
 import pytest
 from scenes import write_scene
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.physical_scale import (
-    PhotoGeometry,
-    Reconstruction,
     crop_sides,
     physical_scales,
     pixel_size,
     pixel_sizes,
     points_in_view,
     propose_scale_range,
-    read_reconstruction,
     relative_scales,
 )
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, read_reconstruction
 
 
 def make_photo(
     points=((0.0, 0.0, 10.0),), pixels=None, width=1000, height=1000, focal=1000.0, name="a.jpg"
-) -> PhotoGeometry:
+) -> TrackedPhoto:
     """A camera at the origin that looks along z."""
     points = np.array(points, dtype=float).reshape(-1, 3)
     if pixels is None:
         pixels = np.tile([width / 2, height / 2], (len(points), 1))
     pose = np.eye(3, 4)
-    return PhotoGeometry(
-        name, width, height, focal, focal, width / 2, height / 2, (), False, pose, points, np.array(pixels)
-    )
+    lens = Lens(width, height, focal, focal, width / 2, height / 2)
+    return TrackedPhoto(name, lens, pose, points, np.array(pixels))
+
+
+def with_lens(photo: TrackedPhoto, **changes) -> TrackedPhoto:
+    return replace(photo, lens=replace(photo.lens, **changes))
 
 
 def make_reconstruction(*photos, points=()) -> Reconstruction:
@@ -102,15 +104,15 @@ def test_relative_scales_are_seven_from_a_twentieth_to_half():
 def test_angle_rules_differ_as_published(ratio, paper, half):
     photo = make_photo(focal=1000 / ratio)
     exact = pixel_size(photo, angle="exact")
-    assert exact == pytest.approx(10 / photo.fx)
+    assert exact == pytest.approx(10 / photo.lens.fx)
     assert pixel_size(photo, angle="paper") / exact == pytest.approx(paper, abs=6e-3)
     assert pixel_size(photo) / exact == pytest.approx(half, abs=6e-3)
 
 
 def test_pixel_size_is_the_mean_of_the_width_and_height_versions():
     photo = make_photo(width=1500, height=500)
-    wide = pixel_size(replace(photo, height=1500))
-    high = pixel_size(replace(photo, width=500))
+    wide = pixel_size(with_lens(photo, height=1500))
+    high = pixel_size(with_lens(photo, width=500))
     assert pixel_size(photo) == pytest.approx((wide + high) / 2)
 
 
@@ -220,16 +222,17 @@ def test_a_mixed_scene_reads_back(mixed_scene):
     reconstruction = read_reconstruction(mixed_scene / "sparse" / "0")
     photos = list(reconstruction.photos.values())
     assert [photo.name for photo in photos] == [f"photo_{i:03d}.jpg" for i in range(6)]
-    assert len({(photo.width, photo.height, photo.fx, photo.cx) for photo in photos}) == 6
+    assert len({(photo.width, photo.height, photo.lens.fx, photo.lens.cx) for photo in photos}) == 6
     assert {photo.width > photo.height for photo in photos} == {True, False}
     assert len(reconstruction.points) == len(reconstruction.colours) > 100
     for photo in photos:
         x, y, z = photo.camera_from_world @ np.column_stack([photo.points, np.ones(len(photo.points))]).T
-        projected = np.column_stack([photo.fx * x / z + photo.cx, photo.fy * y / z + photo.cy])
+        lens = photo.lens
+        projected = np.column_stack([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy])
         assert len(projected) > 20
         assert np.abs(projected - photo.pixels).max() < 1e-6
         assert photo.camera_from_world @ [*photo.centre, 1] == pytest.approx(np.zeros(3), abs=1e-12)
-        assert photo.distortion == ()
+        assert photo.lens.distortion == ()
 
 
 def test_text_and_binary_models_are_the_same(scene, tmp_path):
@@ -259,7 +262,7 @@ def test_keypoints_without_a_finite_3d_point_are_left_out(scene, tmp_path):
 
 
 def test_a_folder_without_a_model_says_what_was_looked_for(tmp_path):
-    with pytest.raises(UserError, match=r"cameras, images and points3D.*colmap"):
+    with pytest.raises(UserError, match=r"cameras, images and points3D.*lang3dxl reconstruct"):
         read_reconstruction(tmp_path)
 
 
@@ -301,7 +304,8 @@ def test_an_unusable_camera_is_named_with_its_photo(tmp_path, model, params, mes
 def test_pillow_writes_png_after_a_model_was_read(scene, tmp_path):
     code = f"""
 from pathlib import Path
-from lang3dxl_ns.preparation.physical_scale import read_reconstruction
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.colmap import read_reconstruction
 read_reconstruction(Path({str(scene)!r}) / "sparse" / "0")
 import numpy as np
 from PIL import Image
@@ -342,7 +346,7 @@ def test_real_scenes_agree_on_the_physical_size(real_scenes):
     )
     plain_sizes, wild_sizes = pixel_sizes(plain)[0], pixel_sizes(wild)[0]
     for name, size in plain_sizes.items():
-        focal_ratio = wild.photos[name].fx / plain.photos[name].fx
+        focal_ratio = wild.photos[name].lens.fx / plain.photos[name].lens.fx
         # A cropped photo has fewer tracks and a smaller field of view: some per cent, no more.
         assert wild_sizes[name] * focal_ratio == pytest.approx(size, rel=0.1)
     proposals = [propose_scale_range(plain, plain_sizes), propose_scale_range(wild, wild_sizes)]

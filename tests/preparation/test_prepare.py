@@ -1,4 +1,4 @@
-"""Preparation's laws: nothing is made twice, nothing stays half-made, one photo's trouble is its own."""
+"""Laws of preparation: no repeated work, no partial files, isolated failures."""
 
 from __future__ import annotations
 
@@ -15,15 +15,17 @@ import torch
 from PIL import Image
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common import console as progress
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import prepare as module
-from lang3dxl_ns.preparation import progress
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
-from lang3dxl_ns.preparation.photo import Photo
-from lang3dxl_ns.preparation.prepare import PreparationConfig, TargetReader, prepare
+from lang3dxl_ns.preparation.prepare import TargetReader, prepare
 from lang3dxl_ns.preparation.pyramid import build_clip_target
 from lang3dxl_ns.preparation.regions import FelzenszwalbRegions, FolderRegions, stored_labels
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.photo import Photo
 
 SCALES = [0.4, 0.8]  # of the photo's width
 NAMES = ["north/a.png", "north/b.png", "south/a.png"]
@@ -83,7 +85,7 @@ def make_photo(folder, name, seed, size=(100, 80)):
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.random.default_rng(seed).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
     Image.fromarray(pixels).save(path)
-    return Photo(name, path, None, *size, fx=90.0, fy=90.0, cx=size[0] / 2, cy=size[1] / 2)
+    return Photo(name, path, None, Lens(*size, fx=90.0, fy=96.0, cx=size[0] / 2, cy=size[1] / 2))
 
 
 def run(photos, config, store, scales=SCALES, pixel_sizes=None, regions=None):
@@ -137,9 +139,9 @@ def test_a_changed_photo_is_made_again_alone(photos, config, store, calls, tmp_p
 def test_a_new_camera_matters_only_where_it_undistorts(photos, config, store, calls):
     run(photos, config, store)
     calls.clear()
-    refined = [replace(photo, fx=91.0) for photo in photos]
+    refined = [replace(photo, lens=replace(photo.lens, fx=91.0)) for photo in photos]
     assert run(refined, config, store).encoded == 0
-    refined[0] = replace(photos[0], distortion=(0.1, 0.0, 0.0, 0.0))
+    refined[0] = replace(photos[0], lens=replace(photos[0].lens, distortion=(0.1, 0.0, 0.0, 0.0)))
     assert run(refined, config, store).encoded == 1
 
 
@@ -229,7 +231,7 @@ def test_the_announced_size_is_that_of_the_stored_numbers(photos, config, store,
 def test_a_disk_that_is_too_small_is_found_before_the_work(photos, config, store, calls, monkeypatch):
     usage = shutil.disk_usage(".")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
-    with pytest.raises(UserError, match=r"targets of 3 photos need .* and 0\.00 GB are free"):
+    with pytest.raises(UserError, match=r"targets of 3 photos need .* and 1\.00 kB are free"):
         run(photos, config, store)
     assert (calls["clip"], calls["dense"]) == (0, 0)
     assert entries(store) == {}
@@ -276,7 +278,7 @@ def test_without_regions_none_are_made_or_read(photos, config, store, calls, mon
     read = []
     original = FeatureStore.read
     monkeypatch.setattr(FeatureStore, "read", lambda *args: read.append(args[1]) or original(*args))
-    reader = run(photos, config, store).reader  # what an earlier run made is there, and left alone
+    reader = run(photos, config, store).reader  # an earlier run's entries exist and are left alone
     assert reader.regions(NAMES[0]) is None
     assert read == []
 

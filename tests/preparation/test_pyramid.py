@@ -7,10 +7,15 @@ from PIL import Image
 from lang3dxl_ns.preparation.pyramid import (
     build_clip_target,
     crop_centres,
-    cut_crops,
     iterate_crops,
     valid_fractions,
 )
+
+
+def cut_crops(photo, side, size, steps=2):
+    """All crops of one scale, and the fraction of each that lies inside the photo."""
+    valid = valid_fractions(*photo.shape[:2], side, steps)
+    return next(iterate_crops(photo, side, size, valid.numel(), steps)), valid
 
 
 def mean_colour(crops):
@@ -26,13 +31,16 @@ def test_grid_counts_are_the_published_ones(side, count):
     assert len(crop_centres(1000, side)) == count
 
 
+@pytest.mark.parametrize("steps", [2, 4])
 @pytest.mark.parametrize("length", [5, 31, 97, 532, 708, 1000])
 @pytest.mark.parametrize("side", [2, 3, 32, 33, 64, 101, 700])
-def test_centres_are_half_a_crop_apart_symmetric_and_inside(length, side):
-    centres = crop_centres(length, side)
-    assert (centres.diff() == side // 2).all()
-    assert 0 <= centres.min() <= centres.max() <= length
-    assert abs(float(centres.float().mean()) - length / 2) <= 0.5
+def test_centres_are_the_middles_of_equal_cells_a_part_of_a_crop_apart(length, side, steps):
+    centres = crop_centres(length, side, steps)
+    cells = (torch.arange(len(centres)) + 0.5) * length / len(centres)
+    assert (centres - cells).abs().max() <= 0.5
+    step = max(2 * (side // 2) // steps, 1)
+    if length >= step:
+        assert step <= length / len(centres) < 2 * step
 
 
 def test_an_axis_shorter_than_half_a_crop_has_its_middle():
@@ -183,6 +191,17 @@ def test_cells_lie_where_the_grid_says():
     expected = (torch.arange(columns) + 0.5) / columns
     middle = target.features[rows // 2, 4:-4, 0]
     assert torch.allclose(middle, expected[4:-4], atol=2e-3)
+
+
+def test_a_finer_grid_has_the_coarse_ones_crops_between_its_own():
+    """The same picture of a ramp, four times as many cells, each at its place."""
+    height, width = 128, 192
+    ramp = ((torch.arange(width) + 0.5) / width).expand(height, width)[..., None].expand(-1, -1, 3)
+    target = build_clip_target(ramp, [32], [1.0], mean_colour, 32, batch_size=64, steps=4)
+    rows, columns = target.features.shape[:2]
+    assert (rows, columns) == (16, 24)
+    expected = (torch.arange(columns) + 0.5) / columns
+    assert torch.allclose(target.features[rows // 2, 2:-2, 0], expected[2:-2], atol=3e-3)
 
 
 def test_the_encoder_never_sees_more_than_a_batch_and_needs_no_gradient():

@@ -1,4 +1,4 @@
-"""Label maps: from colours, from masks that overlap, from files; small, and numbered without gaps."""
+"""Region label maps: from colours, from overlapping masks, from files."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import torch
 from PIL import Image
 from tiny_models import make_tiny_sam
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import segmentation
-from lang3dxl_ns.preparation.photo import Photo
 from lang3dxl_ns.preparation.regions import (
     FelzenszwalbRegions,
     FolderRegions,
@@ -23,8 +22,10 @@ from lang3dxl_ns.preparation.regions import (
     region_source,
     stored_labels,
 )
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.photo import Photo
 
-PHOTO = Photo("north/a.jpg", None, None, 40, 30, 40.0, 40.0, 20.0, 15.0)
+PHOTO = Photo("north/a.jpg", None, None, Lens(40, 30, 40.0, 43.0, 20.0, 15.0))
 IMAGE = torch.zeros(30, 40, 3)
 
 
@@ -50,7 +51,7 @@ def test_nested_masks_give_the_smallest_the_middle_or_the_largest():
     assert not torch.equal(found["small"], found["large"])
 
 
-def test_the_order_of_masks_means_nothing():
+def test_the_order_of_masks_does_not_matter():
     masks = torch.rand(7, 20, 30, generator=torch.manual_seed(0)) > torch.linspace(0.2, 0.9, 7)[:, None, None]
     shuffled = masks[torch.randperm(7, generator=torch.manual_seed(1))]
     for level in ("small", "medium", "large"):
@@ -142,7 +143,7 @@ def test_label_maps_lie_on_the_file_and_are_undistorted_with_it(tmp_path):
     labels = np.tile(np.arange(40), (30, 1))
     (tmp_path / "north").mkdir()
     np.save(tmp_path / "north" / "a.npy", labels)
-    distorted = replace(PHOTO, distortion=(0.4, 0.0, 0.0, 0.0))
+    distorted = replace(PHOTO, lens=replace(PHOTO.lens, distortion=(0.4, 0.0, 0.0, 0.0)))
     found = FolderRegions(tmp_path).labels(distorted, IMAGE)
     assert found.min() == -1
     assert torch.equal(found, distorted.undistort_labels(torch.from_numpy(labels)))
@@ -169,7 +170,7 @@ def test_a_folders_settings_follow_the_file_and_are_none_without_one(tmp_path):
         ("a.png", None),
     ],
 )
-def test_a_file_that_is_no_label_map_is_a_users_error(tmp_path, file, content):
+def test_a_file_that_is_not_a_label_map_is_a_user_error(tmp_path, file, content):
     path = tmp_path / "north" / file
     path.parent.mkdir()
     if content is None:

@@ -1,4 +1,4 @@
-"""The segmenters on saved folders of tiny random models, loaded as real ones are."""
+"""Segmentation networks, on saved folders of tiny random models."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from tiny_models import make_tiny_clipseg, make_tiny_dinov2, make_tiny_grounding_dino, make_tiny_sam
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import segmentation
 from lang3dxl_ns.preparation.segmentation import (
     AutomaticSam,
@@ -114,7 +114,7 @@ def test_one_box_and_no_box_give_a_mask_too(models, monkeypatch):
 def test_automatic_masks_cover_the_image_at_its_own_size(models, monkeypatch):
     for setting, value in {
         "points_per_crop": 3,
-        "pred_iou_thresh": -1e9,  # of a random network no mask is good
+        "pred_iou_thresh": -1e9,  # a random network's masks all score badly
         "stability_score_thresh": -1,
         "crops_nms_thresh": 1.0,
     }.items():

@@ -1,4 +1,4 @@
-"""The store's laws: whole entries or none, one file per name, only what is touched is read."""
+"""Laws of the feature store: atomic entries, one file per name, lazy reading."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.store import FeatureStore
 
 SETTINGS = {"encoder": "abc", "crop_sides": [32, 64]}
@@ -80,7 +80,7 @@ def test_odd_names_never_share_a_file(store):
     for index, name in enumerate(names):
         store.write("clip", name, {"index": torch.tensor(index)}, {"name": index})
     assert [int(store.read("clip", name)["index"]) for name in names] == list(range(len(names)))
-    lower = {file.lower() for file in files(store)}  # not even where upper and lower case are the same
+    lower = {file.lower() for file in files(store)}  # also on case-insensitive file systems
     assert len(lower) == len(names)
     assert all(path.parent == store.root / "clip" for path in store.root.rglob("*.safetensors"))
 
@@ -125,7 +125,7 @@ def test_a_process_killed_while_writing_leaves_no_entry_and_its_leftover_is_remo
     assert not store.is_current("clip", "a.jpg", {})
     (leftover,) = store.root.rglob("*.tmp")
     store.remove_leftovers()
-    assert leftover.exists()  # young: another process may be writing it
+    assert leftover.exists()  # recent: another process may be writing it
     os.utime(leftover, (time.time() - 7200,) * 2)
     store.remove_leftovers()
     assert files(store) == []
@@ -217,7 +217,7 @@ def test_reading_a_slice_does_not_load_the_entry(store):
     assert features[4096].sum() == 0
     assert resident() < 8 * 2**20
     assert features.sum() == 0
-    assert resident() > 60 * 2**20  # the measurement sees what is touched
+    assert resident() > 60 * 2**20  # the measurement does see accessed pages
 
 
 def test_a_bit_that_flipped_makes_an_entry_damaged_and_entries_without_checksum_still_count(store, caplog):
@@ -235,7 +235,7 @@ def test_a_bit_that_flipped_makes_an_entry_damaged_and_entries_without_checksum_
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_a_claim_is_one_processs_alone_and_ends_with_it(store):
+def test_a_claim_excludes_other_processes_and_ends_with_its_own(store):
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:

@@ -1,12 +1,12 @@
-"""From rendered views to what viewers and renders show."""
+"""Outputs for viewers and renders: relevancy, overlay, CLIP colours."""
 
 import pytest
 import torch
-from painted_scene import painted_scene
+from painted_scene import painted_scene, render
 
-from lang3dxl_ns.errors import UserError
-from lang3dxl_ns.query.answer import Asked, ClipColours, Display
-from lang3dxl_ns.query.overlay import overlay
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.answer import Asked, Display
+from lang3dxl_ns.query.heat_maps import overlay
 
 
 @pytest.fixture(scope="module")
@@ -16,19 +16,19 @@ def scene():
 
 @pytest.fixture(scope="module")
 def view(scene):
-    return scene.render(scene.camera("all/0003.jpg"))
+    return render(scene.camera("all/0003.jpg"), torch.zeros(len(scene.gaussians["means"]), 1))
 
 
-def outputs(scene, view, text=None, exact=False, **settings):
+def outputs(scene, view, text=None, **settings):
     queries = {} if text is None else {"queries": scene.queries(scene.prompts(text))}
-    return Asked(scene.scorer(exact), **queries, **settings).outputs(view.image, view.codes, view.alpha)
+    asked = Asked(scene.engine, **queries, **settings)
+    rendered = None if asked.carried is None else render(view.camera, asked.carried).carried
+    return asked.outputs(view.image, rendered, view.alpha)
 
 
-@pytest.mark.parametrize("exact", [False, True])
-def test_relevancies_are_those_that_the_scene_finds(scene, view, exact):
-    colours = ClipColours.of(scene.decode, scene.rendered_codes())
-    found = outputs(scene, view, "dome; window", exact, colours=colours)
-    for i, match in enumerate(scene.match(scene.prompts("dome; window"), view, exact)):
+def test_relevancies_are_those_that_the_scene_finds(scene, view):
+    found = outputs(scene, view, "dome; window")
+    for i, match in enumerate(scene.match(scene.prompts("dome; window"), "all/0003.jpg")):
         torch.testing.assert_close(found[f"relevancy_{i}"][..., 0], match.relevancy)
     assert "relevancy_2" not in found
 
@@ -48,21 +48,10 @@ def test_without_a_prompt_the_overlay_is_the_image(scene, view):
     assert outputs(scene, view)["overlay"] is view.image
 
 
-def test_features_that_differ_have_colours_that_differ(scene, view):
-    colours = ClipColours.of(scene.decode, scene.rendered_codes())
-    picture = outputs(scene, view, colours=colours)["clip_pca"]
-    assert picture.shape == view.image.shape and picture.min() >= 0 and picture.max() <= 1
-    kinds = [picture[view.image[..., 0] == kind].mean(0) for kind in view.image[..., 0].unique()]
-    assert all((a - b).norm() > 0.2 for i, a in enumerate(kinds) for b in kinds[:i])
-
-
-def test_colours_want_something_to_look_at(scene):
-    assert ClipColours.of(scene.decode, torch.zeros(3, 3)) is None
-
-
 def test_where_nothing_is_seen_nothing_is_found(scene, view):
-    empty = torch.zeros_like(view.alpha)
-    found = Asked(scene.scorer(), scene.queries(scene.prompts("dome"))).outputs(view.image, view.codes, empty)
+    asked = Asked(scene.engine, scene.queries(scene.prompts("dome")))
+    rendered = render(view.camera, asked.carried).carried
+    found = asked.outputs(view.image, rendered, torch.zeros_like(view.alpha))
     assert not found["relevancy_0"].any() and torch.equal(found["overlay"], view.image)
 
 

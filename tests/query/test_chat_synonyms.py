@@ -1,4 +1,4 @@
-"""Synonyms from a chat endpoint: a real server on 127.0.0.1, and all the ways in which it fails."""
+"""Synonyms from a chat endpoint: a real server on 127.0.0.1, and its failures."""
 
 import json
 import threading
@@ -8,13 +8,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 import torch
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.chat_synonyms import ChatSettings, ChatSynonyms
 from lang3dxl_ns.query.text import Prompt, SynonymTable, TextConfig, TextEncoder
 
 
 class Server(ThreadingHTTPServer):
-    """Answers as `reply` says: a text to put into a proper answer, or (status, body), after `delay`."""
+    """Replies with `reply`: a text for a valid response, or (status, body), after `delay`."""
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)
@@ -138,7 +138,7 @@ def test_a_slow_endpoint_does_not_hold_up_the_query(chat, server):
     assert time.perf_counter() - start < 0.9
 
 
-def test_nobody_there(chat):
+def test_the_table_answers_for_an_unreachable_server(chat):
     with pytest.warns(UserWarning, match="the table answers instead"):
         assert chat(url="http://127.0.0.1:9/v1")("lintel") == SynonymTable()("lintel")
 

@@ -1,10 +1,10 @@
-"""From pixels back to places."""
+"""Back-projection of matches to 3D, and their boxes."""
 
 import pytest
 import torch
 
 from lang3dxl_ns.query.places import strongest_match, world_points
-from lang3dxl_ns.rendering import Camera
+from lang3dxl_ns.scene.camera import Camera
 
 
 def test_points_project_back_to_their_pixels():

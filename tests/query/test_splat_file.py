@@ -1,4 +1,4 @@
-"""The PLY of Gaussians, read back by an independent reader."""
+"""The splat PLY, read back by an independent reader."""
 
 import numpy as np
 import pytest

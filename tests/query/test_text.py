@@ -1,9 +1,9 @@
-"""What people type becomes prompts, synonyms and vectors."""
+"""Parsing of prompts, synonyms, and text vectors."""
 
 import pytest
 import torch
 
-from lang3dxl_ns.errors import UserError
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.text import Prompt, SynonymTable, TextConfig, TextEncoder, parse_prompts
 
 
@@ -37,7 +37,7 @@ def test_an_empty_prompt_is_refused_in_words(typed):
 
 
 def test_negatives_alone_are_refused_in_words():
-    with pytest.raises(UserError, match="not what to find"):
+    with pytest.raises(UserError, match="only negatives"):
         parse_prompts('not "doors"')
 
 
@@ -68,7 +68,7 @@ def test_plurals_of_several_kinds(plural, term):
 
 @pytest.fixture
 def encode():
-    """A vector per text, the same every time; counts what it is asked."""
+    """A deterministic vector per text; counts the calls."""
     asked = []
 
     def run(texts):
@@ -110,7 +110,7 @@ def test_a_common_word_is_the_same_however_synonyms_are_combined(encode, combine
 
 
 def test_negatives_compete_in_their_own_prompt_only(encode):
-    encoder = TextEncoder(encode, TextConfig(canonical=("object",)))
+    encoder = TextEncoder(encode, TextConfig(negatives=("object",)))
     queries = encoder.queries([Prompt("dome", ("roof", "hat")), Prompt("wall")])
     assert [len(group) for group in queries.negative] == [3, 1]
     own = queries.vectors[list(queries.negative[0])]

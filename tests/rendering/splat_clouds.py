@@ -1,4 +1,4 @@
-"""Random scenes for the rendering tests, and a way to compare two rasterisers on them."""
+"""Random scenes for the rendering tests, and comparison of two rasterisers on them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.rendering import Camera, Gaussians, Rendering
+from lang3dxl_ns.rendering import Gaussians, Rendering
+from lang3dxl_ns.scene.camera import Camera
 
 
 @dataclass
 class Cloud:
-    """Everything that a rendering depends on, as named float64 tensors."""
+    """All inputs of a rendering, as named float64 tensors."""
 
     tensors: dict[str, Tensor]
     intrinsics: Tensor

@@ -1,4 +1,4 @@
-"""gsplat's own densification strategy runs on what the rasteriser reports."""
+"""gsplat's densification strategy on our rasterizer's outputs."""
 
 import pytest
 import torch
@@ -8,6 +8,7 @@ from splat_clouds import make_cloud
 from lang3dxl_ns.rendering import Gaussians, rasterize
 
 
+@pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("absgrad", [False, True])
 def test_the_default_strategy_refines_on_any_device(absgrad):
     torch.manual_seed(0)

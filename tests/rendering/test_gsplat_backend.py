@@ -1,10 +1,11 @@
-"""The gsplat backend: on a GPU against the torch backend; elsewhere what is passed to gsplat and back."""
+"""The gsplat backend: on a GPU against the torch backend; elsewhere the arguments passed and returned."""
 
 import pytest
 import torch
 from splat_clouds import gradients, make_cloud, maps, relative_error
 
-from lang3dxl_ns.rendering import Camera, Gaussians, rasterize
+from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.scene.camera import Camera
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 

@@ -10,6 +10,7 @@ from splat_clouds import Cloud, gaussians, gradients, make_cloud, maps, relative
 from lang3dxl_ns.rendering import rasterize
 from lang3dxl_ns.rendering.reference import rasterize_reference
 
+pytestmark = pytest.mark.usefixtures("backend")
 MODES = [
     {},
     {"detach_features": False},
@@ -22,7 +23,7 @@ def check_float32(cloud: Cloud):
     """Float32 against the reference in float64.
 
     A pair at the threshold of 1/255, or two Gaussians at nearly one depth, may go either way in float32,
-    which shows in the pixel and in the gradient through it; so up to one pixel in a thousand may differ, by
+    which shows in the pixel and its gradient; so up to one pixel in a thousand may differ, by
     little, and is left out then.
     """
     exact, single = cloud.leaves(), cloud.leaves(torch.float32)

@@ -1,11 +1,14 @@
-"""Scenes at the edge of what is allowed."""
+"""Rasterization of degenerate and extreme scenes."""
 
 import pytest
 import torch
 from splat_clouds import gaussians, gradients, make_cloud, maps, relative_error
 
-from lang3dxl_ns.rendering import Camera, Gaussians, rasterize, tile_plan
+from lang3dxl_ns.rendering import Gaussians, rasterize, tile_plan
 from lang3dxl_ns.rendering.reference import rasterize_reference
+from lang3dxl_ns.scene.camera import Camera
+
+pytestmark = pytest.mark.usefixtures("backend")
 
 
 def assert_all_finite(rendering, leaves):
@@ -85,6 +88,33 @@ def test_broken_gaussians_are_left_out_and_get_no_gradient(name, broken):
         assert found[parameter][10:].any()
 
 
+@pytest.mark.parametrize("name", ["channels", "features"])
+@pytest.mark.parametrize("broken", [float("nan"), float("inf"), float("-inf")])
+def test_a_gaussian_of_broken_colours_is_left_out_alone(name, broken):
+    """The picture is that of the others: no pixel of its tiles is spoiled."""
+    cloud = make_cloud(40, 24, 20, size=0.3)
+    without = cloud.leaves(torch.float32)
+    with torch.no_grad():
+        without["opacities"][3] = 0
+    expected = cloud.render(rasterize, without)
+    ours = cloud.leaves(torch.float32)
+    with torch.no_grad():
+        ours[name][3] = broken
+    found = cloud.render(rasterize, ours)
+    for key, value in maps(found).items():
+        torch.testing.assert_close(value, maps(expected)[key])
+    assert not assert_all_finite(found, ours)["means"][3].any()
+
+
+@pytest.mark.parametrize("part", ["view_matrix", "intrinsics"])
+@pytest.mark.parametrize("broken", [float("nan"), float("inf")])
+def test_a_broken_camera_is_an_error(part, broken):
+    cloud = make_cloud(5, 8, 8)
+    (cloud.intrinsics if part == "intrinsics" else cloud.tensors[part])[0, 2] = broken
+    with pytest.raises(ValueError, match="camera has a NaN"):
+        cloud.render(rasterize, cloud.leaves())
+
+
 def test_broken_colours_of_unseen_gaussians_do_no_harm():
     cloud = make_cloud(60, 30, 20)
     cloud.tensors["means"][:10, 2] = -5
@@ -112,6 +142,7 @@ def test_a_long_needle_is_as_exact_in_float32_far_from_its_centre():
     assert float((image - expected).abs().max()) < 2e-4
 
 
+@pytest.mark.parametrize("backend", ["torch"], indirect=True)
 def test_cutting_the_depth_order_into_segments_changes_nothing(monkeypatch):
     cloud = make_cloud(500, 60, 40, size=0.15)
     whole = cloud.leaves()
@@ -125,6 +156,7 @@ def test_cutting_the_depth_order_into_segments_changes_nothing(monkeypatch):
         assert relative_error(value, expected_gradients[name]) < 1e-11, name
 
 
+@pytest.mark.parametrize("backend", ["torch"], indirect=True)
 def test_gaussians_close_to_the_camera_do_not_blow_up_the_memory(monkeypatch):
     expand, expanded = tile_plan._expand, []
 

@@ -1,0 +1,126 @@
+"""`lang3dxl benchmark real-photos`: train on scenes of real photos, and score what there is truth for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lang3dxl_ns.baselines.rows import FULL, choose_rows
+from lang3dxl_ns.benchmarks.ablation import make_all
+from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+
+_SEEN, _TEACHER = "seen_", "seen_teacher_"
+COLORS = {
+    "psnr": "PSNR",
+    "cc_psnr": "PSNR, color-corrected",
+    "clip_cosine": "CLIP cosine",
+    "gaussians": "Gaussians",
+    "setup_seconds": "set-up, CPU s",
+    "train_seconds": "training, CPU s",
+    "train_peak_mb": "memory, MB",
+}
+
+
+@dataclass
+class RealPhotos:
+    """Train on real photos by the README's command and score them: colors in held-out photos and, where a
+    scene has ground_truth/, words in the masked photos that training saw, beside the 2-D teacher.
+
+    Finished runs are kept: the command can be interrupted and repeated at any time. Photos without a COLMAP
+    model are reconstructed first.
+    """
+
+    scene: tuple[Path, ...]
+    """Folders of photos, with ground_truth/ or without."""
+    out: Path
+    """Folder for real_photos.md and the results of every run."""
+    baselines: bool = False
+    """Whether the baselines run too, on the scenes with ground truth."""
+    iterations: int = 1_000
+    """Training iterations."""
+    scale: float = 0.25
+    """Size of the training photos relative to those on disk."""
+    clip: str = "builtin"
+    """CLIP: "builtin", a Hugging Face name or a folder."""
+    dense: str = "auto"
+    """Dense encoder: the same choices, or "none"."""
+    ns_train: str = ""
+    """Extra flags of `ns-train lang3dxl` in one string."""
+
+    def main(self) -> None:
+        scenes = _labels(self.scene)
+        settings = RunSettings(self.clip, self.dense, "auto", self.scale, 64, self.ns_train, "none")
+        systems = [row for row in choose_rows(("systems",), True, False) if row.trains and row.name != FULL]
+        full = choose_rows((FULL,), True, False)
+        runs = [
+            Run(row, path, label, 0, self.iterations)
+            for label, path in scenes.items()
+            for row in [*full, *(systems if self.baselines and (path / "ground_truth").is_dir() else [])]
+            if row.trains
+        ]
+        make_all(runs, ScoredRuns(self.out, settings), self._write)
+
+    def _write(self, figures: Mapping[Run, Mapping[str, float]], failed: Mapping[Run, str]) -> None:
+        text = [
+            "# Real photos",
+            f"    {command_line('lang3dxl benchmark real-photos', self)}",
+            describe_machine(),
+            *tables(figures),
+            *(f"Not run: {run.name}: {reason}" for run, reason in failed.items()),
+        ]
+        data = {run.name: dict(found) for run, found in figures.items()}
+        write_report(self.out, "real_photos", "\n\n".join(text) + "\n", data)
+
+
+def tables(figures: Mapping[Run, Mapping[str, float]]) -> list[str]:
+    """A table of colors, and for each scene with ground truth one of words, in Markdown."""
+    shown = {key: name for key, name in COLORS.items() if any(key in found for found in figures.values())}
+    colors = [
+        [run.label, run.row.label, *(_figure(found.get(key)) for key in shown)]
+        for run, found in figures.items()
+    ]
+    parts = ["## Held-out photos", markdown_table(["scene", "system", *shown.values()], colors)]
+    for label in dict.fromkeys(run.label for run in figures):
+        mine = {run: found for run, found in figures.items() if run.label == label}
+        words = _words(mine)
+        if words:
+            parts += [f"## Words in the masked photos of {label}, average precision", words]
+    return parts
+
+
+def _words(figures: Mapping[Run, Mapping[str, float]]) -> str:
+    """Categories by system, and the 2-D teacher of the full method; empty without ground truth."""
+    found = [
+        key.removeprefix(f"{_SEEN}ap_") for run in figures for key in figures[run] if f"{_SEEN}ap_" in key
+    ]
+    categories = [name for name in dict.fromkeys(found) if name]
+    rows: list[Sequence[str]] = []
+    for run, values in figures.items():
+        kinds = {run.row.label: _SEEN} | ({"2-D teacher": _TEACHER} if run.row.name == FULL else {})
+        for system, prefix in kinds.items():
+            cells = [values.get(f"{prefix}ap_{name}") for name in categories]
+            rows.append([system, *map(_figure, cells), _figure(values.get(f"{prefix}map"))])
+    return markdown_table(["", *categories, "mean"], rows) if categories else ""
+
+
+def _figure(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.2f}"
+
+
+def _labels(scenes: Sequence[Path]) -> dict[str, Path]:
+    """The scenes by the names of their folders. Raises UserError for none, missing ones, and equal names."""
+    found: dict[str, Path] = {}
+    for scene in (path.expanduser().absolute() for path in scenes):
+        if not scene.is_dir():
+            raise UserError(f"{scene} is not a folder of photos")
+        if scene.name in found:
+            raise UserError(f"two scenes are called {scene.name}: rename a folder")
+        found[scene.name] = scene
+    if not found:
+        raise UserError("give --scene one or more folders of photos")
+    return found

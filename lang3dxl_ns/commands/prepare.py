@@ -1,0 +1,63 @@
+"""`lang3dxl prepare`: make a scene's targets before training, or delete unused ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lang3dxl_ns.preparation.settings import PreparationConfig
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+
+
+@dataclass(kw_only=True)
+class Prepare(PreparationConfig):
+    """Make the targets that training learns from: CLIP features of crops in physical scale, dense features.
+
+    `ns-train lang3dxl` makes missing targets itself; this command makes them in advance. It can be
+    interrupted and repeated at any time.
+    """
+
+    data: Path
+    """Folder of photos, with images/ and sparse/0/ or without a model, or a video."""
+    cache_dir: Path | None = None
+    """Folder for the targets (default: lang3dxl_cache inside the data folder)."""
+    clean: bool = False
+    """Make nothing; delete targets that these settings and the scene's photos do not use (such as those of
+    removed photos, or dense features with --dense none)."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.preparation.encoders import check_encoders, option_prefix
+        from lang3dxl_ns.preparation.store import FeatureStore
+
+        option_prefix.set("--")
+        if not self.clean:
+            check_encoders(self.clip, self.dense)
+        datamanager = open_datamanager(self, self.data, self.cache_dir)
+        if self.clean:
+            files, freed = datamanager.clean_store()
+            print(f"Deleted {files} files, {freed / 1e6:.1f} MB, from {datamanager.cache_dir}")
+        elif datamanager.targets is not None:
+            print(f"Targets of {len(datamanager.targets.names)} photos are in {datamanager.cache_dir}")
+        for kind, (files, size) in FeatureStore(datamanager.cache_dir).sizes().items():
+            print(f"  {kind}: {files} files, {size / 1e6:.1f} MB")
+
+
+def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:
+    """The data manager for a folder of photos with these settings; prepares nothing yet."""
+    from lang3dxl_ns.methods import DEVICE
+    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
+    from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+    from lang3dxl_ns.preparation.encoders import option_prefix
+
+    option_prefix.set("--")
+    config = Lang3DXLDataManagerConfig(
+        dataparser=PhotoCollectionDataParserConfig(data=data),
+        data=data,
+        cache_dir=cache_dir,
+        **{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)},
+    )
+    config.settle_targets(learned=config.makes_dense or config.regions not in ("auto", "none"))
+    return config.setup(device=DEVICE, test_mode="test")

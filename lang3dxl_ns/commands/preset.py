@@ -1,0 +1,25 @@
+"""`lang3dxl preset`: flags that train a benchmark scene as published."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from lang3dxl_ns.common.presets import train_flags
+
+
+@dataclass
+class Preset:
+    """Print the flags that train a benchmark scene as published, for use as
+
+    ns-train lang3dxl --data FOLDER $(lang3dxl preset holyscenes/milano)
+    """
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Such as holyscenes/milano."""
+
+    def main(self) -> None:
+        print(shlex.join(train_flags(self.name)))

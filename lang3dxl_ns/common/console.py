@@ -1,0 +1,44 @@
+"""Console output: progress bars and plain lines."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+QUIET_S = 5.0
+"""Seconds before a progress bar appears; shorter work shows none."""
+
+
+@contextmanager
+def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
+    """A function to call after each of `total` items; after five seconds, shows a bar with time left."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    start = time.monotonic()
+    bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    shown = bar.add_task(what, total=total)
+
+    def advance() -> None:
+        bar.advance(shown)
+        if time.monotonic() - start > QUIET_S:
+            bar.start()  # repeated calls have no effect
+
+    try:
+        yield advance
+    finally:
+        if bar.live.is_started:  # else it would print an empty line
+            bar.stop()
+
+
+def say(*lines: str) -> None:
+    """Print lines verbatim: no rich markup, no wrapping."""
+    from rich import get_console
+
+    for line in lines:
+        get_console().print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def some(names: Sequence[str], shown: int = 10) -> str:
+    """The first few names, for a message."""
+    return ", ".join(names[:shown]) + (", …" if len(names) > shown else "")

@@ -1,0 +1,19 @@
+"""Resizing of images and maps."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+
+def fitted_size(codes: Float[Tensor, "H W 3"], longer_side: int) -> tuple[int, int]:
+    """Rows and columns of a map of at most `longer_side` pixels."""
+    height, width = codes.shape[:2]
+    scale = min(longer_side / max(height, width), 1.0)
+    return max(round(height * scale), 1), max(round(width * scale), 1)
+
+
+def resize_nearest(image: Float[Tensor, "H W c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:
+    """Nearest-exact resizing: picks samples, since the mean of two codes is meaningless."""
+    return F.interpolate(image.permute(2, 0, 1)[None], size, mode="nearest-exact")[0].permute(1, 2, 0)

@@ -1,0 +1,66 @@
+"""Numba kernels: cached on disk, multi-threaded, with a message when they are compiled."""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numba
+import torch
+from numba.core.event import Listener, register
+
+from lang3dxl_ns.common.console import say
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function for each number type it is called with; it releases Python's lock.
+
+    The machine code is cached beside the source or in the user's numba folder; if neither is writable, it is
+    compiled anew in every process.
+    """
+    try:
+        compiled = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
+    except RuntimeError:  # numba's error for having no cache folder
+        compiled = numba.njit(nogil=True, error_model="numpy")(function)
+    _announcement.kernels.add(id(compiled))
+    return compiled
+
+
+class _Announcement(Listener):
+    """Logs once per process that kernels are being compiled; loading them from disk is silent."""
+
+    def __init__(self) -> None:
+        self.kernels: set[int] = set()
+        self._said = False
+
+    def on_start(self, event: Any) -> None:
+        if not self._said and id(event.data["dispatcher"]) in self.kernels:
+            self._said = True
+            say("Compiling the CPU kernels for this machine, once; this takes up to 20 seconds …")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+_announcement = _Announcement()
+register("numba:compile", _announcement)
+
+
+def in_threads(function: Callable[..., Any], parts: Sequence[tuple[Any, ...]]) -> list[Any]:
+    """Call a function with each tuple of arguments, on as many threads as torch uses; results in order."""
+    threads = min(torch.get_num_threads(), len(parts))
+    if threads <= 1:
+        return [function(*part) for part in parts]
+    return list(_pool(threads).map(lambda part: function(*part), parts))
+
+
+@functools.lru_cache(maxsize=1)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="kernel")
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads don't survive a fork

@@ -1,0 +1,38 @@
+"""Opening of untrusted pictures: only in listed formats, with a single kind of error."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from PIL import Image
+
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "AVIF")
+"""Formats accepted, whatever the file's name. Pillow knows forty more, some of which start other programs
+(EPS: Ghostscript)."""
+
+
+class NoPictureError(Exception):
+    """A file that is not a complete picture in one of these formats."""
+
+
+@contextmanager
+def open_picture(path: Path) -> Iterator[Image.Image]:
+    """The picture in a file, closed afterwards. Raises OSError for the disk, and NoPictureError for a
+    damaged file or another format, even if the block is the first to read the pixels."""
+    Image.init()  # otherwise Pillow knows only the most common
+    try:
+        with Image.open(path, formats=[form for form in FORMATS if form in Image.OPEN]) as image:
+            yield image
+    except Image.UnidentifiedImageError as error:
+        raise NoPictureError(f"not a picture in one of the formats {', '.join(FORMATS)}") from error
+    # Exceptions of Pillow's decoders for damaged files.
+    except (
+        *(OSError, SyntaxError, ValueError, LookupError, TypeError, AttributeError, RuntimeError),
+        *(EOFError, ArithmeticError, MemoryError, struct.error, Image.DecompressionBombError),
+    ) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # the disk's, not the decoder's
+            raise
+        raise NoPictureError(str(error) or type(error).__name__) from error

@@ -1,0 +1,43 @@
+"""Presets: YAML settings shipped in configs/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lang3dxl_ns.common.errors import UserError
+
+_PACKAGE = Path(__file__).parents[1]
+# Inside the package in an installed wheel, beside it in a checkout.
+FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
+
+
+def load_preset(name: str) -> dict[str, Any]:
+    """The settings in configs/`name`.yaml, for example "holyscenes/milano".
+
+    Raises UserError for an unknown name (listing the known ones) and for a damaged file.
+    """
+    known = sorted(path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml"))
+    if name not in known:
+        raise UserError(f"there is no preset {name!r}: choose one of {', '.join(known)}")
+    try:
+        settings = yaml.safe_load((FOLDER / f"{name}.yaml").read_text())
+    except (yaml.YAMLError, ValueError) as error:
+        raise UserError(f"{FOLDER / name}.yaml can't be read ({error}): restore it") from error
+    if not isinstance(settings, dict):
+        raise UserError(f"{FOLDER / name}.yaml should hold settings, not {settings!r}: restore it")
+    return settings
+
+
+def train_flags(name: str) -> list[str]:
+    """Flags of `ns-train lang3dxl` that train a scene as published: crop range, iterations, schedule.
+
+    Raises UserError for a preset that does not describe a scene.
+    """
+    settings = load_preset(name)
+    if "train" not in settings:
+        raise UserError(f"{name} is not a scene preset: choose another, such as holyscenes/milano")
+    flags = {"pipeline.datamanager.scale-preset": name} | settings["train"]
+    return [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]

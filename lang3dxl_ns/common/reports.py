@@ -1,0 +1,215 @@
+"""Benchmark reports: machine description, interleaved timing, peak memory, and atomic JSON and markdown."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import math
+import os
+import platform
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from datetime import date
+from multiprocessing import get_context
+from multiprocessing.context import BaseContext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+from lang3dxl_ns.common.files import write_atomically
+
+if TYPE_CHECKING:  # imported where it is used: a command's help comes without it
+    import torch
+
+MEBIBYTE = 2**20
+Result = TypeVar("Result")
+
+
+# --- machine and command --------------------------------------------------------------------------------
+
+
+def describe_machine(device: torch.device | str = "cpu") -> str:
+    """One line on where and when figures were measured: processor, cores, threads, versions, date."""
+    import torch
+
+    parts = [
+        _processor_name(),
+        f"{os.cpu_count()} cores, {torch.get_num_threads()} thread(s) used",
+        f"torch {torch.__version__}, Python {platform.python_version()}, {platform.system()}",
+        date.today().isoformat(),
+    ]
+    device = torch.device(device)
+    if device.type == "cuda":
+        parts.insert(0, torch.cuda.get_device_name(device))
+    return " · ".join(parts)
+
+
+def _processor_name() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, "") or platform.processor() or platform.machine()
+
+
+def command_line(command: str, settings: Any) -> str:
+    """The command that repeats a run: `command`, and a flag for each field of `settings` not at its default.
+
+    `settings` is a dataclass instance whose fields tyro turned into flags.
+    """
+    words = [command]
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        default = field.default_factory() if callable(field.default_factory) else field.default
+        if value != default:
+            words += _flag(field.name.replace("_", "-"), value)
+    return " ".join(words)
+
+
+def _flag(name: str, value: Any) -> list[str]:
+    if isinstance(value, bool):
+        return [f"--{name}" if value else f"--no-{name}"]
+    words = [shlex.quote(str(item)) for item in _flatten(value)]
+    if isinstance(value, str) and value.startswith("-"):  # would be parsed as a flag
+        return [f"--{name}={words[0]}"]
+    return [f"--{name}", *words]
+
+
+def _flatten(value: Any) -> Iterable[Any]:
+    if isinstance(value, tuple | list):
+        for item in value:
+            yield from _flatten(item)
+    else:
+        yield value
+
+
+# --- time and memory ------------------------------------------------------------------------------------
+
+
+def interleaved_times(
+    candidates: Mapping[str, Callable[[], object]],
+    repeats: int = 5,
+    budget_seconds: float = math.inf,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, list[float]]:
+    """Seconds per run of each candidate, measured in turn so that load on the machine slows all alike.
+
+    Each candidate has one warm-up run, excluded from the result (page faults can make it three times as
+    long), then at least one timed run, and more until its `budget_seconds` are used up. Compare medians.
+
+    Args:
+        clock: seconds. `time.process_time` for single-threaded work on a shared machine, to exclude other
+            processes.
+    """
+    for work in candidates.values():
+        work()
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    for _ in range(repeats):
+        for name, work in candidates.items():
+            if sum(times[name]) < budget_seconds:
+                times[name].append(_seconds(work, clock))
+    return times
+
+
+def _seconds(work: Callable[[], object], clock: Callable[[], float]) -> float:
+    synchronize()
+    start = clock()
+    work()
+    synchronize()
+    return clock() - start
+
+
+def synchronize() -> None:
+    """Wait until the GPU, if one is in use, has finished all queued work."""
+    import torch
+
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence[str] = ()) -> Result:
+    """The result of `work(*args)`, run in its own process so that its peak memory can be measured.
+
+    Without a GPU, processes are forked from one that has imported the modules of `preload` (the first call's,
+    for all calls); a process that has used a GPU can't be forked. All arguments must be picklable.
+
+    Raises:
+        BrokenProcessPool: the process was killed, most likely for lack of memory.
+    """
+    import torch
+
+    if torch.cuda.is_available():
+        context: BaseContext = get_context("spawn")
+    else:
+        context = get_context("forkserver")
+        context.set_forkserver_preload(list(preload))
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(work, *args).result()
+
+
+def peak_memory(setup: Callable[..., Callable[[], object]], *args: Any) -> int:
+    """Bytes that `setup(*args)()` allocates at its peak, beyond what was held just before the last call.
+
+    Measured in a fresh process, so earlier work can't distort it: host memory, or the GPU's if `setup` uses
+    one. `setup` and `args` must be picklable. Accurate to a few MiB; Linux and macOS.
+    """
+    # sympy, because torch would otherwise import it at the first gradient.
+    return in_own_process(_measure_peak, setup, args, preload=("torch", "sympy", setup.__module__))
+
+
+def _measure_peak(setup: Callable[..., Callable[[], object]], args: Sequence[Any]) -> int:
+    import torch
+
+    work = setup(*args)
+    gc.collect()
+    if torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        work()
+        return torch.cuda.max_memory_allocated() - before
+    before = host_peak(reset=True)
+    work()
+    return host_peak() - before
+
+
+def host_peak(reset: bool = False) -> int:
+    """Peak memory of this process, bytes; `reset` first lowers the recorded peak to what is held now."""
+    if sys.platform == "linux":
+        # getrusage would include the parent's peak: Linux carries it over into a new process.
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        status = Path("/proc/self/status").read_text()
+        kibibytes = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
+        return int(kibibytes) * 1024
+    import resource  # absent on Windows
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
+
+
+# --- the report -----------------------------------------------------------------------------------------
+
+
+def progress_bar() -> Progress:
+    """A rich progress bar with the time left; add one task per benchmark."""
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    return Progress(*columns, speed_estimate_period=600)  # steps vary: a short window would make it jump
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A markdown table; None becomes a dash."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join("–" if c is None else str(c) for c in line) + " |" for line in lines)
+
+
+def write_report(folder: Path, name: str, markdown: str, data: Mapping[str, Any]) -> None:
+    """Write `name`.json and `name`.md into `folder` (created if missing), each atomically.
+
+    Raises:
+        ValueError: a figure is NaN or infinite, which JSON cannot hold.
+    """
+    write_atomically(folder / f"{name}.json", json.dumps(data, indent=2, allow_nan=False) + "\n")
+    write_atomically(folder / f"{name}.md", markdown.rstrip() + "\n")

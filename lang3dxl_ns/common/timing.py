@@ -1,0 +1,41 @@
+"""Optional timing of named sections of a step."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+_seconds: dict[str, list[float]] | None = None
+
+
+@contextmanager
+def part(name: str) -> Iterator[None]:
+    """Time the enclosed block as `name`; does nothing outside `measure()`."""
+    if _seconds is None:
+        yield
+        return
+    _synchronize()
+    start = time.perf_counter()
+    yield
+    _synchronize()
+    _seconds[name].append(time.perf_counter() - start)
+
+
+@contextmanager
+def measure() -> Iterator[dict[str, list[float]]]:
+    """Collect the seconds of every `part` inside; yields {name: one entry per visit}."""
+    global _seconds
+    _seconds = defaultdict(list)
+    try:
+        yield _seconds
+    finally:
+        _seconds = None
+
+
+def _synchronize() -> None:
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()

@@ -1,0 +1,124 @@
+"""Feature decoder interface: what Gaussians carry, what is rendered, how renderings become features."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class SemanticEncoder(nn.Module, ABC):
+    """Interface of the semantic field and of the baselines.
+
+    The model gives every Gaussian `initial_codes`, renders what is `carried`, and decodes the rendered map.
+    Outputs are raw (not unit length) CLIP features and, if configured, dense features.
+
+    Args:
+        clip_dim: channels of the CLIP features.
+        dense_dim: channels of the dense features; 0 for none.
+    """
+
+    def __init__(self, clip_dim: int, dense_dim: int) -> None:
+        super().__init__()
+        self.clip_dim, self.dense_dim = clip_dim, dense_dim
+        self.output_mean: Tensor
+        self.output_std: Tensor
+        self.register_buffer("output_mean", torch.zeros(clip_dim + dense_dim))
+        self.register_buffer("output_std", torch.ones(clip_dim + dense_dim))
+
+    bounded = False
+    """Whether codes are squashed by a sigmoid before they are decoded."""
+    per_gaussian = False
+    """Whether carried values are decoded per Gaussian before compositing, or per pixel after it."""
+    needs_lifting = False
+    """Whether the codes are computed from the photos after training instead of learned."""
+
+    @abstractmethod
+    def initial_codes(
+        self, count: int, generator: torch.Generator | None = None
+    ) -> Float[Tensor, "count code"] | None:
+        """Initial codes, one per Gaussian; None if Gaussians learn none."""
+
+    def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"] | None:
+        """Values to render, from the Gaussians' raw parameters; None for nothing (yet)."""
+        return gaussians["codes"]
+
+    @abstractmethod
+    def forward(
+        self, rendered: Float[Tensor, "*batch d"]
+    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
+        """CLIP and dense features of every pixel; dense is None without a dense head."""
+
+    def decode_clip(self, rendered: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch clip"]:
+        """CLIP features of every pixel."""
+        return self(rendered)[0]
+
+    def hidden(self, carried: Float[Tensor, "n d"]) -> Float[Tensor, "n r"]:
+        """Input of the last layer, `clip_head`, which outputs CLIP features."""
+        return self.decode_clip(carried)
+
+    def clip_head(self) -> tuple[Float[Tensor, "clip r"], Float[Tensor, " clip"]] | None:
+        """The linear last layer of `decode_clip`: weight and bias. None if `hidden` is the feature."""
+        return None
+
+    def learn_gaussians(
+        self,
+        features: Float[Tensor, "n clip+dense"],
+        mass: Float[Tensor, " n"],
+        advance: Callable[[], None] = lambda: None,
+    ) -> Float[Tensor, "n code"]:
+        """Codes for features gathered onto the Gaussians, if the encoder `needs_lifting`.
+
+        mass: pixels that each Gaussian fills; 0 for those visible in no photo. advance: called
+        `learning_steps` times during the work.
+        """
+        raise NotImplementedError
+
+    learning_steps = 0
+    """Number of steps of `learn_gaussians`."""
+
+    def picture(self, carried: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch 3"]:
+        """The first three channels as colours in [0, 1]."""
+        colours = carried[..., :3].sigmoid()
+        missing = 3 - colours.shape[-1]
+        return torch.cat([colours, *[colours[..., :1]] * missing], dim=-1)
+
+    @abstractmethod
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Optimiser groups by name."""
+
+    def own_losses(
+        self, clip: Float[Tensor, "h w clip"], dense: Float[Tensor, "h w dense"] | None
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The decoder's own losses on a decoded map, already weighted."""
+        return {}
+
+    def learn_targets(self, targets: Callable[[], Iterable[Float[Tensor, "h w clip"]]]) -> None:
+        """Called before training with the photos' CLIP targets."""
+
+    def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
+        """Per-channel mean and deviation of the targets, CLIP then dense.
+
+        Raises:
+            ValueError: wrong number of channels, a non-finite value, or a negative deviation.
+        """
+        if mean.shape != self.output_mean.shape or std.shape != self.output_std.shape:
+            raise ValueError(
+                f"output statistics need {len(self.output_mean)} channels (CLIP {self.clip_dim}, dense "
+                f"{self.dense_dim}), got mean {tuple(mean.shape)} and std {tuple(std.shape)}"
+            )
+        if not (mean.isfinite().all() and std.isfinite().all() and (std >= 0).all()):
+            raise ValueError("output statistics must be finite and the deviations not negative")
+        self.output_mean.copy_(mean)
+        self.output_std.copy_(std)
+
+    def set_progress(self, fraction: float) -> None:
+        """Set the fraction of the run done (0 to 1)."""
+
+    def _split(
+        self, features: Float[Tensor, "*batch out"]
+    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
+        return features[..., : self.clip_dim], features[..., self.clip_dim :] if self.dense_dim else None

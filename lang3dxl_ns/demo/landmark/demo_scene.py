@@ -1,0 +1,45 @@
+"""`lang3dxl demo-scene`: its settings, separate from the work so that its help starts fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+
+@dataclass
+class DemoScene:
+    """Generate a demo scene: photos of a procedural landmark."""
+
+    out: Path
+    """Folder to write; must be empty or missing."""
+    seed: int = 0
+    """The same seed gives the same bytes."""
+    family: Literal["cathedral", "mosque", "hall", "auto"] = "auto"
+    """Kind of building; auto: chosen by the seed."""
+    photos: int = 48
+    """Number of photos, 4 to 9999."""
+    wild: bool = True
+    """Like photos from the Internet: sizes, lenses, weather, exposures and passers-by vary. --no-wild:
+    one camera, one sun, no people."""
+    width: int = 480
+    """Pixels of a landscape photo; wild photos are smaller."""
+    height: int = 360
+    """Pixels of a landscape photo."""
+    contact_sheet: bool = False
+    """Also write contact_sheet.jpg: six photos with their ground truth."""
+    test_views: int = 24
+    """Novel views for scoring (test_views/): cameras like the photos', plain light, no people. 0: none."""
+    workers: int | None = None
+    """Number of processes; by default one per CPU core."""
+
+    def main(self) -> None:
+        """Write the scene and print where it is."""
+        from rich import get_console
+
+        from lang3dxl_ns.demo.landmark.scene_writer import write_scene
+
+        folder = write_scene(self)
+        get_console().print(
+            f"{self.photos} photos, COLMAP model, masks and ground truth in {folder}", soft_wrap=True
+        )

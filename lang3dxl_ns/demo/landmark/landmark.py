@@ -1,0 +1,78 @@
+"""A procedural landmark: a seeded building of one of three families, with its surroundings."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.demo.landmark.families import cathedral, hall, mosque
+from lang3dxl_ns.demo.landmark.labels import BUILDING_PARTS, PARTS
+from lang3dxl_ns.demo.landmark.materials import Material
+from lang3dxl_ns.demo.landmark.shapes import Shape
+from lang3dxl_ns.demo.landmark.surroundings import place_surroundings
+from lang3dxl_ns.demo.landmark.vocabulary import Builder
+
+_GRAMMARS = {"cathedral": cathedral, "mosque": mosque, "hall": hall}
+FAMILIES = tuple(_GRAMMARS)
+
+
+@dataclass(frozen=True, eq=False)
+class Landmark:
+    """Shapes and materials in metres, z up, the ground at z = 0, the façade facing +x."""
+
+    seed: int
+    family: str
+    shapes: tuple[Shape, ...]
+    materials: tuple[Material, ...]
+    centre: Float[Array, "3"]
+    """Centre of the building's bounds."""
+    radius: float
+    """Half the horizontal diagonal of the building's bounds, metres."""
+    height: float
+    """Of the building, metres."""
+    obstacles: Float[Array, "n 2 3"]
+    """Bounds (lower and upper corner) of everything but the ground, to keep cameras and people out."""
+
+    @classmethod
+    def from_seed(cls, seed: int, family: str | None = None) -> Landmark:
+        """The landmark of this seed; without a family (or with "auto") the seed chooses it too.
+
+        Raises UserError for an unknown family.
+        """
+        rng = np.random.default_rng([seed, 1])
+        drawn = FAMILIES[int(rng.integers(len(FAMILIES)))]
+        family = drawn if family in (None, "auto") else family
+        if family not in _GRAMMARS:
+            raise UserError(f"there is no landmark family {family!r}: choose one of {', '.join(FAMILIES)}")
+        builder = Builder(rng)
+        _GRAMMARS[family](builder)
+        low, high = _bounds(shape for shape in builder.shapes if PARTS[shape.part] in BUILDING_PARTS)
+        centre, radius = (low + high) / 2, math.hypot(*(high - low)[:2]) / 2
+        place_surroundings(builder, centre, radius)
+        standing = [_bounds([shape]) for shape in builder.shapes if PARTS[shape.part] != "ground"]
+        return cls(
+            seed=seed,
+            family=family,
+            shapes=tuple(builder.shapes),
+            materials=tuple(builder.materials),
+            centre=centre,
+            radius=radius,
+            height=float(high[2]),
+            obstacles=np.array(standing),
+        )
+
+    def is_free(self, point, margin: float) -> bool:
+        """Whether nothing is within `margin` metres of a point (by bounding boxes)."""
+        low, high = self.obstacles[:, 0], self.obstacles[:, 1]
+        point = np.asarray(point)
+        return not ((point > low - margin) & (point < high + margin)).all(axis=1).any()
+
+
+def _bounds(shapes) -> tuple[Array, Array]:
+    corners = np.concatenate([shape.corners for shape in shapes])
+    return corners.min(axis=0), corners.max(axis=0)

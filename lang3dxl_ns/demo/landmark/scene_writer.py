@@ -1,0 +1,238 @@
+"""Demo scene generator: a procedural landmark as photos, COLMAP model, masks and ground truth."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.demo.landmark.contact_sheet import contact_sheet
+from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
+from lang3dxl_ns.demo.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
+from lang3dxl_ns.demo.landmark.landmark import Landmark
+from lang3dxl_ns.demo.landmark.novel_cameras import choose_cameras
+from lang3dxl_ns.demo.landmark.photography import (
+    Shot,
+    View,
+    plain_view,
+    random_photo_size,
+    random_view,
+    take_photo,
+)
+from lang3dxl_ns.demo.landmark.raycast import Camera
+from lang3dxl_ns.demo.landmark.sparse_model import (
+    POINTS,
+    Similarity,
+    TakenPhoto,
+    find_tracks,
+    sample_points,
+    write_model,
+)
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.colmap import TrackedPhoto
+from lang3dxl_ns.scene.novel_views import FOLDER, write_novel_cameras
+
+HELD_OUT_EVERY = 8
+"""nerfstudio's interval split: of the photos sorted by name, 0, 8, 16 … are held out."""
+TRUTH_EVERY = 2
+"""Every second photo has ground truth, including the held-out ones."""
+OVERSAMPLING = 2
+"""Rays per pixel along each axis."""
+TEST_POINTS = 100
+"""Surface points per test view, for the distance of what it shows."""
+
+
+@dataclass(frozen=True)
+class _Order:
+    """One photo or test view for a worker to render."""
+
+    number: int
+    seed: int
+    family: str
+    wild: bool
+    size: tuple[int, int]
+    points: int
+    folder: Path
+    test_camera: Camera | None = None
+    """For a test view; photos choose their own."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.number:04d}"
+
+
+def write_scene(scene: DemoScene) -> Path:
+    """Write images/, masks/, sparse/0/, ground_truth/, test_views/ and scene.json; returns the folder.
+
+    The folder appears once everything is written. Raises UserError for a folder that is not empty, and for
+    invalid numbers.
+    """
+    out = Path(scene.out).expanduser().absolute()
+    _check(scene, out)
+    landmark = Landmark.from_seed(scene.seed, scene.family)
+    unfinished = out.with_name(f".{out.name}.unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    for name in ("images", "masks", "depth", *(f"ground_truth/{category}" for category in CATEGORIES)):
+        (unfinished / name).mkdir(parents=True)
+
+    size = scene.width, scene.height
+    points = int(np.clip(POINTS // scene.photos, 40, 400))
+    cameras = choose_cameras(landmark, scene.test_views, scene.wild, size)
+    numbered = [(i + 1, None) for i in range(scene.photos)] + [(i + 1, c) for i, c in enumerate(cameras)]
+    orders = [
+        _Order(number, scene.seed, landmark.family, scene.wild, size, points, unfinished, camera)
+        for number, camera in numbered
+    ]
+    taken = list(_taken(orders, scene.workers))
+    photos, views = taken[: scene.photos], taken[scene.photos :]
+    rng = np.random.default_rng([scene.seed, 3])
+    similarity = Similarity.random(rng)
+    tracks = find_tracks(photos, [unfinished / "depth" / f"{photo.number:04d}.npy" for photo in photos], rng)
+    write_model(unfinished / "sparse" / "0", photos, tracks, similarity, one_camera=not scene.wild)
+    shutil.rmtree(unfinished / "depth")
+    if views:
+        geometries = [_tracked(view, similarity) for view in views]
+        write_novel_cameras(unfinished, geometries, same_light=not scene.wild)
+    _write_description(unfinished, landmark, scene, similarity)
+    if scene.contact_sheet:
+        contact_sheet(unfinished).save(unfinished / "contact_sheet.jpg", quality=88)
+    if out.exists():
+        out.rmdir()  # it is empty: checked above
+    out.parent.mkdir(parents=True, exist_ok=True)
+    unfinished.rename(out)
+    return out
+
+
+def photo_view(
+    landmark: Landmark, seed: int, number: int, wild: bool, size: tuple[int, int]
+) -> tuple[View, int, int]:
+    """The view of photo `number` of a scene, and its width and height in pixels."""
+    rng = np.random.default_rng([seed, 2, number])
+    width, height = random_photo_size(rng, *size) if wild else size
+    return random_view(landmark, rng, wild), width, height
+
+
+def _check(scene: DemoScene, out: Path) -> None:
+    if not 4 <= scene.photos <= 9999:
+        raise UserError(f"--photos is {scene.photos}: a scene has 4 to 9999 (numbers have four digits)")
+    if not 0 <= scene.test_views <= 9999:
+        raise UserError(f"--test-views is {scene.test_views}: give 0 to 9999")
+    if scene.seed < 0:
+        raise UserError(f"--seed is {scene.seed}: give 0 or more")
+    if min(scene.width, scene.height) < 64:
+        raise UserError(
+            f"--width and --height are {scene.width} and {scene.height}: both must be 64 pixels or more"
+        )
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out} exists and isn't an empty folder: give --out another name, or remove it")
+
+
+def _taken(orders: list[_Order], workers: int | None) -> Iterator[TakenPhoto]:
+    """Photos in their order, taken by a process pool, with a progress bar."""
+    workers = min(workers or os.cpu_count() or 1, len(orders))
+    # Spawned processes: forked ones would inherit this one's threads and loaded libraries.
+    context = multiprocessing.get_context("spawn")
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns) as bar, ProcessPoolExecutor(workers, mp_context=context) as pool:
+        yield from bar.track(pool.map(_take, orders), total=len(orders), description="taking photos")
+
+
+@lru_cache(maxsize=1)
+def _landmark(seed: int, family: str) -> Landmark:
+    return Landmark.from_seed(seed, family)
+
+
+def _take(order: _Order) -> TakenPhoto:
+    """In a worker: take one photo and write its files."""
+    landmark = _landmark(order.seed, order.family)
+    if order.test_camera is not None:
+        return _take_test_view(landmark, order.test_camera, order)
+    view, width, height = photo_view(landmark, order.seed, order.number, order.wild, order.size)
+    shot = take_photo(landmark, view, width, height, OVERSAMPLING)
+    photo = Image.fromarray(shot.image)
+    save_photo = partial(photo.save, quality=93, subsampling=0)
+    save_photo(order.folder / "images" / f"{order.name}.jpg")
+    Image.fromarray(building_mask(shot.parts)).save(order.folder / "masks" / f"{order.name}.png")
+    np.save(order.folder / "depth" / f"{order.name}.npy", shot.depth.astype(np.float16))
+    if (order.number - 1) % TRUTH_EVERY == 0:
+        _write_truth(shot, save_photo, order)
+    points, colours = sample_points(
+        shot, view.camera, order.points, np.random.default_rng([order.seed, 4, order.number])
+    )
+    return TakenPhoto(order.number, width, height, view.camera, points, colours)
+
+
+def _take_test_view(landmark: Landmark, camera: Camera, order: _Order) -> TakenPhoto:
+    """In a worker: take a test view and write its picture, mask and labels (white on black)."""
+    shot, name = take_photo(landmark, plain_view(camera), *order.size, OVERSAMPLING), f"{order.name}.png"
+    masks = {f"ground_truth/{c}": mask for c, mask in category_masks(shot.parts, shot.elements).items()}
+    masks = {place: mask for place, mask in masks.items() if mask.mean() >= SMALLEST_POSITIVE}
+    for place, mask in {"masks": building_mask(shot.parts), **masks}.items():
+        (order.folder / FOLDER / place).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(order.folder / FOLDER / place / name)
+    (order.folder / FOLDER / "images").mkdir(exist_ok=True)
+    picture = Image.fromarray(shot.image)
+    picture.save(order.folder / FOLDER / "images" / f"{order.name}.jpg", quality=93, subsampling=0)
+    rng = np.random.default_rng([order.seed, 6, order.number])
+    return TakenPhoto(order.number, *order.size, camera, *sample_points(shot, camera, TEST_POINTS, rng))
+
+
+def _tracked(view: TakenPhoto, similarity: Similarity) -> TrackedPhoto:
+    """A test view's camera in the COLMAP model's world."""
+    focal, points = view.camera.focal * max(view.width, view.height), similarity.apply(view.points)
+    return TrackedPhoto(
+        name=f"{view.number:04d}.jpg",
+        lens=Lens(view.width, view.height, focal, focal, view.width / 2, view.height / 2),
+        camera_from_world=similarity.camera_from_world(view.camera),
+        points=points,
+        pixels=np.zeros((len(points), 2)),
+    )
+
+
+def _write_truth(shot: Shot, save_photo, order: _Order) -> None:
+    """HolyScenes' layout: for each category in the photo, object black on white, and a copy of the photo."""
+    for category, mask in category_masks(shot.parts, shot.elements).items():
+        if mask.mean() < SMALLEST_POSITIVE:
+            continue
+        folder = order.folder / "ground_truth" / category
+        truth = Image.fromarray(np.where(mask, np.uint8(0), np.uint8(255)))
+        truth.save(folder / f"{order.name}-gt.jpg", quality=100)
+        save_photo(folder / f"{order.name}-img.jpg")
+
+
+def _write_description(folder: Path, landmark: Landmark, scene: DemoScene, similarity: Similarity) -> None:
+    """Write scene.json, a description of the scene for people and tests."""
+    truth = {
+        c: sorted(path.name[:4] for path in (folder / "ground_truth" / c).glob("*-gt.jpg"))
+        for c in CATEGORIES
+    }
+    for category, numbers in truth.items():
+        if not numbers:
+            (folder / "ground_truth" / category).rmdir()
+    description = {
+        "seed": scene.seed,
+        "family": landmark.family,
+        "wild": scene.wild,
+        "photos": scene.photos,
+        "categories": [category for category, numbers in truth.items() if numbers],
+        "ground_truth_photos": {category: len(numbers) for category, numbers in truth.items() if numbers},
+        "test_views": scene.test_views,
+        "held_out": [f"{i + 1:04d}.jpg" for i in range(0, scene.photos, HELD_OUT_EVERY)],
+        "colmap_from_metres": {
+            "scale": similarity.scale,
+            "rotation": similarity.rotation.tolist(),
+            "translation": similarity.translation.tolist(),
+        },
+    }
+    (folder / "scene.json").write_text(json.dumps(description, indent=1) + "\n")

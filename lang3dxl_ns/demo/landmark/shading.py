@@ -1,0 +1,226 @@
+"""Shading: from ray hits to a linear picture, with sun, sky and haze."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, Int16, UInt8
+from numpy import ndarray as Array
+
+from lang3dxl_ns.demo.landmark.materials import Material, fractal_noise
+from lang3dxl_ns.demo.landmark.raycast import Camera, SunCamera, cast
+from lang3dxl_ns.demo.landmark.shapes import Shape, floats
+
+SHADOW_MAP = 256
+"""Pixels per side; about 0.3 m each on a landmark of 40 m radius."""
+
+
+@dataclass(frozen=True)
+class Weather:
+    """Sun, sky and air at one moment; colours are linear."""
+
+    sun_azimuth: float
+    """Radians; 0 is in front of the façade."""
+    sun_elevation: float
+    sun_colour: tuple[float, float, float]
+    sky_light: tuple[float, float, float]
+    """Light from the whole sky on an upward-facing surface."""
+    horizon: tuple[float, float, float]
+    zenith: tuple[float, float, float]
+    clouds: float
+    """0 clear … 1 overcast."""
+    cloud_seed: int
+    haze: float
+    """Distance in metres at which 63 % of the colour is haze."""
+
+    @property
+    def to_sun(self) -> Float[Array, "3"]:
+        flat = np.cos(self.sun_elevation)
+        return floats(
+            [np.cos(self.sun_azimuth) * flat, np.sin(self.sun_azimuth) * flat, np.sin(self.sun_elevation)]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowMap:
+    """Distance the sun's rays travel before they hit something."""
+
+    sun: SunCamera
+    depth: Float[Array, "n n"]
+
+    @classmethod
+    def of(
+        cls, shapes: Sequence[Shape], weather: Weather, centre: Float[Array, "3"], radius: float
+    ) -> ShadowMap:
+        """Shadows within `radius` metres of the centre, and a little beyond."""
+        rotation = Camera.looking_at(centre + weather.to_sun, centre, 1.0).rotation
+        sun = SunCamera(centre, rotation, 2.6 * radius)
+        casting = [shape for shape in shapes if shape.casts_shadow]
+        return cls(sun, cast(casting, sun, SHADOW_MAP, SHADOW_MAP)[0])
+
+    def sunlit(self, at: Float[Array, "n 3"], normal: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Share of sunlight that reaches points: the mean of four neighbours in the map, 1 outside it."""
+        n, texel = SHADOW_MAP, self.sun.extent / SHADOW_MAP
+        lit = np.ones(len(at), np.float32)
+        x, y, z = self.sun.project(at + normal * texel, n, n).T
+        inside = np.flatnonzero((x >= 1) & (y >= 1) & (x < n - 1) & (y < n - 1))
+        column, row = (v[inside].astype(np.int32) for v in (x - 0.5, y - 0.5))
+        fx, fy = x[inside] - 0.5 - column, y[inside] - 0.5 - row
+        limit = z[inside] - 0.8 * texel
+        free = [self.depth[row + j, column + i] >= limit for j in (0, 1) for i in (0, 1)]
+        lit[inside] = (free[0] * (1 - fx) + free[1] * fx) * (1 - fy) + (
+            free[2] * (1 - fx) + free[3] * fx
+        ) * fy
+        return lit
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """Hits of a camera's rays: the truth of every pixel, and the inputs of the lighting.
+
+    Fields of [n] cover the pixels that hit something, ordered by shape.
+    """
+
+    depth: Float[Array, "h w"]
+    """Metres along the camera's axis; MISS in the sky."""
+    pixel: Int[Array, " n"]
+    """Index into the flattened picture."""
+    part: UInt8[Array, " n"]
+    element: UInt8[Array, " n"]
+    material: Int16[Array, " n"]
+    normal: Float[Array, "n 3"]
+    texture: Float[Array, "2 n"]
+    shade: Float[Array, " n"]
+    sunlit: Float[Array, " n"]
+
+    def spread(self, values: UInt8[Array, " n"]) -> UInt8[Array, "h w"]:
+        """Values of the hit pixels as a picture, 0 in the sky."""
+        picture = np.zeros(self.depth.size, dtype=np.uint8)
+        picture[self.pixel] = values
+        return picture.reshape(self.depth.shape)
+
+
+def trace(shapes: Sequence[Shape], camera: Camera, weather: Weather, width: int, height: int) -> Traced:
+    """Cast a ray through every pixel's centre. The sun decides which recesses are lit."""
+    depth, index = cast(shapes, camera, width, height)
+    order = np.argsort(index.ravel(), kind="stable")  # radix sort, for int16
+    pixel = order[np.searchsorted(index.ravel()[order], 0) :]
+    shape, n = index.ravel()[pixel], len(pixel)
+    traced = Traced(
+        depth=depth,
+        pixel=pixel,
+        part=np.empty(n, np.uint8),
+        element=np.empty(n, np.uint8),
+        material=np.empty(n, np.int16),
+        normal=np.empty((n, 3), np.float32),
+        texture=np.empty((2, n), np.float32),
+        shade=np.empty(n, np.float32),
+        sunlit=np.empty(n, np.float32),
+    )
+    rays, position = _flat(camera, width, height)[pixel].T, camera.position.astype(np.float32)
+    to_sun = tuple(weather.to_sun.tolist())
+    starts = np.flatnonzero(np.diff(shape, prepend=-1)).tolist()
+    for start, end in zip(starts, [*starts[1:], n], strict=True):
+        it, run = shapes[shape[start]], slice(start, end)
+        ray = rays[:, run]
+        at = ray * depth.ravel()[pixel[run]] + position[:, None]
+        surface = it.surface(it.point_to_local(tuple(at)), it.to_local(tuple(ray)), it.to_local(to_sun))
+        traced.normal[run, 0], traced.normal[run, 1], traced.normal[run, 2] = it.to_world(surface.normal)
+        traced.texture[0, run], traced.texture[1, run] = surface.s, surface.t
+        traced.shade[run], traced.sunlit[run] = surface.shade, surface.sunlit
+        traced.part[run] = it.part
+        traced.element[run] = np.where(surface.element, it.element, 0)
+        traced.material[run] = np.where(surface.trim, it.trim, it.material)
+    return traced
+
+
+def light(
+    traced: Traced,
+    materials: Sequence[Material],
+    camera: Camera,
+    weather: Weather,
+    shadows: ShadowMap,
+) -> Float[Array, "h w 3"]:
+    """Linear colours of the hits."""
+    height, width = traced.depth.shape
+    rays = _flat(camera, width, height)
+    colour = _sky(rays, weather)
+    colour[traced.pixel] = _lit(traced, materials, camera, weather, rays[traced.pixel], shadows)
+    return colour.reshape(height, width, 3)
+
+
+def _flat(camera: Camera, width: int, height: int) -> Float[Array, "n 3"]:
+    _, direction = camera.rays(width, height)
+    return np.stack(direction, axis=-1).reshape(-1, 3)
+
+
+def _lit(
+    hits: Traced, materials, camera: Camera, weather: Weather, ray: Float[Array, "n 3"], shadows: ShadowMap
+) -> Float[Array, "n 3"]:
+    distance = hits.depth.ravel()[hits.pixel]
+    length = np.sqrt((ray * ray).sum(axis=1))
+    facing = -(ray * hits.normal).sum(axis=1) / length
+    at = ray * distance[:, None] + camera.position.astype(np.float32)
+    pixel_size = distance / (camera.focal * 640)  # texture detail as in a medium-sized photo
+    footprint = pixel_size / np.maximum(facing, 0.15)
+
+    colour = np.empty((len(ray), 3), np.float32)
+    gloss = np.zeros(len(ray), np.float32)
+    for i in np.unique(hits.material):
+        own = np.flatnonzero(hits.material == i)
+        colour[own] = materials[i].reflectance(*hits.texture[:, own], footprint[own])
+        gloss[own] = materials[i].gloss
+
+    to_sun = weather.to_sun
+    sunlight = np.clip(hits.normal @ to_sun, 0, 1) * hits.sunlit
+    sunny = np.flatnonzero(sunlight)
+    sunlight[sunny] *= shadows.sunlit(at[sunny], hits.normal[sunny])
+    up, height = hits.normal[:, 2], at[:, 2]
+    skylight = (0.62 + 0.38 * up + 0.12 * hits.normal[:, 1]) * (1 - 0.25 * np.exp(-np.maximum(height, 0) / 2))
+    light = sunlight[:, None] * floats(weather.sun_colour) + skylight[:, None] * floats(weather.sky_light)
+    colour *= light * hits.shade[:, None]
+    shiny = np.flatnonzero(gloss)
+    if len(shiny):
+        colour[shiny] += _glint(
+            ray[shiny] / length[shiny, None],
+            hits.normal[shiny],
+            gloss[shiny],
+            colour[shiny],
+            sunlight[shiny],
+            weather,
+        )
+    clear = np.exp(-distance * length / weather.haze)[:, None]
+    return colour * clear + floats(weather.horizon) * (1 - clear)
+
+
+def _glint(view, normal, gloss, colour, sunlight, weather: Weather):
+    """Highlight of the sun and reflection of the sky on glossy materials."""
+    facing = (view * normal).sum(axis=1, keepdims=True)
+    mirror = view - 2 * facing * normal
+    highlight = np.clip(mirror @ weather.to_sun, 0, 1) ** 24 * (sunlight > 0)
+    grazing = (1 - np.clip(-facing[:, 0], 0, 1)) ** 3
+    sky = floats(weather.zenith) * (np.clip(mirror[:, 2], 0, 1) * (0.1 + 0.5 * grazing))[:, None]
+    own = colour * (1.2 * np.clip(mirror[:, 2], 0, 1))[:, None]  # metals reflect in their own colour
+    return gloss[:, None] * (
+        0.6 * highlight[:, None] * floats(weather.sun_colour) * (0.3 + colour) + 0.5 * sky + own * 0.4
+    )
+
+
+def _sky(rays, weather: Weather) -> Float[Array, "n 3"]:
+    up = rays[:, 2] / np.sqrt((rays * rays).sum(axis=1))
+    share = np.sqrt(np.clip(up, 0, 1))[:, None]
+    colour = floats(weather.horizon) * (1 - share) + floats(weather.zenith) * share
+    above = np.flatnonzero(up > 0.02)
+    if weather.clouds > 0 and len(above):
+        # Clouds lie on a plane overhead, so they shrink towards the horizon.
+        x, y = (
+            rays[above, i] / (rays[above, 2] + 0.15 * np.hypot(rays[above, 0], rays[above, 1]))
+            for i in (0, 1)
+        )
+        noise = fractal_noise(x * 1.5, y * 1.5, weather.cloud_seed, 5)
+        cover = np.clip((noise - 0.75 + 0.45 * weather.clouds) * 4, 0, 1)[:, None]
+        bright = floats(weather.horizon).max() * (1.05 - 0.25 * cover * weather.clouds)
+        colour[above] = colour[above] * (1 - cover) + bright * cover
+    return colour

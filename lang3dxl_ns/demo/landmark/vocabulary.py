@@ -1,0 +1,434 @@
+"""Building parts of landmarks: towers, domes, minarets, rows of windows, portals, columns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lang3dxl_ns.demo.landmark.labels import ELEMENT, PART
+from lang3dxl_ns.demo.landmark.materials import COVERING, MASONRY, Material, make_material
+from lang3dxl_ns.demo.landmark.openings import Openings
+from lang3dxl_ns.demo.landmark.shapes import Box, Ellipsoid, Frustum, Polytope, Shape, gable, prism
+
+FRONT, LEFT, BACK, RIGHT = 0.0, math.pi / 2, math.pi, -math.pi / 2
+"""Facings: the façade looks along +x."""
+Point = tuple[float, float, float]
+
+
+@dataclass
+class ShapeList:
+    """Collects shapes and their materials."""
+
+    rng: np.random.Generator
+    shapes: list[Shape] = field(default_factory=list)
+    materials: list[Material] = field(default_factory=list)
+    role: dict[str, int] = field(default_factory=dict)
+    """Index into `materials` by role: "wall", "trim", "dome" …"""
+
+    def add_material(self, material: Material) -> int:
+        self.materials.append(material)
+        return len(self.materials) - 1
+
+    def chance(self, probability: float) -> bool:
+        return bool(self.rng.random() < probability)
+
+    def between(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def pick(self, *choices: str) -> str:
+        return choices[int(self.rng.integers(len(choices)))]
+
+    # Solids. `material` is a role, `foot` the centre of the base.
+
+    def box(self, part: str, material: str, foot: Point, size: Point, yaw: float = 0.0):
+        self.shapes.append(Box(PART[part], self.role[material], foot, yaw, 0, size))
+
+    def cone(self, part: str, material: str, foot: Point, bottom: float, top: float, height: float):
+        self.shapes.append(Frustum(PART[part], self.role[material], foot, 0.0, 0, bottom, top, height))
+
+    def ellipsoid(self, part: str, material: str, centre: Point, radii: Point, cut=-1e3, end=1e3):
+        self.shapes.append(Ellipsoid(PART[part], self.role[material], centre, 0.0, 0, radii, cut, end))
+
+    def gable(
+        self, part: str, material: str, foot: Point, width: float, length: float, height: float, yaw=0.0
+    ):
+        """A gabled roof with its ridge along y (turned by yaw)."""
+        fields = gable(width, length, height)
+        self.shapes.append(Polytope(PART[part], self.role[material], foot, yaw, 0, **fields))
+
+    def prism(self, part, material, foot: Point, radius, height, sides: int, taper=0.0, yaw=0.0):
+        fields = prism(radius, height, sides, taper)
+        self.shapes.append(Polytope(PART[part], self.role[material], foot, yaw, 0, **fields))
+
+
+@dataclass
+class Builder(ShapeList):
+    """Builds one landmark; chooses the style shared by all its parts."""
+
+    facade_height: float = 30.0
+    """Metres; windows are 1/60 to 1/8 of it high."""
+
+    def __post_init__(self):
+        self._choose_materials()
+        self.window_outline = self.pick("round", "pointed", "round", "rectangle", "segment")
+        self.glazing = self.pick("mullion", "grid", "lattice", "tracery", "plain", "mullion")
+        self.portal_outline = self.pick("round", "pointed")
+        self.doors = self.pick("leaves", "panels", "tympanum", "leaves", "open")
+        self.dome_rise = self.between(0.75, 1.2)
+        self.onion = self.chance(0.3)
+        self.lantern = self.chance(0.5)
+        self.round_spires = self.chance(0.4)
+
+    def _choose_materials(self):
+        """All parts draw from the same two palettes, so that colour doesn't reveal a category."""
+        rng = self.rng
+        masonry = [
+            self.add_material(make_material(name, rng)) for name in rng.choice(MASONRY, 3, replace=False)
+        ]
+        covering = [
+            self.add_material(make_material(name, rng)) for name in rng.choice(COVERING, 3, replace=False)
+        ]
+        wall = masonry[0]
+        for role, share in (("trim", 0.25), ("tower", 0.7), ("minaret", 0.5), ("column", 0.3), ("drum", 0.7)):
+            self.role[role] = wall if self.chance(share) else int(rng.choice(masonry[1:]))
+        self.role |= {"wall": wall, "roof": covering[0]}
+        for role in ("dome", "spire", "cap"):
+            self.role[role] = int(rng.choice(covering if self.chance(0.75) else masonry))
+        glass = "stained glass" if self.chance(0.25) else "glass"
+        self.role["glass"] = self.add_material(make_material(glass, rng))
+        self.role["door"] = self.add_material(make_material(self.pick("wood", "wood", "bronze"), rng))
+        self.role["shadow"] = self.add_material(make_material("shadow", rng))
+
+
+def ahead(point: Point, facing: float, distance: float, aside: float = 0.0) -> Point:
+    """A point `distance` in front of a wall that faces `facing`, and `aside` to its left."""
+    c, s = math.cos(facing), math.sin(facing)
+    return point[0] + c * distance - s * aside, point[1] + s * distance + c * aside, point[2]
+
+
+def window_row(
+    b: Builder,
+    part: str,
+    foot: Point,
+    facing: float,
+    width: float,
+    height: float,
+    columns: int | None = None,
+    rows: int = 1,
+    outline: str | None = None,
+    filling: str | None = None,
+):
+    """Windows on a field of wall whose lower edge is centred at `foot`.
+
+    Without `columns`, as many as fit well. Their height stays within 1/60 … 1/8 of the façade's.
+    """
+    smallest, largest = b.facade_height / 60, b.facade_height / 8
+    outline = outline or b.window_outline
+    tall = float(np.clip(b.between(0.6, 0.9) * height / rows, smallest, largest))
+    slender = 1.0 if outline == "circle" else b.between(0.32, 0.55)
+    wide = tall * slender
+    if columns is None:
+        columns = max(1, round(width / (wide * b.between(1.7, 2.6))))
+    wide = min(wide, 0.8 * width / columns)
+    if outline == "circle":
+        tall = wide
+    if tall > height / rows or min(wide, tall) < smallest * 0.3:
+        return
+    _opening(
+        b,
+        part,
+        "window",
+        foot,
+        facing,
+        (width, height),
+        columns,
+        rows,
+        (wide, tall),
+        outline,
+        filling or b.glazing,
+    )
+
+
+def rose_window(b: Builder, part: str, foot: Point, facing: float, diameter: float):
+    diameter = min(diameter, b.facade_height / 8)
+    size = (diameter, diameter)
+    field_ = (diameter * 1.5, diameter * 1.3)
+    _opening(b, part, "window", foot, facing, field_, 1, 1, size, "circle", "rose")
+
+
+def portal(b: Builder, part: str, foot: Point, facing: float, width: float, height: float):
+    """A door with a stepped reveal, sometimes under a gable or behind steps."""
+    orders = int(b.rng.integers(1, 5))
+    step = 0.26 * width / 2 / orders
+    size = (width, height)
+    _opening(
+        b,
+        part,
+        "portal",
+        foot,
+        facing,
+        (width * 1.5, height * 1.12),
+        1,
+        1,
+        size,
+        b.portal_outline,
+        b.doors,
+        orders,
+        step,
+    )
+    for i in range(int(b.rng.integers(0, 4))):
+        depth = 1.6 - 0.4 * i
+        b.box(
+            "ground",
+            "trim",
+            ahead(foot, facing, depth / 2),
+            (depth, width * 1.9 - 0.5 * i, 0.16 * (i + 1)),
+            facing,
+        )
+
+
+def niche_row(b: Builder, foot: Point, facing: float, width: float, height: float, columns: int):
+    """Blind arches: like windows, but walled up."""
+    tall = min(0.86 * height, b.facade_height / 8)
+    wide = min(tall * 0.5, 0.7 * width / columns)
+    _opening(b, "clutter", "none", foot, facing, (width, height), columns, 1, (wide, tall), "round", "plain")
+
+
+def _opening(
+    b, part, element, foot, facing, field_, columns, rows, size, outline, filling, orders=1, step=None
+):
+    fillings = {"portal": "shadow" if filling == "open" else "door", "window": "glass", "none": "wall"}
+    material = fillings[element] if filling != "louvre" else "shadow"
+    depth = 0.35 + 0.3 * orders if element == "portal" else min(0.28 * size[0], 0.7)
+    b.shapes.append(
+        Openings(
+            part=PART[part],
+            material=b.role[material],
+            position=ahead(foot, facing, 0.04),
+            yaw=facing,
+            element=ELEMENT[element],
+            trim_material=b.role["trim"],
+            field=field_,
+            columns=columns,
+            rows=rows,
+            width=size[0],
+            height=size[1],
+            outline=outline,
+            filling=filling,
+            depth=depth,
+            orders=orders,
+            step=0.05 * size[0] if step is None else step,
+            surround=min(0.14 * size[0], 0.4) if element != "none" else 0.0,
+        )
+    )
+
+
+def dome(
+    b: Builder, foot: Point, radius: float, drum: float, windows: bool = True, onion: bool | None = None
+):
+    """A dome on a drum of the given height, with windows around the drum."""
+    x, y, z = foot
+    if drum > 0:
+        b.cone("wall", "drum", foot, radius * 1.02, radius * 1.02, drum)
+        b.cone("wall", "trim", (x, y, z + drum * 0.92), radius * 1.08, radius * 1.08, drum * 0.1)
+    if windows and drum > 1:
+        sides = int(b.rng.choice([8, 12, 16]))
+        for i in range(sides):
+            facing = 2 * math.pi * i / sides
+            # A flat field on a round drum: place it in front of the curve's middle.
+            side = 2 * math.pi * radius / sides
+            place = ahead((x, y, z + drum * 0.12), facing, radius * 1.02)
+            window_row(b, "wall", place, facing, side * 0.6, drum * 0.74, columns=1)
+    z += drum
+    if b.onion if onion is None else onion:
+        top = z + _onion(b, (x, y, z), radius)
+    else:
+        b.ellipsoid("dome", "dome", (x, y, z), (radius, radius, radius * b.dome_rise), cut=0.0)
+        top = z + radius * b.dome_rise
+        if b.lantern and radius > 3:
+            b.cone("dome", "trim", (x, y, top - 0.06 * radius), radius * 0.16, radius * 0.16, radius * 0.34)
+            b.ellipsoid(
+                "dome",
+                "dome",
+                (x, y, top + 0.28 * radius),
+                (radius * 0.19, radius * 0.19, radius * 0.2),
+                cut=0.0,
+            )
+            top += 0.46 * radius
+    if radius > 1:
+        b.cone("dome", "trim", (x, y, top - 0.05 * radius), radius * 0.04, radius * 0.015, radius * 0.4)
+        b.ellipsoid("dome", "trim", (x, y, top + 0.1 * radius), (radius * 0.06,) * 3)
+
+
+def _onion(b: Builder, foot: Point, radius: float) -> float:
+    """A bulb continued smoothly by a cone; returns its height."""
+    x, y, z = foot
+    bulge, tall, angle = radius * 1.15, radius * 1.0, math.radians(48)
+    lower = tall * math.sqrt(1 - (radius / bulge) ** 2)  # where the bulb is as wide as the drum
+    middle, join = z + lower, tall * math.sin(angle)
+    b.ellipsoid("dome", "dome", (x, y, middle), (bulge, bulge, tall), cut=-lower, end=join)
+    height = tall / math.sin(angle) - join
+    b.cone("dome", "dome", (x, y, middle + join), bulge * math.cos(angle), 0.0, height)
+    return lower + join + height
+
+
+def spire(b: Builder, foot: Point, radius: float, height: float):
+    """A steep pointed roof, round or with four or eight sides, with a cross or ball on top."""
+    if b.round_spires:
+        b.cone("spire", "spire", foot, radius, 0.0, height)
+    else:
+        sides = int(b.rng.choice([4, 8]))
+        b.prism("spire", "spire", foot, radius, height, sides, taper=1.0, yaw=0.0)
+    if height > 5:
+        x, y, z = foot
+        bar = 0.03 * radius + 0.03
+        b.box("spire", "trim", (x, y, z + height - 0.3), (bar, bar, 0.45 * radius + 0.6))
+        b.box("spire", "trim", (x, y, z + height + 0.3 * radius), (bar, 5 * bar, bar))
+
+
+def pinnacle(b: Builder, foot: Point, radius: float, height: float):
+    """A small spire on a square shaft."""
+    x, y, z = foot
+    b.box("spire", "trim", foot, (radius * 1.7, radius * 1.7, height * 0.35))
+    b.prism("spire", "spire", (x, y, z + height * 0.35), radius, height * 0.65, 4, taper=1.0, yaw=0.0)
+
+
+def tower(
+    b: Builder,
+    foot: Point,
+    width: float,
+    height: float,
+    top: str,
+    sides: int = 4,
+    bare: tuple[float, ...] = (),
+):
+    """A tower in storeys with belfry openings; top: spire, flat, pyramid, dome or onion.
+
+    `bare`: facings whose lowest storey has no windows, for a portal.
+    """
+    x, y, z = foot
+    if sides == 4:
+        b.box("tower", "tower", foot, (width, width, height))
+    else:
+        b.prism("tower", "tower", foot, width / 2, height, sides, yaw=0.0)
+    storeys = max(2, min(5, round(height / width / b.between(0.7, 1.1))))
+    storey = height / storeys
+    for i in range(1, storeys + 1):
+        ledge = 0.35 + 0.02 * width
+        size = width * (1.1 if i == storeys else 1.05)
+        if sides == 4:
+            b.box("tower", "trim", (x, y, z + i * storey - ledge), (size, size, ledge))
+        else:
+            b.prism("tower", "trim", (x, y, z + i * storey - ledge), size / 2, ledge, sides, yaw=0.0)
+    columns = int(b.rng.integers(1, 4))
+    for facing in (FRONT, LEFT, BACK, RIGHT):
+        for i in range(storeys):
+            if i == 0 and (facing in bare or storey < 4):
+                continue
+            place = ahead((x, y, z + i * storey + 0.15 * storey), facing, width / 2)
+            across = width * (0.8 if sides == 4 else 0.38)
+            belfry = i == storeys - 1
+            filling = "louvre" if belfry and b.lantern else None
+            window_row(
+                b,
+                "tower",
+                place,
+                facing,
+                across,
+                storey * 0.66,
+                columns if belfry else max(1, columns - 1),
+                filling=filling,
+            )
+    _tower_top(b, (x, y, z + height), width, top)
+
+
+def _tower_top(b: Builder, foot: Point, width: float, top: str):
+    x, y, z = foot
+    corners = [(sx * width * 0.44, sy * width * 0.44) for sx in (-1, 1) for sy in (-1, 1)]
+    if top == "spire":
+        spire(b, foot, width * 0.47, width * b.between(1.4, 2.8))
+        if b.chance(0.5):
+            for dx, dy in corners:
+                pinnacle(b, (x + dx, y + dy, z), width * 0.09, width * 0.65)
+    elif top == "flat":
+        if b.chance(0.5):
+            for dx, dy in corners:
+                pinnacle(b, (x + dx, y + dy, z), width * 0.09, width * b.between(0.4, 0.8))
+        else:
+            battlements(b, foot, width)
+    elif top == "pyramid":
+        b.prism("roof", "roof", foot, width * 0.55, width * 0.42, 4, taper=1.0, yaw=0.0)
+    else:
+        dome(b, foot, width * 0.42, width * 0.14, windows=False, onion=top == "onion")
+
+
+def battlements(b: Builder, foot: Point, width: float, count: int = 5):
+    x, y, z = foot
+    merlon = width / (2 * count - 1)
+    for i in range(count):
+        along = (2 * i - count + 1) * merlon * 0.98
+        for side in (-1, 1):
+            edge = side * (width / 2 - merlon * 0.3)
+            b.box("tower", "tower", (x + along, y + edge, z), (merlon, merlon * 0.6, merlon * 1.1))
+            b.box("tower", "tower", (x + edge, y + along, z), (merlon * 0.6, merlon, merlon * 1.1))
+
+
+def minaret(b: Builder, foot: Point, radius: float, height: float, balconies: int, octagonal: bool, cap: str):
+    """A slender shaft with balconies; cap: cone, dome or lantern."""
+    x, y, z = foot
+    base = height * 0.14
+    b.box("minaret", "wall", foot, (radius * 2.6, radius * 2.6, base))
+    b.prism("minaret", "wall", (x, y, z + base), radius * 1.3, radius, 4, taper=0.45, yaw=0.0)
+    heights = np.linspace(base, height * 0.82, balconies + 1)
+    for low, high in zip(heights[:-1].tolist(), heights[1:].tolist(), strict=True):
+        if octagonal:
+            b.prism("minaret", "minaret", (x, y, z + low), radius, high - low, 8)
+        else:
+            b.cone("minaret", "minaret", (x, y, z + low), radius, radius * 0.95, high - low)
+        b.cone("minaret", "trim", (x, y, z + high - radius * 0.8), radius * 0.95, radius * 1.65, radius * 0.8)
+        b.cone("minaret", "trim", (x, y, z + high), radius * 1.65, radius * 1.65, radius * 0.6)
+        radius *= 0.84
+    top = z + height * 0.82
+    b.cone("minaret", "minaret", (x, y, top), radius * 0.95, radius * 0.9, height * 0.08)
+    top += height * 0.08
+    if cap == "cone":
+        b.cone("minaret", "cap", (x, y, top), radius * 1.2, 0.0, height * 0.13)
+        top += height * 0.13
+    elif cap == "dome":
+        b.ellipsoid(
+            "minaret",
+            "cap",
+            (x, y, top + 0.4 * radius),
+            (radius * 1.25, radius * 1.25, radius * 1.6),
+            cut=-0.4 * radius,
+        )
+        top += 2 * radius
+    else:
+        for i in range(6):
+            place = ahead((x, y, top), i * math.pi / 3, radius * 0.75)
+            b.cone("minaret", "trim", place, radius * 0.12, radius * 0.12, radius * 1.6)
+        b.cone("minaret", "trim", (x, y, top + 1.6 * radius), radius * 1.15, radius * 1.15, radius * 0.3)
+        b.ellipsoid("minaret", "cap", (x, y, top + 1.9 * radius), (radius, radius, radius * 1.1), cut=0.0)
+        top += 3 * radius
+    b.cone("minaret", "trim", (x, y, top - 0.2 * radius), radius * 0.12, 0.02, radius * 1.6)
+
+
+def colonnade(b: Builder, start: Point, end: Point, count: int, height: float, radius: float):
+    """A row of equal columns between two points, with bases and capitals."""
+    for i in range(count):
+        share = i / (count - 1)
+        x, y = (s + (e - s) * share for s, e in zip(start[:2], end[:2], strict=True))
+        z = start[2]
+        b.cone("column", "column", (x, y, z), radius, radius * 0.86, height)
+        b.box("column", "trim", (x, y, z + height - radius), (radius * 2.8, radius * 2.8, radius))
+        b.box("column", "trim", (x, y, z), (radius * 2.8, radius * 2.8, radius * 0.8))
+
+
+def chimney(b: Builder, foot: Point, height: float):
+    """A smokestack: slender and round like a minaret."""
+    radius = height * b.between(0.05, 0.08)
+    x, y, z = foot
+    b.cone("clutter", "wall", foot, radius * 1.15, radius, height)
+    b.cone("clutter", "trim", (x, y, z + height), radius * 1.25, radius * 1.25, radius * 0.6)

@@ -1,1 +1,0 @@
-"""Stability as a measured property: every component over a catalogue of extreme cases."""

@@ -1,0 +1,1 @@
+"""Numerical stability: every component measured on a catalogue of extreme cases."""

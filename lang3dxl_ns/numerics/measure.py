@@ -1,0 +1,289 @@
+"""Measurement of one numerics case: errors against a float64 reference, and run time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lang3dxl_ns.common.reports import interleaved_times
+
+Maps = dict[str, Tensor]
+Function = Callable[[Maps], Mapping[str, Tensor]]
+
+AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
+"""Mixed-precision modes: inputs in float32, the component under autocast."""
+FLIP = 1e-4
+"""A pixel off by more than this share of the largest value has a pair across a threshold."""
+_STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Largest errors that pass, relative to the reference's largest value (max) or its RMS (rms)."""
+
+    output_max: float = 1e-5
+    output_rms: float = 1e-6
+    gradient_max: float = 1e-4
+    gradient_rms: float = 1e-5
+    flipped: float = 0.0
+    """Share of pixels allowed to fall on the other side of a threshold than the reference's."""
+
+    def times(self, factor: float) -> Bounds:
+        """The same with all errors multiplied by a factor."""
+        names = ("output_max", "output_rms", "gradient_max", "gradient_rms")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
+
+
+EXACT = Bounds(1e-9, 1e-9, 1e-7, 1e-7)
+"""In float64, rounding is negligible and only the formula could be wrong."""
+
+
+@dataclass
+class Problem:
+    """A case with its data: float64 leaves, and two functions of them that should agree."""
+
+    leaves: Maps
+    compute: Function
+    """The component, in the precision and on the device of its leaves."""
+    reference: Function
+    """The same in float64, written for clarity. Not finite where the component need not be."""
+    thresholds: bool = False
+    """Count pixels that flip across a threshold separately, and exclude them from the gradient."""
+    smooth: bool = False
+    """Also check the reference's gradient by finite differences."""
+    constants: frozenset[str] = frozenset()
+    """Leaves without a gradient."""
+    output_scale: float = 0.0
+    """Smallest denominator of relative output errors, for answers that nearly vanish."""
+    gradient_scale: float = 0.0
+    """The same for gradients."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A component and one hard case of it."""
+
+    component: str
+    name: str
+    build: Callable[[], Problem]
+    bounds: Mapping[str, Bounds] = field(default_factory=lambda: {"float32": Bounds(), "float64": EXACT})
+    """By mode: float32, float64, bf16 and fp16 (autocast), tf32 (on a GPU)."""
+    note: str = ""
+    """Reason for the bound, where it isn't obvious."""
+
+
+@dataclass
+class Row:
+    """Measured figures; errors are relative, `ms` is one forward and backward."""
+
+    component: str
+    case: str
+    mode: str
+    output_max: float
+    output_rms: float
+    gradient_max: float | None
+    gradient_rms: float | None
+    finite_difference: float | None
+    flipped: float
+    finite: bool
+    ms: float
+    bounds: Bounds
+    note: str
+
+    @property
+    def misses(self) -> list[str]:
+        """Bounds exceeded, in words; empty for a pass."""
+        found = [] if self.finite else ["not finite"]
+        for name, bound in vars(self.bounds).items():
+            value = getattr(self, name)
+            if value is not None and not value <= bound:
+                found.append(f"{name.replace('_', ' ')} {value:.1e} > {bound:.0e}")
+        if self.finite_difference is not None and not self.finite_difference < 1e-4:
+            found.append(f"finite difference {self.finite_difference:.1e} > 1e-4")
+        return found
+
+
+def measure(case: Case, mode: str, device: torch.device | str = "cpu", repeats: int = 3) -> Row:
+    """Run a case in one mode: errors against the reference, whether all is finite, and time."""
+    problem = case.build()
+    dtype = torch.float64 if mode == "float64" else torch.float32
+    leaves = _leaves(problem, {n: v.to(device, dtype) for n, v in problem.leaves.items()})
+    # The reference sees the rounded inputs: input rounding is not the component's error.
+    exact = _leaves(problem, {n: v.detach().double() for n, v in leaves.items()})
+    with _precision(mode, device):
+        found = problem.compute(leaves)
+    expected = problem.reference(exact)
+    settled = _settled(found, expected) if problem.thresholds else {}
+    upstream = _upstream(expected, settled)
+    gradients = _gradients(found, leaves, upstream)
+    exact_gradients = _gradients(expected, exact, upstream)
+    outputs = [_errors(found[name], value, problem.output_scale) for name, value in expected.items()]
+    slopes = [
+        _errors(gradients[name], value, problem.gradient_scale) for name, value in exact_gradients.items()
+    ]
+
+    def work() -> None:
+        with _precision(mode, device):
+            again = problem.compute(leaves)
+        _gradients(again, leaves, upstream)
+
+    clock = time.process_time if torch.device(device).type == "cpu" else time.perf_counter
+    seconds = interleaved_times({"it": work}, repeats, 0.2, clock)["it"]
+    return Row(
+        case.component,
+        case.name,
+        mode,
+        output_max=_worst(error.max for error in outputs),
+        output_rms=_worst(error.rms for error in outputs),
+        gradient_max=_worst(error.max for error in slopes) if slopes else None,
+        gradient_rms=_worst(error.rms for error in slopes) if slopes else None,
+        finite_difference=_finite_difference(problem, exact, upstream, exact_gradients),
+        flipped=1 - _share(settled),
+        finite=all(error.finite for error in (*outputs, *slopes)),
+        ms=1e3 * sorted(seconds)[len(seconds) // 2],
+        bounds=case.bounds[mode],
+        note=case.note,
+    )
+
+
+@dataclass(frozen=True)
+class _Error:
+    max: float
+    rms: float
+    finite: bool
+    """Finite wherever the reference is."""
+
+
+def _errors(found: Tensor, expected: Tensor, scale: float = 0.0) -> _Error:
+    """Errors relative to the reference's largest value and RMS (at least `scale`), where it is finite.
+
+    Where the reference is not finite, the component may be anything; where it is all zero, errors are
+    absolute.
+    """
+    if found.shape != expected.shape:
+        raise ValueError(f"the component gives {tuple(found.shape)}, the reference {tuple(expected.shape)}")
+    keep = expected.detach().isfinite()
+    true, ours = expected.detach()[keep], found.detach().to(expected.device)[keep].double()
+    if not true.numel():
+        return _Error(0.0, 0.0, True)
+    difference = ours - true
+    largest, size = max(float(true.abs().max()), scale), max(_rms(true), scale)
+    return _Error(
+        float(difference.abs().max()) / (largest or 1.0),
+        _rms(difference) / (size or 1.0),
+        bool(ours.isfinite().all()),
+    )
+
+
+def _rms(values: Tensor) -> float:
+    """Root mean square; scaled first, so that nothing under- or overflows."""
+    largest = values.abs().max()
+    if not largest > 0 or not bool(largest.isfinite()):
+        return float(largest)
+    return float(largest * (values / largest).square().mean().sqrt())
+
+
+def _worst(values: Iterable[float]) -> float:
+    """The largest; NaN if there is any (`max` would lose it)."""
+    listed = list(values)
+    return math.nan if any(math.isnan(value) for value in listed) else max(listed, default=0.0)
+
+
+def _leaves(problem: Problem, values: Maps) -> Maps:
+    return {name: value.requires_grad_(name not in problem.constants) for name, value in values.items()}
+
+
+def _settled(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> Maps:
+    """By map [h, w, 1]: the pixels in which no map flips across a threshold."""
+    flipped = [
+        (found[name].detach().double() - true.detach()).abs().amax(2, keepdim=True)
+        > FLIP * float(true.detach().abs().max())
+        for name, true in expected.items()
+        if true.numel()
+    ]
+    if not flipped:
+        return {}
+    settled = ~torch.stack(flipped).any(0)
+    return dict.fromkeys(expected, settled)
+
+
+def _share(settled: Maps) -> float:
+    return float(next(iter(settled.values())).double().mean()) if settled else 1.0
+
+
+def _upstream(expected: Mapping[str, Tensor], settled: Maps) -> Maps:
+    generator = torch.Generator().manual_seed(0)
+    random = {
+        name: torch.randn(value.shape, generator=generator, dtype=torch.float64).to(value.device)
+        for name, value in expected.items()
+    }
+    finite = {name: value.detach().isfinite() for name, value in expected.items()}
+    return {name: value * settled.get(name, True) * finite[name] for name, value in random.items()}
+
+
+def _gradients(outputs: Mapping[str, Tensor], leaves: Maps, upstream: Maps) -> Maps:
+    """Gradients of Σ output · upstream with respect to all leaves; zero for leaves without influence."""
+    wanted = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
+    attached = {name: value for name, value in outputs.items() if value.requires_grad}
+    if not attached:
+        return {name: torch.zeros_like(leaf) for name, leaf in wanted.items()}
+    found = torch.autograd.grad(
+        list(attached.values()),
+        list(wanted.values()),
+        [upstream[name].to(value) for name, value in attached.items()],
+        allow_unused=True,
+    )
+    return {
+        name: torch.zeros_like(leaf) if gradient is None else gradient
+        for (name, leaf), gradient in zip(wanted.items(), found, strict=True)
+    }
+
+
+def _finite_difference(problem: Problem, leaves: Maps, upstream: Maps, gradients: Maps) -> float | None:
+    """Relative difference of the reference's gradient from central differences, along a random direction."""
+    if not problem.smooth:
+        return None
+    generator = torch.Generator().manual_seed(1)
+    along = {}
+    for name in gradients:
+        direction = torch.randn(leaves[name].shape, generator=generator, dtype=torch.float64)
+        along[name] = direction.to(leaves[name].device)
+
+    def value(step: float) -> float:
+        moved = {name: leaf.detach() + step * along.get(name, 0.0) for name, leaf in leaves.items()}
+        outputs = problem.reference(moved)
+        return float(sum((outputs[name] * upstream[name]).sum() for name in outputs))
+
+    slope = float(sum((gradients[name] * direction).sum() for name, direction in along.items()))
+    return abs((value(_STEP) - value(-_STEP)) / (2 * _STEP) - slope) / max(abs(slope), 1e-12)
+
+
+def narrowed(values: Tensor) -> Tensor:
+    """Rounded to autocast's number type, like the output of a layer; unchanged outside autocast."""
+    device = values.device.type
+    return values.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else values
+
+
+def _precision(mode: str, device: torch.device | str) -> AbstractContextManager[Any]:
+    """The context of a mode: autocast, TF32, or nothing."""
+    if mode in AUTOCAST:
+        return torch.autocast(torch.device(device).type, AUTOCAST[mode])
+    return _tf32() if mode == "tf32" else nullcontext()
+
+
+class _tf32:
+    """TF32 matrix products, on GPUs that have them."""
+
+    def __enter__(self) -> None:
+        self._before = torch.get_float32_matmul_precision()
+        torch.set_float32_matmul_precision("high")
+
+    def __exit__(self, *_: object) -> None:
+        torch.set_float32_matmul_precision(self._before)

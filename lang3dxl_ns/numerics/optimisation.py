@@ -1,0 +1,105 @@
+"""Long and stiff optimisations of the semantic field alone, for drift, growth and breakdown over time."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from lang3dxl_ns.components.losses import clip_loss
+from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+
+PIXELS, BATCH, CHANNELS, KINDS = 1024, 64, 32, 12
+NOISE = 0.3
+"""Deviation of the targets around their cluster's mean, like crops of the same thing."""
+PARTS = 10
+LARGEST_CODE = 25.0
+"""At 17 float32's sigmoid is 1 with zero slope: a code stops there, once its momentum is spent."""
+DRIFT = 1.05
+"""The last part's loss may exceed the lowest part's by this factor."""
+
+
+@dataclass
+class Run:
+    """An optimisation, in tenths of its steps."""
+
+    name: str
+    steps: int
+    converges: bool
+    """Whether its loss must converge; its numbers must be finite in any case."""
+    seconds: float = 0.0
+    losses: list[float] = field(default_factory=list)
+    """Mean over the part."""
+    codes: list[float] = field(default_factory=list)
+    """Largest code at the part's end."""
+    finite: bool = True
+    """Whether all parameters and moments are finite at the end of every part."""
+
+    @property
+    def misses(self) -> list[str]:
+        """Bounds exceeded, in words; empty for a pass."""
+        found = [] if self.finite else ["not finite"]
+        if self.converges and not self.losses[-1] <= DRIFT * min(self.losses):
+            found.append(f"loss {self.losses[-1]:.3f}, was {min(self.losses):.3f}")
+        if self.converges and not self.codes[-1] <= LARGEST_CODE:
+            found.append(f"largest code {self.codes[-1]:.1f} > {LARGEST_CODE:.0f}")
+        return found
+
+
+def runs(quick: bool) -> list[Run]:
+    """Runs the catalogue of optimisations (on the CPU: the steps are too small for a GPU)."""
+    long = 1_000 if quick else 100_000
+    steps = 200 if quick else 1_000
+    return [
+        optimise("usual rates, no decay", long, 1e-3, 5e-4, 5e-4),
+        optimise("rates 1e6 apart, codes fast", steps, 10.0, 1e-3, 1e-5, converges=False),
+        optimise("rates 1e6 apart, decoder fast", steps, 1e-5, 1e-3, 10.0, converges=False),
+    ]
+
+
+def optimise(
+    name: str, steps: int, code_rate: float, grid_rate: float, decoder_rate: float, converges: bool = True
+) -> Run:
+    """Adam as in training (epsilon 1e-15) at constant rates, on pixels of a few kinds of things."""
+    generator = torch.Generator().manual_seed(0)
+    # A small table keeps a step to a millisecond or two.
+    config = SemanticFieldConfig(preset="short", log2_table_size=9)
+    model = SemanticField(config, CHANNELS, generator=generator)
+    kinds = torch.randn(KINDS, CHANNELS, generator=generator)
+    targets = kinds[torch.randint(KINDS, (PIXELS,), generator=generator)]
+    codes = model.initial_codes(PIXELS, generator).requires_grad_()
+    groups: list[tuple[list[Tensor], float]] = [
+        ([codes], code_rate),
+        ([*model.encoding_parameters()], grid_rate),
+        ([*model.decoder_parameters()], decoder_rate),
+    ]
+    adam = torch.optim.Adam([{"params": p, "lr": rate} for p, rate in groups], eps=1e-15, fused=True)
+    weight = torch.ones(1, BATCH)
+
+    def step() -> float:
+        chosen = torch.randint(PIXELS, (BATCH,), generator=generator)
+        target = targets[chosen] + NOISE * torch.randn(BATCH, CHANNELS, generator=generator)
+        loss = clip_loss(model.decode_clip(codes[chosen])[None], target[None], weight)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        return loss.item()
+
+    run, start = Run(name, steps, converges), time.process_time()
+    for _ in range(PARTS):
+        losses = [step() for _ in range(steps // PARTS)]
+        run.losses.append(math.fsum(losses) / len(losses))
+        run.codes.append(float(codes.detach().abs().max()))
+        run.finite &= _all_finite(adam)
+    run.seconds = time.process_time() - start
+    return run
+
+
+def _all_finite(optimizer: torch.optim.Optimizer) -> bool:
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    moments = [value for state in optimizer.state.values() for value in state.values()]
+    tensors: list[Tensor] = [*parameters, *moments]
+    return all(bool(tensor.isfinite().all()) for tensor in tensors)

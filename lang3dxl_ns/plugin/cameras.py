@@ -1,0 +1,61 @@
+"""Conversion of lenses and poses between nerfstudio's cameras and ours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from lang3dxl_ns.scene.camera import Camera, Lens, camera_to_world, view_matrix
+
+
+def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4"]) -> Cameras:
+    """Pinhole cameras (photos are undistorted on reading) at nerfstudio's poses."""
+
+    def column(name: str) -> Tensor:
+        return torch.tensor([getattr(lens, name) for lens in lenses])
+
+    return Cameras(
+        camera_to_worlds=camera_to_worlds,
+        fx=column("fx").float(),
+        fy=column("fy").float(),
+        cx=column("cx").float(),
+        cy=column("cy").float(),
+        width=column("width"),
+        height=column("height"),
+    )
+
+
+def view_of(camera: Camera) -> Cameras:
+    """One of our cameras as a nerfstudio camera."""
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    lens = Lens(camera.width, camera.height, fx, fy, cx, cy)
+    return to_nerfstudio([lens], camera_to_world(camera.view_matrix.cpu())[None])
+
+
+def lens_of(cameras: Cameras, index: int) -> Lens:
+    """The lens of a nerfstudio perspective camera."""
+    parameters = cameras.distortion_params
+    k1, k2, k3, _, p1, p2 = [0.0] * 6 if parameters is None else parameters[index].tolist()
+    return Lens(
+        width=int(cameras.width[index]),
+        height=int(cameras.height[index]),
+        fx=float(cameras.fx[index]),
+        fy=float(cameras.fy[index]),
+        cx=float(cameras.cx[index]),
+        cy=float(cameras.cy[index]),
+        distortion=(k1, k2, p1, p2, k3) if any((k1, k2, k3, p1, p2)) else (),
+    )
+
+
+def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"], device: torch.device) -> Camera:
+    """The lens of a nerfstudio camera at a (possibly refined) pose, camera → world."""
+    return Camera(
+        view_matrix=view_matrix(pose.to(device)),
+        intrinsics=camera.get_intrinsics_matrices()[0].to(device),
+        width=int(camera.width.item()),
+        height=int(camera.height.item()),
+    )

@@ -1,0 +1,497 @@
+"""Data manager: one photo per step with its targets, read ahead through a bounded cache."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from itertools import chain, repeat
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from jaxtyping import Bool, Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
+from nerfstudio.data.datamanagers.full_images_datamanager import (
+    FullImageDatamanager,
+    FullImageDatamanagerConfig,
+)
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markdown import Markdown
+from rich.markup import escape
+from torch import Tensor
+
+from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.timing import part
+from lang3dxl_ns.plugin.cameras import to_nerfstudio
+from lang3dxl_ns.plugin.data_folder import parser_for
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
+from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
+from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
+from lang3dxl_ns.plugin.run_dataparser import recorded_scene
+from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
+from lang3dxl_ns.preparation.encoders import BUILTIN
+from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
+from lang3dxl_ns.preparation.needs import Need, Sources, needs_table, scene_needs
+from lang3dxl_ns.preparation.prepare import prepare
+from lang3dxl_ns.preparation.regions import RegionSource, region_source
+from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
+from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
+from lang3dxl_ns.scene.camera import scaled_size
+from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.novel_views import NovelViews, read_novel_views
+from lang3dxl_ns.scene.photo import Photo
+
+
+@dataclass
+class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
+    """Photos and their targets. `--pipeline.datamanager.clip none` trains colours only."""
+
+    _target: type = field(default_factory=lambda: Lang3DXLDataManager)
+    dataparser: AnnotatedDataParserUnion = field(default_factory=PhotoCollectionDataParserConfig)
+    """Source of photos and cameras."""
+    cache_dir: Path | None = None
+    """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
+    cache_gb: float | None = None
+    """Memory for decoded photos and their targets, in gigabytes; least recently used ones are evicted.
+    Default: a quarter of the machine's memory."""
+    read_ahead: int = 4
+    """Photos read ahead of the training step, in addition to that memory."""
+    run: tyro.conf.Suppress[Path | None] = None
+    """Folder of the run whose config.yml this comes from; set when that is read."""
+
+    def check(self) -> None:
+        """Raises UserError for invalid options, before any work."""
+        super().check()
+        check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
+
+    def settle_targets(self, learned: bool) -> None:
+        """Dense features and regions are for semantics `learned` with the scene; others have finer crops."""
+        if self.crops == "auto":
+            self.crops = "pyramid" if learned else "fine"
+        if not learned or self.clip == "none":
+            self.dense = self.regions = "none"
+        elif self.dense == "auto":
+            self.dense = BUILTIN if self.clip == BUILTIN else DENSE_MODEL
+
+
+_BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
+
+
+class PhotosGoneError(UserError):
+    """Too many photos have vanished during training to continue."""
+
+
+MOST_GONE = 0.1
+"""Share of the training photos that may vanish."""
+
+
+class PhotoDataset(InputDataset):
+    """nerfstudio's dataset over `Photo`s: read, undistorted and resized on demand, pinhole cameras."""
+
+    def __init__(self, outputs: DataparserOutputs, scale: float):
+        super().__init__(outputs)
+        self.scale = scale
+        self.photos: list[Photo] = outputs.metadata["photos"]
+        lenses = [photo.lens.scaled(scale) for photo in self.photos]
+        self.cameras = to_nerfstudio(lenses, outputs.cameras.camera_to_worlds)
+
+    def read(self, index: int) -> dict[str, Tensor]:
+        """`image` [h, w, 3] uint8 and, if the photo has one, `mask` [h, w, 1] bool."""
+        photo = self.photos[index]
+        data = {"image": photo.read_uint8(self.scale)}
+        mask = photo.read_mask(self.scale)
+        if mask is not None:
+            data["mask"] = mask[..., None]
+        return data
+
+    def get_data(self, image_idx: int, image_type: str = "float32") -> dict:
+        data = self.read(image_idx)
+        if image_type == "float32":
+            data["image"] = data["image"].float() / 255
+        return {"image_idx": image_idx, **data}
+
+    def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
+        return self.photos[image_idx].read(self.scale)
+
+
+class Lang3DXLDataManager(FullImageDatamanager):
+    """One photo per step: camera, image, mask, and the targets of the semantic losses."""
+
+    config: Lang3DXLDataManagerConfig
+    train_dataset: PhotoDataset
+    eval_dataset: PhotoDataset
+    photo_in_hand: str
+    """Name of the latest training photo."""
+
+    def __init__(self, config: Lang3DXLDataManagerConfig, *args, **kwargs):
+        config.check()
+        self._left_out: set[int] = set()
+        self._gone = 0
+        if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
+            if config.data is not None:
+                config.dataparser.data = Path(config.data)
+            # a run's own cameras are never found anew: its Gaussians would not fit them
+            config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
+            config.data = config.dataparser.data
+        if hasattr(config.dataparser, "load_3D_points"):
+            config.dataparser.load_3D_points = True  # off by default in nerfstudio-data
+        try:
+            super().__init__(config, *args, **kwargs)
+        except (UserError, OSError) as reason:
+            recorded = recorded_scene(config.run)
+            if recorded is None or kwargs.get("test_mode", "val") == "val":
+                raise
+            CONSOLE.log(
+                f"[yellow]The cameras are taken from the run's folder, since the photos are gone: {reason}"
+            )
+            config.dataparser, config.camera_res_scale_factor = recorded, 1.0
+            super().__init__(config, *args, **kwargs)
+
+    def get_datapath(self) -> Path:
+        """Folder where the viewer keeps camera paths: the run's."""
+        return self.config.run or super().get_datapath()
+
+    def create_train_dataset(self) -> PhotoDataset:
+        return self._dataset(self.train_dataparser_outputs)
+
+    def create_eval_dataset(self) -> PhotoDataset:
+        return self._dataset(self.dataparser.get_dataparser_outputs(split=self.test_split))
+
+    def _dataset(self, outputs: DataparserOutputs) -> PhotoDataset:
+        if "photos" not in outputs.metadata:  # one of nerfstudio's own dataparsers
+            outputs.metadata["photos"] = photos_of(outputs, Path(self.config.dataparser.data))
+        if not outputs.metadata["photos"]:
+            raise UserError(
+                f"a split of {self.config.dataparser.data} has no photo: add photos (a tenth is held out)"
+            )
+        return PhotoDataset(outputs, self.config.camera_res_scale_factor)
+
+    def setup_train(self) -> None:
+        """Before training: prepare missing targets, and give the model their statistics and the scene's
+        needs."""
+        if self.test_mode != "val":
+            return
+        self.train_dataset.metadata["needs"] = {need.component: need.needed for need in self.needs}
+        CONSOLE.print(Markdown(f"**What this scene needs**\n\n{needs_table(self.needs)}"))
+        if self.targets is not None:
+            prepared = set(self.targets.names)  # without damaged photos
+            names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
+            self.train_dataset.metadata["feature_statistics"] = self.targets.feature_statistics(names)
+            self.train_dataset.metadata["clip_targets"] = partial(self.targets.clip_features, names)
+        _log(self._memory_budget())
+
+    @cached_property
+    def targets(self) -> TargetReader | None:
+        """The prepared targets of all photos, or None if only colours are trained. Made on first use,
+        so that the viewer and exports never wait for them."""
+        photos = list(self.photos.values())
+        if self.config.clip == "none":
+            return None
+        # Held-out photos have the whole pyramid, which the 2-D teacher is.
+        fine = [p.name for p in self.train_dataset.photos] if self.config.crops == "fine" else []
+        return prepare_collection(
+            photos,
+            self._reconstruction(),
+            self.config,
+            self.cache_dir,
+            self.device,
+            log=_log,
+            regions=self._region_source,
+            fine=fine,
+        ).reader
+
+    def clean_store(self) -> tuple[int, int]:
+        """Delete targets unused by the scene's photos with this configuration; returns files and bytes."""
+        c = self.config
+        used = {
+            CLIP: c.clip != "none",
+            FINE: c.clip != "none",
+            DENSE: c.dense != "none",
+            FOREGROUND: c.foreground == "text",
+        }
+        used[REGIONS] = self._region_source is not None
+        names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
+        names += [] if self.test_views is None else [view.name for view in self.test_views.cameras]
+        return FeatureStore(self.cache_dir).clean([kind for kind, wanted in used.items() if wanted], names)
+
+    @cached_property
+    def test_views(self) -> NovelViews | None:
+        """The scene's test views, if it has any."""
+        return read_novel_views(self.data_folder)
+
+    @cached_property
+    def test_dataset(self) -> PhotoDataset:
+        """The test views as photos, with targets made with the collection's crop sizes."""
+        views, config = self.test_views, self.config
+        if views is None:
+            raise UserError(
+                f"{self.data_folder} has no test views: `lang3dxl demo-scene` makes scenes with them"
+            )
+        dataset = self._dataset(
+            novel_outputs(views, self.train_dataparser_outputs, config.foreground != "none")
+        )
+        if self.targets is not None:
+            plan = plan_crops(list(self.photos.values()), self._reconstruction(), config)
+            sizes = novel_pixel_sizes(views, config) if plan.pixel_sizes is not None else None
+            prepare(dataset.photos, sizes, config, plan.scales, FeatureStore(self.cache_dir), self.device)
+        return dataset
+
+    @cached_property
+    def _region_source(self) -> RegionSource | None:
+        c = self.config
+        return region_source(c.regions, c.region_level, c.sam, self.data_folder, self.device)
+
+    @cached_property
+    def needs(self) -> list[Need]:
+        """The scene's needs for optional components, measured on first use."""
+        learns = self.config.clip != "none"
+        sources = Sources(
+            dense=learns and self.config.makes_dense,
+            regions=learns and self._region_source is not None,
+        )
+        photos, reconstruction = list(self.photos.values()), self._reconstruction()
+        return scene_needs(photos, reconstruction, plan_crops(photos, reconstruction, self.config), sources)
+
+    @cached_property
+    def photos(self) -> dict[str, Photo]:
+        """All photos by name, with their foreground masks, which both datasets then use. Made on first use,
+        like the targets."""
+        datasets = (self.train_dataset, self.eval_dataset)
+        photos = {photo.name: photo for dataset in datasets for photo in dataset.photos}
+        masked = with_foreground(
+            list(photos.values()), self.config, self.data_folder, self.cache_dir, self.device, _log
+        )
+        photos = {photo.name: photo for photo in masked}
+        for dataset in datasets:
+            dataset.photos[:] = [photos[photo.name] for photo in dataset.photos]
+        return photos
+
+    def foreground(self, name: str) -> Bool[Tensor, "h w"] | None:
+        """A photo's foreground, at training resolution; None if it is the whole photo."""
+        return self.photos[name].read_mask(self.config.camera_res_scale_factor)
+
+    @property
+    def data_folder(self) -> Path:
+        """Folder of the scene."""
+        data = Path(self.config.dataparser.data)
+        return data if data.is_dir() else data.parent
+
+    @property
+    def cache_dir(self) -> Path:
+        """Folder of prepared targets."""
+        return (self.config.cache_dir or self.data_folder / "lang3dxl_cache").expanduser()
+
+    def _reconstruction(self) -> Reconstruction:
+        """The model in its own units: COLMAP's, or for other dataparsers one made from the seed points."""
+        own = getattr(self.dataparser, "reconstruction", None)
+        if own is not None:
+            return own
+        return reconstruction_of([self.train_dataparser_outputs, self.eval_dataset._dataparser_outputs])
+
+    @cached_property
+    def _train_cache(self) -> PhotoCache:
+        _ = self.targets  # so that they are not made in the cache's thread
+        return PhotoCache(lambda index: self._read(self.train_dataset, index), self.cache_bytes)
+
+    @property
+    def cache_bytes(self) -> float:
+        """Memory for photos and targets, bytes."""
+        gigabytes = self.config.cache_gb
+        return machine_memory() / 4 if gigabytes is None else gigabytes * 1e9
+
+    def _memory_budget(self) -> str:
+        """Memory that training uses for photos, estimated from the first one's targets."""
+        photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
+        total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
+        if self.targets is not None:
+            total += len(photos) * self.targets.bytes_of(self.targets.names[0])
+        held = min(total, self.cache_bytes)
+        return (
+            f"memory: at most {held / 1e9:.2f} GB of photos and targets at a time (of "
+            f"{total / 1e9:.2f} GB in {len(photos)} photos), {self.config.read_ahead} photos read ahead "
+            "(--pipeline.datamanager.cache-gb sets the limit)"
+        )
+
+    def sample_train_cameras(self) -> list[int]:
+        """A new round of all usable training photos."""
+        rounds = super().sample_train_cameras()
+        usable = [i for i in rounds if i not in self._left_out]
+        if not usable:
+            raise UserError("none of the training photos can be used: see the reasons above")
+        return usable
+
+    def next_train(self, step: int) -> tuple[Cameras, dict]:
+        """Camera and batch of the next training photo; every photo once per round.
+
+        A photo found to be damaged is left out from then on, and logged.
+        """
+        index = self.train_unseen_cameras.pop(0)
+        if not self.train_unseen_cameras:
+            self.train_unseen_cameras = self.sample_train_cameras()
+        try:
+            with part("data"):
+                data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
+                camera, batch = self._batch(self.train_dataset, index, data)
+        except UserError as reason:
+            _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
+            self._leave_out(index, reason)
+            # The round continues without it: a resumed run, which meets it later, has the same order.
+            rest = [i for i in self.train_unseen_cameras if i != index]
+            self.train_unseen_cameras = rest or self.sample_train_cameras()
+            return self.next_train(step)
+        camera.metadata = {"cam_idx": index}
+        self.photo_in_hand = batch["name"]
+        return camera, batch
+
+    def _leave_out(self, index: int, reason: UserError) -> None:
+        """Raises PhotosGoneError if too many have vanished."""
+        self._left_out.add(index)
+        self._gone += has_vanished(reason)
+        if self._gone > max(MOST_GONE * len(self.train_dataset), 1):
+            raise PhotosGoneError(
+                f"{self._gone} of {len(self.train_dataset)} training photos or their targets have vanished; "
+                f"the latest reason: {reason}; restore the disk or network share"
+            ) from reason
+
+    def round_state(self) -> dict[str, Any]:
+        """Photos left in this round, and the state that determines the next, for a checkpoint."""
+        names = [photo.name for photo in self.train_dataset.photos]
+        generator = getattr(self, "random_generator", None)  # "fps" sampling has none
+        return {
+            "upcoming": [names[i] for i in self.train_unseen_cameras],
+            "generator": generator and generator.getstate(),
+        }
+
+    def restore_round(self, state: dict[str, Any]) -> None:
+        """Restores `round_state`; photos that this run lacks are skipped, new ones join in the next round."""
+        index = {photo.name: i for i, photo in enumerate(self.train_dataset.photos)}
+        if state["generator"] is not None and hasattr(self, "random_generator"):
+            self.random_generator.setstate(state["generator"])
+        upcoming = [index[name] for name in state["upcoming"] if name in index]
+        self.train_unseen_cameras = upcoming or self.sample_train_cameras()
+
+    def train_photos(self) -> Iterator[tuple[Cameras, dict]]:
+        """Camera and batch of every training photo once, without the damaged ones."""
+        for index, photo in enumerate(self.train_dataset.photos):
+            if index in self._left_out:
+                continue
+            try:
+                camera, batch = self._batch(self.train_dataset, index, self._read(self.train_dataset, index))
+            except UserError as reason:
+                CONSOLE.log(f"[yellow]{photo.name} is left out: {reason}")
+                continue
+            camera.metadata = {"cam_idx": index}
+            yield camera, batch
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
+        """Camera and batch of a held-out photo, in turn."""
+        return next(self._eval_rounds)
+
+    @cached_property
+    def _eval_rounds(self) -> Iterator[tuple[Cameras, dict]]:
+        return chain.from_iterable(repeat(EvalPhotos(self)))
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> EvalPhotos:  # type: ignore[override]
+        """All held-out photos, read one at a time."""
+        return EvalPhotos(self)
+
+    def get_train_rays_per_batch(self) -> int:
+        """Pixels of a typical photo, for nerfstudio's speed display."""
+        return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
+
+    def _read(self, dataset: PhotoDataset, index: int) -> dict[str, Any]:
+        """A photo's data for a step, as kept in memory: bytes and half precision.
+
+        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with semantics `clip_target` [Hd, Wd, C],
+        `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
+        (labels, −1 for none).
+        """
+        data: dict[str, Any] = dict(dataset.read(index))
+        if self.targets is not None:
+            name = dataset.photos[index].name
+            clip = self.targets.clip(name)
+            found = {
+                "clip_target": clip.features,
+                "dense_target": self.targets.dense(name),
+                "regions": self.targets.regions(name),
+            }
+            # Cloned: read from disk now, not during the step.
+            data |= {key: value.clone() for key, value in found.items() if value is not None}
+            data["crop_sides"] = clip.crop_fractions
+        return data
+
+    def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, dict]:
+        """A photo's data for a step, on the device, with `name` and `image_idx`."""
+        batch: dict[str, Any] = {
+            key: value.to(self.device) if isinstance(value, Tensor) else value for key, value in data.items()
+        }
+        for key, number in (
+            ("clip_target", torch.float32),
+            ("dense_target", torch.float32),
+            ("regions", torch.int64),
+        ):
+            if key in batch:
+                batch[key] = batch[key].to(number)
+        batch |= {"image_idx": index, "name": dataset.photos[index].name}
+        return dataset.cameras[index : index + 1].to(self.device), batch
+
+
+class EvalPhotos:
+    """Photos to evaluate as (camera, batch) pairs, one photo in memory at a time; damaged ones are left out
+    and logged.
+
+    Args:
+        dataset: by default the held-out photos.
+        names: photos of it to evaluate; by default all.
+    """
+
+    def __init__(
+        self,
+        datamanager: Lang3DXLDataManager,
+        dataset: PhotoDataset | None = None,
+        names: Collection[str] | None = None,
+    ):
+        self._datamanager = datamanager
+        self.dataset = dataset or datamanager.eval_dataset
+        photos = enumerate(self.dataset.photos)
+        self._wanted = [index for index, photo in photos if names is None or photo.name in names]
+
+    def __len__(self) -> int:
+        return len(self._wanted)
+
+    def cameras(self) -> Iterator[tuple[Cameras, Photo]]:
+        """Camera and photo of each, without reading files."""
+        for index in self._wanted:
+            yield self.dataset.cameras[index : index + 1], self.dataset.photos[index]
+
+    def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
+        dataset = self.dataset
+        _ = self._datamanager.targets  # errors in preparing them must not be blamed on a photo
+        usable = False
+        for index in self._wanted:
+            photo = dataset.photos[index]
+            try:
+                item = self._datamanager._batch(dataset, index, self._datamanager._read(dataset, index))
+            except UserError as reason:
+                _log(f"{photo.name} is left out of evaluation: {reason}")
+                continue
+            usable = True
+            yield item
+        if not usable:
+            raise UserError("none of the held-out photos can be used: see the reasons above")
+
+
+def _log(message: str) -> None:
+    """Log verbatim: brackets in a photo's name are not markup."""
+    CONSOLE.log(escape(message))

@@ -1,0 +1,269 @@
+"""Dataparser for photo collections with a COLMAP model: a lens per photo, masks, the original scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
+from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+
+from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_names
+from lang3dxl_ns.preparation.foreground import find_mask
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
+from lang3dxl_ns.scene.companions import inside
+from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
+
+MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
+OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
+"""Folder for a model of ours if sparse is taken."""
+
+
+@dataclass
+class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
+    """A folder with images/, a COLMAP model, and optionally masks/."""
+
+    _target: type = field(default_factory=lambda: PhotoCollectionDataParser)
+    colmap_path: Path = Path("sparse/0")
+    """COLMAP model, relative to the data folder; sparse, colmap/sparse/0 and dense/sparse are tried too."""
+    images_path: Path = Path("images")
+    """Photos, relative to the data folder; dense/images is tried too."""
+    masks_path: Path | None = Path("masks")
+    """Foreground masks, white = keep, named like the photos (.png or .jpg); a photo without one is used
+    whole. See --pipeline.datamanager.foreground for other sources."""
+    held_out: Path | None = None
+    """Text file with names of the photos to hold out of training, one per line, with or without suffix;
+    replaces every eighth. `lang3dxl evaluate split` makes one from ground truth."""
+    follow_links: bool = False
+    """Whether photos and masks may be symbolic links that leave their folder."""
+    downscale_factor: int | None = 1
+    """Keep 1: photos are resized on reading (--pipeline.datamanager.camera-res-scale-factor)."""
+
+
+@dataclass
+class PhotoCollectionDataParser(ColmapDataParser):
+    """Reads any COLMAP model, with lens and size per photo. Photos are undistorted on reading
+    (`Photo.read`), so all output cameras are pinholes."""
+
+    config: PhotoCollectionDataParserConfig
+
+    def __init__(self, config: PhotoCollectionDataParserConfig):
+        super().__init__(config)
+        self.reconstruction: Reconstruction | None = None
+        self.photos: dict[Path, Photo] = {}
+        self._left_out: dict[str, UserError] = {}
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
+        data = self.config.data = Path(self.config.data).expanduser().absolute()
+        if not data.is_dir():
+            raise UserError(
+                f"{data} is not a folder: pass the folder that holds images/ and sparse/0 as --data"
+            )
+        self.config.colmap_path = _first_folder(
+            data, (self.config.colmap_path, *MODEL_FOLDERS, OWN_MODEL), "*.*"
+        )
+        self.config.images_path = _images_path(data, self.config.images_path)
+        if self.reconstruction is None:
+            self._read_collection()
+            self._mention_what_is_not_used()
+        # The parent would require a mask for every photo; ours are optional and found per photo.
+        masks, scaled = self.config.masks_path, self.config.auto_scale_poses
+        self.config.masks_path, self.config.auto_scale_poses = None, scaled and self._cameras_are_apart
+        try:
+            outputs = super()._generate_dataparser_outputs(split, **kwargs)
+        finally:
+            self.config.masks_path, self.config.auto_scale_poses = masks, scaled
+        outputs.metadata["photos"] = [self.photos[path] for path in outputs.image_filenames]
+        # From here on the transform again applies to the model's own coordinates.
+        transform = outputs.dataparser_transform.double()
+        transform[:, 3] -= transform[:, :3] @ torch.from_numpy(self._origin)
+        outputs.dataparser_transform = transform.float()
+        return outputs
+
+    def _get_image_indices(self, image_filenames, split):
+        if self.config.held_out is not None:
+            held_out = self._held_out([self._name(path) for path in image_filenames])
+            everything = np.arange(len(image_filenames))
+            wanted = np.isin(everything, held_out, invert=split == "train")
+            indices = everything[wanted]
+        else:
+            indices = super()._get_image_indices(image_filenames, split)
+        if len(indices) == 0:
+            raise UserError(
+                f"the {split} split of {self.config.data} has no photo (of {len(image_filenames)} in all): "
+                f"add photos, or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
+            )
+        return indices
+
+    def _held_out(self, photos: list[str]) -> list[int]:
+        """Indices of the photos in the list. Raises UserError if one of them doesn't exist."""
+        assert self.config.held_out is not None
+        indices = []
+        for name in read_names(self.config.held_out):
+            forms = [(p, str(PurePosixPath(p).with_suffix("")), PurePosixPath(p).stem) for p in photos]
+            found = [i for i, known in enumerate(forms) if name in known]
+            if len(found) != 1:
+                raise UserError(
+                    f"{self.config.held_out} names {name}, which fits {len(found)} photos of the scene: "
+                    f"correct the list"
+                )
+            indices += found
+        return indices
+
+    def _get_all_images_and_cameras(self, recon_dir: Path) -> dict:
+        """Frames for the parent, sorted by name (so that interval splits don't depend on COLMAP's ids)."""
+        assert self.reconstruction is not None
+        frames = [self._frame(tracked) for tracked in self.reconstruction.photos.values()]
+        applied = np.eye(4)[:3][[0, 2, 1]]
+        applied[2] *= -1
+        return {"frames": frames, "camera_model": "PINHOLE", "applied_transform": applied.tolist()}
+
+    @cached_property
+    def _origin(self) -> np.ndarray:
+        """The origin subtracted from positions while they are in float64: the centre of the cameras.
+
+        The parent casts to float32, which resolves map coordinates (millions of metres) only to half a metre.
+        """
+        assert self.reconstruction is not None
+        if self.config.center_method == "none":
+            return np.zeros(3)
+        return np.mean([tracked.centre for tracked in self.reconstruction.photos.values()], axis=0)
+
+    @property
+    def _cameras_are_apart(self) -> bool:
+        """Whether cameras are far enough apart to scale the scene by their distance."""
+        assert self.reconstruction is not None
+        centres = np.array([tracked.centre for tracked in self.reconstruction.photos.values()])
+        distances = np.linalg.norm(self.reconstruction.points - centres.mean(axis=0), axis=1)
+        typical = np.median(distances) if len(distances) else 0.0
+        return bool(np.ptp(centres, axis=0).max() > 1e-6 * typical)
+
+    def _load_3D_points(self, colmap_path: Path, transform_matrix: torch.Tensor, scale_factor: float) -> dict:
+        """The model's points in the scene's frame, with their colours."""
+        assert self.reconstruction is not None
+        transform = transform_matrix.double()
+        points = torch.from_numpy(self.reconstruction.points - self._origin)
+        return {
+            "points3D_xyz": (scale_factor * (points @ transform[:, :3].T + transform[:, 3])).float(),
+            "points3D_rgb": torch.from_numpy(self.reconstruction.colours),
+        }
+
+    def _frame(self, tracked: TrackedPhoto) -> dict:
+        world_from_camera = np.linalg.inv(np.vstack([tracked.camera_from_world, [0, 0, 0, 1]]))
+        world_from_camera[:3, 3] -= self._origin
+        world_from_camera[:3, 1:3] *= -1  # OpenCV axes to OpenGL's
+        world_from_camera = world_from_camera[[0, 2, 1, 3]]  # COLMAP assumes gravity along -y; here z is up
+        world_from_camera[2] *= -1
+        return {
+            "file_path": self._image_path(tracked.name).as_posix(),
+            "transform_matrix": world_from_camera,
+            "camera_model": "PINHOLE",
+            "fl_x": tracked.lens.fx,
+            "fl_y": tracked.lens.fy,
+            "cx": tracked.lens.cx,
+            "cy": tracked.lens.cy,
+            "w": tracked.width,
+            "h": tracked.height,
+        }
+
+    def _image_path(self, name: str) -> Path:
+        return self._images_folder / name
+
+    @property
+    def _images_folder(self) -> Path:
+        return self.config.data / self.config.images_path
+
+    def _name(self, path: Path) -> str:
+        return Path(path).relative_to(self.config.data / self.config.images_path).as_posix()
+
+    def _read_collection(self) -> None:
+        """The model's usable photos; logs which are left out, and why."""
+        reconstruction = read_reconstruction(self.config.data / self.config.colmap_path)
+        left_out: dict[str, UserError] = {}
+        for name, tracked in reconstruction.photos.items():
+            path = self._image_path(name)
+            try:
+                if not inside(self._images_folder, name, self.config.follow_links).is_file():
+                    raise UserError(f"there is no {path}")
+                self.photos[path] = Photo.from_model(tracked, path, self._mask_path(name))
+            except UserError as reason:
+                left_out[name] = reason
+        self._left_out = left_out
+        if len(self.photos) == 1:
+            raise UserError(
+                f"{self.config.data} has one usable photo: a scene needs at least two, one to "
+                f"learn from and one to hold out"
+            )
+        if not self.photos:
+            raise UserError(
+                f"none of the model's {len(left_out)} photos can be used; "
+                f"the first: {next(iter(left_out.values()))}. Name the photos' folder with "
+                f"`lang3dxl-colmap --images-path FOLDER` after the other options"
+            )
+        if left_out:
+            CONSOLE.log(f"[yellow]{len(left_out)} photos of the model are left out:[/yellow]")
+            for name, why in left_out.items():
+                CONSOLE.log(f"  {escape(f'{name}: {why}')}")
+        kept = {name: g for name, g in reconstruction.photos.items() if name not in left_out}
+        self.reconstruction = replace(reconstruction, photos=kept)
+
+    def _mask_path(self, name: str) -> Path | None:
+        """The photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""
+        if self.config.masks_path is None:
+            return None
+        return find_mask(self.config.data / self.config.masks_path, name, self.config.follow_links)
+
+    def _mention_what_is_not_used(self) -> None:
+        """Log other models beside the one in use, and photos missing from it."""
+        model = self.config.data / self.config.colmap_path
+        others = [folder for folder in _models_beside(model) if folder != model]
+        if others:
+            counts = (f"{f.relative_to(self.config.data)} with {photos_in_model(f)}" for f in others)
+            CONSOLE.log(
+                f"[yellow]{self.config.data} has {len(others) + 1} models; used is {self.config.colmap_path} "
+                f"with {photos_in_model(model)} photos.[/yellow] There are also {', '.join(counts)}: choose "
+                "with `lang3dxl-colmap --colmap-path FOLDER` after all other options"
+            )
+        known = set(self.photos)
+        names = photos_below(self._images_folder)
+        unknown = [n for n in names if self._images_folder / n not in known and n not in self._left_out]
+        if unknown:
+            CONSOLE.log(
+                f"{len(unknown)} photos of {self._images_folder} are not in the COLMAP model and not used: "
+                f"{escape(some(unknown))}"
+            )
+
+
+def _images_path(data: Path, named: Path) -> Path:
+    """The photos' folder relative to the scene's: the configured one if it exists, else one with photos."""
+    if (data / named).is_dir() and any((data / named).iterdir()):
+        return named
+    return find_photos(data).folder.relative_to(data) if any(find_photos(data).names) else named
+
+
+def _models_beside(model: Path) -> list[Path]:
+    """The models that COLMAP's mapper left in one folder: 0, 1, …; only this one if it has no number."""
+    if not model.name.isdigit():
+        return [model]
+    numbered = (folder for folder in model.parent.iterdir() if folder.name.isdigit())
+    return sorted(folder for folder in numbered if any(folder.glob("images.*")))
+
+
+def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Path:
+    """The first of the folders (relative to `data`) that exists and holds files; otherwise the first."""
+    return next((c for c in candidates if any(p.is_file() for p in (data / c).glob(contents))), candidates[0])
+
+
+photo_collection = DataParserSpecification(
+    config=PhotoCollectionDataParserConfig(),
+    description="A folder of photos with a COLMAP model: images/, sparse/0/, optionally masks/.",
+)

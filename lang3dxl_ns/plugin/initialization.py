@@ -1,0 +1,66 @@
+"""Initial Gaussians of training: from the COLMAP points, and a sky."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases
+from sklearn.neighbors import NearestNeighbors
+from torch import Tensor
+from torch.nn import Parameter
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.scene.geometry import sphere_around
+
+FEWEST = 4
+"""Fewest positions, so that each has three neighbours."""
+
+
+def seed_positions(
+    config: Lang3DXLModelConfig, seed_points: tuple[Tensor, Tensor] | None
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Initial positions of Gaussians and their colours (0…1): the scene's points, or random ones in a box.
+
+    Raises UserError if the scene has too few points.
+    """
+    if seed_points is not None and not config.random_init:
+        if len(seed_points[0]) < FEWEST:
+            raise UserError(
+                f"the scene has {len(seed_points[0])} 3D points, too few to start from: reconstruct it "
+                "again (colmap point_triangulator), or start from random Gaussians: "
+                "--pipeline.model.random-init True"
+            )
+        return seed_points[0].float(), seed_points[1].float() / 255
+    means = (torch.rand(config.num_random, 3) - 0.5) * config.random_scale
+    return means, torch.rand(config.num_random, 3)
+
+
+def initial_gaussians(
+    config: Lang3DXLModelConfig, means: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"]
+) -> dict[str, Parameter]:
+    """A Gaussian per position (at least `FEWEST`), as wide as the mean distance to its three nearest
+    neighbours, and the sky."""
+    if config.sky_gaussians:
+        sky = sphere_around(means, config.sky_gaussians)
+        means = torch.cat([means, sky])
+        colours = torch.cat([colours, torch.full_like(sky, 0.5)])
+    n = len(means)
+    return {
+        "means": Parameter(means),
+        "scales": Parameter(_spacing(means).log().repeat(1, 3)),
+        # Uniform over rotations; with its own generator, so that preparation does not affect it.
+        "quats": Parameter(F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)),
+        "features_dc": Parameter(RGB2SH(colours) if config.sh_degree > 0 else torch.logit(colours, eps=1e-4)),
+        "features_rest": Parameter(torch.zeros(n, num_sh_bases(config.sh_degree) - 1, 3)),
+        "opacities": Parameter(torch.logit(0.1 * torch.ones(n, 1))),
+    }
+
+
+def _spacing(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
+    points = means.numpy()
+    distances = NearestNeighbors(n_neighbors=4).fit(points).kneighbors(points)[0][:, 1:]
+    spacing = torch.from_numpy(distances).float().mean(dim=-1, keepdim=True)
+    # Coincident points would make Gaussians of zero size.
+    return spacing.clamp_min(1e-3 * float(spacing.median().clamp_min(1e-6)))

@@ -1,0 +1,261 @@
+"""Loading a `Scene` from a run folder, without a data manager or photos."""
+
+from __future__ import annotations
+
+import pickle
+import time
+import zipfile
+import zlib
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.trainer import TrainerConfig
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.cameras import view_of
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.plugin.saved_config import read_config
+from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, load_image_text_encoder
+from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, ScenePhoto
+from lang3dxl_ns.query.scene import QueryConfig, Scene, View
+from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.scene.camera import Camera
+
+NOT_A_CHECKPOINT = (
+    *(OSError, EOFError, RuntimeError, pickle.UnpicklingError),
+    *(LookupError, TypeError, ValueError, AttributeError),
+)
+"""Exceptions raised on reading a file that is not a checkpoint."""
+NOT_FINISHED = "this run has no semantics yet: they are learned when training ends; resume it (--load-dir)"
+NO_SEMANTICS = "this run has no semantics (it was trained with clip none): it can't be queried"
+
+
+def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
+    """The scene description kept in a run's folder."""
+    outputs, clip = datamanager.train_dataparser_outputs, datamanager.config.clip
+    known = None if clip == "none" else find_model(clip, CLIP_OPTION)
+    local = Path(clip).expanduser()
+    return SceneFile(
+        photos=[*_photos(datamanager, "train"), *_photos(datamanager, "eval")],
+        clip=None if known is None else str(local.absolute()) if local.is_dir() else clip,
+        clip_identity=None if known is None else known.identity,
+        scale=float(outputs.dataparser_scale),
+        transform=outputs.dataparser_transform.tolist(),
+        data=str(Path(datamanager.config.dataparser.data).expanduser().absolute()),
+    )
+
+
+def _photos(datamanager: Lang3DXLDataManager, split: Literal["train", "eval"]) -> list[ScenePhoto]:
+    masked = datamanager.photos
+    dataset = datamanager.train_dataset if split == "train" else datamanager.eval_dataset
+    cameras, photos = dataset.cameras, [masked[photo.name] for photo in dataset.photos]
+    return [
+        ScenePhoto(
+            name=photo.name,
+            split=split,
+            camera_to_world=cameras.camera_to_worlds[i].tolist(),
+            lens=photo.lens.scaled(dataset.scale),
+            mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
+        )
+        for i, photo in enumerate(photos)
+    ]
+
+
+def load_scene(
+    config: str | Path, device: torch.device | str | None = None, settings: QueryConfig | None = None
+) -> Scene:
+    """The scene of a run.
+
+    Args:
+        config: the run's config.yml, loaded without executing code (nerfstudio's own commands, ns-eval
+            and others, do trust the file). The latest checkpoint beside it is used.
+        device: by default a GPU if there is one.
+        settings: of queries.
+
+    Raises UserError for a folder without a checkpoint, a run without semantics, or another CLIP than the
+    run's.
+    """
+    path = Path(config).expanduser()
+    run = read_config(path)
+    file = SceneFile.read(path.parent / SCENE_FILE)
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    model = _load_model(run, path.parent, file, device)
+    return scene_of_model(model, file, path.parent, settings)
+
+
+def scene_of_model(
+    model: Lang3DXLModel,
+    file: SceneFile,
+    cache_dir: Path | None = None,
+    settings: QueryConfig | None = None,
+    guard: Callable[[], AbstractContextManager] = nullcontext,
+    encode_texts: EncodeTexts | None = None,
+    watch: Callable[[str], None] | None = None,
+) -> Scene:
+    """A scene around a loaded model, even one still in training (then without `cache_dir`).
+
+    Args:
+        guard: entered around every use of the model, which other threads may be using.
+        encode_texts: the run's CLIP, if it is already loaded (`text_encoder`).
+        watch: see `Scene`.
+
+    Raises UserError if the model has no semantics, or its CLIP has changed.
+    """
+    field = model.semantic_field
+    encode_texts = encode_texts or text_encoder(file, model.device)
+    if field is None:
+        raise UserError(NO_SEMANTICS)
+    carried = model.carried
+    if carried is None:
+        raise UserError(NOT_FINISHED)
+    parts = gaussians_of(model)
+
+    def render(camera: Camera, features: Float[Tensor, "n d"]) -> View:
+        with guard():
+            return _draw(model, camera, features)
+
+    def fill(camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
+        with guard():
+            return filled_pixels(partial(model.composite, view_of(camera)), weight, model.num_points)
+
+    def engine() -> QueryEngine:
+        with guard():
+            return make_engine(field, carried.detach(), temperature)
+
+    temperature = (settings or QueryConfig()).temperature
+    return Scene(
+        render=render,
+        fill=fill,
+        engine=engine,
+        gaussians=parts,
+        file=file,
+        encode_texts=encode_texts,
+        state=model.state_dict(),
+        cache_dir=cache_dir,
+        config=settings,
+        watch=watch,
+    )
+
+
+def gaussians_of(model: Lang3DXLModel) -> dict[str, Tensor]:
+    """The model's parameters per Gaussian, without gradients."""
+    return {name: parameter.detach() for name, parameter in model.gauss_params.items()}
+
+
+def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
+    """The CLIP that a run was trained with. Raises UserError if there is none, or it has changed."""
+    if file.clip is None:
+        raise UserError(NO_SEMANTICS)
+    encoder = load_image_text_encoder(file.clip, device)
+    if encoder.identity != file.clip_identity:
+        raise UserError(
+            f"the CLIP in {file.clip} is not the one this run was trained with: restore it, or train anew"
+        )
+    return encoder.encode_texts
+
+
+def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch.device) -> Lang3DXLModel:
+    path, checkpoint = latest_checkpoint(folder / run.relative_model_dir)
+    state = checkpoint["pipeline"]
+    if not isinstance(run.pipeline.model, Lang3DXLModelConfig):
+        raise UserError(f"{folder} is a run of another method: train one with ns-train lang3dxl")
+    photos = [photo for photo in file.photos if photo.split == "train"]
+    # The checkpoint brings its own Gaussians: start with the fewest possible.
+    start = replace(run.pipeline.model, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
+    model = start.setup(
+        scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
+        num_train_data=len(photos),
+        metadata={"feature_statistics": None, "photos": photos},
+        device=device,
+        grad_scaler=None,
+        seed_points=(torch.eye(4)[:, :3], torch.zeros(4, 3)),
+    )
+    assert isinstance(model, Lang3DXLModel)
+    try:
+        model.load_state_dict(model_state(state), strict=True)
+    except (RuntimeError, LookupError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"the checkpoint {path} does not fit the config.yml beside it ({error}): copy both from one run"
+        ) from error
+    return model.to(device).eval()
+
+
+def model_state(state: dict[str, Any]) -> dict[str, Any]:
+    """The model's part of a pipeline's parameters."""
+    return {k.removeprefix("_model."): v for k, v in state.items() if k.startswith("_model.")}
+
+
+def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
+    """Path and content of the latest checkpoint in a folder, on the CPU, loaded without executing code.
+
+    Raises UserError if there is none, or it is damaged, or not a run's checkpoint.
+    """
+    checkpoints = sorted(folder.glob("step-*.ckpt"))
+    if not checkpoints:
+        raise UserError(f"{folder} holds no checkpoint: train for longer, or copy it")
+    check_checkpoint(checkpoints[-1])
+    return checkpoints[-1], read_checkpoint(checkpoints[-1])
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Content of a checkpoint of any nerfstudio run, on the CPU. Raises UserError for another file."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except NOT_A_CHECKPOINT as error:
+        raise _no_checkpoint(path, error) from error
+    shape = {"pipeline": dict, "step": int}
+    if not isinstance(state, dict) or not all(isinstance(state.get(k), v) for k, v in shape.items()):
+        raise _no_checkpoint(path, "it has no pipeline and step")
+    return state
+
+
+def _no_checkpoint(path: Path, why: object) -> UserError:
+    return UserError(
+        f"{path} is not a checkpoint of lang3dxl ({why}); nothing in it was run. Pass a run's "
+        "config.yml, in --load-dir its folder nerfstudio_models, in --load-checkpoint one of its step-….ckpt "
+        "files"
+    )
+
+
+def check_checkpoint(place: Path) -> None:
+    """Verify the checksums of the checkpoint at a path, or of the latest in a folder.
+
+    Raises UserError if it is damaged. A folder without checkpoints is fine: runs start that way.
+    """
+    checkpoints = sorted(place.glob("step-*.ckpt")) if place.is_dir() else [place]
+    if not checkpoints or not checkpoints[-1].is_file():
+        return
+    try:
+        with zipfile.ZipFile(checkpoints[-1]) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, zlib.error):
+        damaged = "the whole file"
+    if damaged is not None:
+        raise UserError(
+            f"the checkpoint {checkpoints[-1]} is damaged ({damaged}), perhaps by an incomplete copy: copy "
+            "it again, move it away to resume from an earlier one, or train anew (prepared targets are kept)"
+        )
+
+
+@torch.no_grad()
+def _draw(model: Lang3DXLModel, camera: Camera, features: Float[Tensor, "n d"]) -> View:
+    """Render a camera of the rasterizer with a model in evaluation mode."""
+    start = time.perf_counter()
+    model.set_crop(None)
+    outputs, rendered = model.render(view_of(camera).to(model.device), features)
+    assert rendered is not None
+    maps = {name: outputs[name][..., 0] for name in ("accumulation", "depth")}
+    seconds = time.perf_counter() - start
+    return View(camera, outputs["rgb"], rendered, maps["accumulation"], maps["depth"], seconds)

@@ -1,0 +1,520 @@
+"""Lang3D-XL's model: splatfacto's Gaussians with semantic codes, and the field that decodes them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from math import isqrt
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.model_components.lib_bilagrid import color_correct
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils.colors import get_color
+from nerfstudio.utils.rich_utils import CONSOLE
+from pytorch_msssim import SSIM
+from torch import Tensor, nn
+from torch.nn import Parameter
+
+from lang3dxl_ns.baselines.encoders import make_encoder
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.image import fitted_size, resize_nearest
+from lang3dxl_ns.common.timing import part
+from lang3dxl_ns.components import losses, schedules
+from lang3dxl_ns.components.appearance import AppearanceField
+from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
+from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
+from lang3dxl_ns.plugin.answering import AnsweringModel
+from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.initialization import initial_gaussians, seed_positions
+from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig, make_strategy
+from lang3dxl_ns.preparation.targets import FeatureStatistics
+from lang3dxl_ns.rendering import Gaussians, Rendering, rasterize, spherical_harmonics
+from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
+from lang3dxl_ns.scene.camera import Camera, in_view
+from lang3dxl_ns.scene.geometry import centre_and_radius
+
+
+class Lang3DXLModel(AnsweringModel):
+    """Gaussians with colours and semantic codes; without targets (clip = none) it has no semantic parts."""
+
+    config: Lang3DXLModelConfig
+    semantic_field: SemanticEncoder | None
+    downsampler: AttenuatedDownsampler | None
+    appearance: AppearanceField | None
+    look: str | None
+    """Photo whose look views are rendered with; None: the appearance's rule for unseen views."""
+    clip_mean: Tensor
+    dense_mean: Tensor
+
+    def populate_modules(self) -> None:
+        """Build Gaussians, components, metrics and strategy (on the CPU; the pipeline moves them)."""
+        self.config.fit_to_run(self.config.total_steps)
+        if not self._wants("view dependence", self.config.view_dependence):
+            self.config.sh_degree = 0
+        means, colours = seed_positions(self.config, self.seed_points)
+        self.extent = centre_and_radius(means)
+        self.gauss_params = nn.ParameterDict(initial_gaussians(self.config, means, colours))
+        self._make_camera_optimizer(self._wants("camera optimiser", self.config.camera_optimisation, False))
+        self.semantic_field = self.downsampler = None
+        statistics: FeatureStatistics | None = self.kwargs["metadata"].get("feature_statistics")
+        if statistics is not None:
+            clip, dense = statistics.clip, statistics.dense
+            self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean, statistics)
+        self.look = None
+        self.appearance = None
+        if self._wants("appearance", self.config.appearance.use):
+            self.appearance = self._make_appearance()
+        self.step = 0
+        self.step_is_sound = True
+        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+        self.lpips = Lpips()
+        self.crop_box = None
+        self.background_color = get_color(
+            "black" if self.config.background_color == "random" else self.config.background_color
+        )
+        self.strategy = make_strategy(self.config)
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+
+    def _add_semantics(
+        self,
+        clip_mean: Float[Tensor, " c"],
+        dense_mean: Float[Tensor, " d"],
+        statistics: FeatureStatistics | None = None,
+    ) -> None:
+        """Build the feature decoder and the downsampler for this feature width; give every Gaussian a code.
+
+        `statistics` of the targets, if available: not for a loaded model.
+        """
+        self.register_buffer("clip_mean", clip_mean)
+        self.register_buffer("dense_mean", dense_mean)
+        c = self.config
+        self.semantic_field = make_encoder(
+            c.encoder, c.semantic_field, len(clip_mean), len(dense_mean), *self.extent
+        )
+        if statistics is not None:
+            clip, dense = statistics.clip.std, statistics.dense
+            std = clip if dense is None else torch.cat([clip, dense.std])
+            self.semantic_field.set_output_statistics(torch.cat([clip_mean, dense_mean]), std)
+            with part("learn targets"):
+                self.semantic_field.learn_targets(self.kwargs["metadata"]["clip_targets"])
+        self.downsampler = AttenuatedDownsampler(c.downsampler, len(clip_mean))
+        codes = self.semantic_field.initial_codes(self.num_points)
+        if codes is not None:
+            self.gauss_params["codes"] = Parameter(codes)
+
+    def _wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
+        """Whether to build an optional component; `auto`: by the scene's measured needs."""
+        if choice == "auto":
+            return (self.kwargs["metadata"].get("needs") or {}).get(component, unmeasured)
+        return choice == "on"
+
+    def _make_camera_optimizer(self, wanted: bool) -> None:
+        settings = self.config.camera_optimizer
+        if wanted and settings.mode == "off":
+            settings.mode = "SO3xR3"
+        self.camera_optimizer = settings.setup(num_cameras=self.num_train_data, device="cpu")
+
+    def _make_appearance(self) -> AppearanceField:
+        names = [photo.name for photo in self.kwargs["metadata"].get("photos", ())]
+        generator = torch.Generator().manual_seed(0)
+        return AppearanceField(self.config.appearance, names, *self.extent, generator=generator)
+
+    # ── training ────────────────────────────────────────────────────────────────────────────────────
+
+    def step_cb(self, optimizers, step: int) -> None:
+        """Before an iteration: tell the components the fraction of the run done."""
+        super().step_cb(optimizers, step)
+        if self.semantic_field is not None:
+            self.semantic_field.set_progress(step / self.config.total_steps)
+
+    def step_post_backward(self, step: int) -> None:
+        """After an iteration: densify and prune (except at step 0, where the strategy would reset opacities,
+        and after a skipped step)."""
+        if step > 0 and self.step_is_sound:
+            before = self.num_points
+            with self._gathered_codes_follow():
+                super().step_post_backward(step)
+            if self.num_points != before:
+                CONSOLE.log(f"Step {step}: {before} → {self.num_points} Gaussians")
+
+    @contextmanager
+    def _gathered_codes_follow(self) -> Iterator[None]:
+        """Let densification copy and remove codes held by no optimizer along with their Gaussians."""
+        codes = self.gauss_params.get("codes")
+        if codes is None or self._learns_from_renderings:
+            yield
+            return
+        optimizers = self.optimizers
+        self.optimizers = {**optimizers, "codes": torch.optim.SGD([codes], lr=0.0)}
+        yield
+        self.optimizers = optimizers
+        self.gauss_params["codes"].requires_grad_(False)
+
+    def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
+        names = [n for n in self.gauss_params if n != "codes" or self._learns_from_renderings]
+        return {name: [self.gauss_params[name]] for name in names}
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """Optimiser groups: one per Gaussian property, and those of the components present."""
+        groups = super().get_param_groups()
+        if self.semantic_field is not None and self.downsampler is not None:
+            groups |= self.semantic_field.parameter_groups()
+            if self._learns_from_renderings:
+                groups["downsampler"] = list(self.downsampler.parameters())
+        if self.appearance is not None:
+            groups["appearance_vectors"] = [self.appearance.vectors]
+            groups["appearance"] = self.appearance.network_parameters()
+        return {name: parameters for name, parameters in groups.items() if parameters}
+
+    @property
+    def _warm_up_is_over(self) -> bool:
+        return self.step >= self.config.warm_up * self.config.total_steps
+
+    # ── rendering ───────────────────────────────────────────────────────────────────────────────────
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
+        """Render a camera: `rgb`, `accumulation`, `background`; in training `codes` [H, W, d] if the
+        encoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
+        keep = None
+        self.carried_map = None
+        if self.crop_box is not None and not self.training:
+            keep = self.crop_box.within(self.means).squeeze(-1)
+            if not keep.any():
+                size = int(camera.width.item()), int(camera.height.item())
+                return self.get_empty_outputs(*size, self.background_color.to(self.device))  # type: ignore[return-value]
+        if self.training:
+            return self._training_outputs(camera)
+        asked = None if self.answers is None else self.answers.carried()
+        colors = self._code_colors()
+        carried = [part for part in (asked, colors) if part is not None]
+        outputs, rendered = self.render(camera, torch.cat(carried, dim=1) if carried else None, keep)
+        if self.semantic_field is not None:
+            # Present from the first rendering on, since viewers list its outputs.
+            outputs["bottleneck"] = outputs["background"]
+        if rendered is not None and colors is not None:
+            rendered, outputs["bottleneck"] = rendered.tensor_split([-3], dim=2)
+        if asked is not None:
+            self.carried_map = rendered
+        return outputs
+
+    def _training_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+        carried = None
+        if self._learns_from_renderings and self._warm_up_is_over:
+            carried = self.carried
+        outputs, codes = self.render(camera, carried)
+        if self.means.requires_grad:
+            self.strategy.step_pre_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
+            )
+        if codes is not None:
+            outputs["codes"] = codes
+        return outputs
+
+    @property
+    def carried(self) -> Float[Tensor, "n d"] | None:
+        """Semantic values that Gaussians carry; None if there are none (yet)."""
+        return None if self.semantic_field is None else self.semantic_field.carried(self.gauss_params)
+
+    @property
+    def _learns_from_renderings(self) -> bool:
+        return self.semantic_field is not None and not self.semantic_field.needs_lifting
+
+    def _code_colors(self) -> Float[Tensor, "n 3"] | None:
+        if self.carried is None or (self.answers is not None and not self.answers.shows_bottleneck):
+            return None
+        assert self.semantic_field is not None
+        return self.semantic_field.picture(self.carried.detach()).nan_to_num(0.0)
+
+    def render(
+        self, camera: Cameras, features: Float[Tensor, "n d"] | None = None, keep: Tensor | None = None
+    ) -> tuple[dict[str, Tensor], Float[Tensor, "H W d"] | None]:
+        """`rgb`, `accumulation`, `background`, and outside training `depth`, of a camera; and `features` of
+        the Gaussians composited over black. keep: the Gaussians to render; default all."""
+        with part("render"):
+            rendering, background = self._render(camera, features, keep)
+        self.info = rendering.info
+        outputs = {
+            "rgb": rendering.image.clamp(0.0, 1.0),
+            "accumulation": rendering.alpha,
+            "background": background if self.training else background.expand_as(rendering.image),
+        }
+        if rendering.depth is not None:
+            far = rendering.depth.detach().max()
+            outputs["depth"] = torch.where(rendering.alpha > 0, rendering.depth, far)
+        return outputs, rendering.features
+
+    def composite(self, camera: Cameras, features: Float[Tensor, "n d"]) -> Float[Tensor, "H W d"]:
+        """Values of Gaussians composited over black in a camera; differentiable in the features alone."""
+        view, _ = self._view(camera)
+        gaussians = self._activated(self.gauss_params).detach()
+        antialiased = self.config.rasterize_mode == "antialiased"
+        return rasterize(gaussians, view.detach(), features, antialiased=antialiased).image
+
+    def _view(self, camera: Cameras) -> tuple[Camera, Float[Tensor, "3 4"]]:
+        """The camera for the rasterizer, refined in training, and its pose."""
+        pose = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
+        downscale = self._get_downscale_factor()
+        camera.rescale_output_resolution(1 / downscale)
+        view = to_rasterizer(camera, pose[0], self.device)
+        camera.rescale_output_resolution(downscale)
+        self.last_size = (view.height, view.width)
+        return view, pose[0].to(self.device)
+
+    def _activated(self, g: Mapping[str, Tensor]) -> Gaussians:
+        scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
+        return Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1))
+
+    def _render(
+        self, camera: Cameras, features: Tensor | None, keep: Tensor | None
+    ) -> tuple[Rendering, Float[Tensor, "3"]]:
+        g = {name: p if keep is None else p[keep] for name, p in self.gauss_params.items()}
+        if features is not None and keep is not None:
+            features = features[keep]
+        view, pose = self._view(camera)
+        background = self._get_background_color()
+        gaussians = self._activated(g)
+        colours, in_photo = self._colours(g, pose[:, 3]), gaussians
+        if self.appearance is not None:
+            vector = self._light(camera, pose)
+            visible = in_view(view, gaussians.means, gaussians.scales).nonzero().squeeze(1)
+            seed = self.step if self.training else None
+            with part("appearance"):
+                colours, in_photo = self.appearance(gaussians, colours, vector, visible, seed)
+        settings: dict[str, Any] = {
+            "antialiased": self.config.rasterize_mode == "antialiased",
+            "absgrad": self.strategy.absgrad and self.training,
+        }
+        rendering = rasterize(
+            gaussians,
+            view,
+            colours,
+            background,
+            features=features,
+            detach_features=not self.config.feature_gradient_to_geometry,
+            render_depth=not self.training or self.config.output_depth_during_training,
+            **settings,
+        )
+        if in_photo is not gaussians:
+            # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
+            photo = rasterize(in_photo, view, colours, background, **settings)
+            rendering = replace(rendering, image=photo.image, info=photo.info)
+        return rendering, background
+
+    def _light(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
+        """Vector of the training photo, of the chosen look, or by the rule for other views."""
+        assert self.appearance is not None
+        position, direction = pose[:, 3].detach(), -pose[:, 2].detach()
+        if self.training and camera.metadata and "cam_idx" in camera.metadata:
+            name = self.kwargs["metadata"]["photos"][camera.metadata["cam_idx"]].name
+            self.appearance.remember(name, position, direction)
+            return self.appearance.vector(name)
+        if self.look is not None:
+            return self.appearance.vector(self.look)
+        return self.appearance.vector_of_view(position, direction)
+
+    def _colours(self, g: Mapping[str, Tensor], camera_centre: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
+        """Colours seen from a point. The degree of the harmonics rises by one every 1,000 iterations, or
+        every tenth of a run of under 10,000. At degree 0 colours are logits, as in splatfacto."""
+        if self.config.sh_degree == 0:
+            return torch.sigmoid(g["features_dc"])
+        interval = max(min(self.config.sh_degree_interval, self.config.total_steps // 10), 1)
+        degree = min(self.step // interval, self.config.sh_degree)
+        directions = g["means"].detach() - camera_centre
+        coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
+        return (spherical_harmonics(degree, directions, coefficients) + 0.5).clamp_min(0.0)
+
+    # ── losses and metrics ──────────────────────────────────────────────────────────────────────────
+
+    def get_loss_dict(
+        self, outputs: dict, batch: dict, metrics_dict: dict | None = None
+    ) -> dict[str, Tensor]:
+        """Colour loss and, if there are semantics, the semantic losses (already weighted)."""
+        mask = self._downscale_if_required(batch["mask"])[..., 0] if "mask" in batch else None
+        with part("losses"):
+            target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+            loss = {"rgb": losses.rgb_loss(outputs["rgb"], target, mask, self.config.ssim_lambda)}
+        if self.training:
+            self.camera_optimizer.get_loss_dict(loss)
+        if "codes" in outputs and "clip_target" in batch:
+            loss |= self._semantic_losses(outputs["codes"], batch, mask)
+        return loss
+
+    def _semantic_losses(
+        self, codes: Float[Tensor, "h w 3"], batch: dict, mask: Tensor | None
+    ) -> dict[str, Tensor]:
+        c = self.config
+        assert c.dense_weight is not None
+        ramp = schedules.semantic_ramp(self.step / c.total_steps)
+        size = fitted_size(codes, self._random_size())
+        clip, dense, small_mask = self._decode_small(codes, mask, size)
+        with part("downsample"):
+            predicted, target, weight = self._match(clip, batch, small_mask)
+        with part("losses"):
+            # Cells with little foreground have little weight.
+            weight = None if small_mask is None else weight
+            loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, target, weight)}
+            if dense is not None and "dense_target" in batch:
+                difference = losses.dense_loss(dense, batch["dense_target"], small_mask)
+                loss["dense"] = ramp * c.dense_weight * difference
+            if "regions" in batch:
+                labels = resize_nearest(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()
+                loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
+            assert self.semantic_field is not None
+            own = self.semantic_field.own_losses(clip, dense)
+        return loss | {name: ramp * value for name, value in own.items()}
+
+    def _decode_small(self, codes: Float[Tensor, "H W 3"], mask: Tensor | None, size: tuple[int, int]):
+        """Decode a map resized (nearest) to a given size → clip [h, w, C], dense, mask [h, w]."""
+        small_mask = None if mask is None else resize_nearest(mask[..., None].float(), size)[..., 0]
+        assert self.semantic_field is not None
+        with part("decode"):
+            clip, dense = self.semantic_field(resize_nearest(codes, size))
+        return clip, dense, small_mask
+
+    def _match(self, clip: Float[Tensor, "h w c"], batch: dict, mask: Tensor | None):
+        assert self.downsampler is not None
+        return self.downsampler.match(clip, batch["clip_target"], batch["crop_sides"], mask)
+
+    def _random_size(self) -> int:
+        """Longer side to decode at in this iteration; the same after a resume."""
+        assert self.config.decode_size is not None
+        smallest, largest = self.config.decode_size
+        generator = torch.Generator().manual_seed(self.step)
+        return int(torch.randint(smallest, largest + 1, (), generator=generator))
+
+    def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
+        """Numbers for the log: PSNR of the step's photo and the number of Gaussians."""
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        metrics = {
+            "psnr": psnr(outputs["rgb"].detach(), target),
+            "gaussian_count": torch.tensor(self.num_points),
+        }
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    @torch.no_grad()
+    def get_image_metrics_and_images(
+        self, outputs: dict, batch: dict
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Held-out photo: PSNR (`cc_psnr`: with matched colours), SSIM, and LPIPS if its weights are
+        available."""
+        target = self.get_gt_img(batch["image"])
+        predicted = outputs["rgb"]
+        chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]
+        # Matched on the CPU, whose solver also handles pictures of a single colour.
+        corrected = color_correct(predicted.cpu(), target.cpu())
+        metrics = {
+            "psnr": float(psnr(predicted, target)),
+            "cc_psnr": float(psnr(corrected, target.cpu())),
+            "ssim": float(self.ssim(*chw)),
+        }
+        perceptual = self.lpips(*chw)
+        if perceptual is not None:
+            metrics["lpips"] = perceptual
+        images = {"img": torch.cat([target, predicted], dim=1)}
+        if "bottleneck" in outputs:
+            images["bottleneck"] = outputs["bottleneck"]
+        return metrics, images
+
+    @torch.no_grad()
+    def feature_metrics(self, camera: Cameras, batch: dict) -> dict[str, float]:
+        """Agreement with a photo's targets, beside that of the mean training feature."""
+        if self.carried is None or "clip_target" not in batch:
+            return {}
+        assert self.config.decode_size is not None
+        mask = batch["mask"][..., 0] if "mask" in batch else None
+        clip, dense, small_mask = self._feature_maps(camera, self.config.decode_size[1], mask)
+        target = batch["clip_target"]
+        predicted, weight = match(clip, target, batch["crop_sides"], small_mask)
+        metrics = feature_metrics("clip", predicted, target, self.clip_mean, weight)
+        if dense is not None and "dense_target" in batch:
+            target = losses.resize(batch["dense_target"], dense.shape[:2])
+            metrics |= feature_metrics("dense", dense, target, self.dense_mean, small_mask)
+        return metrics
+
+    def _feature_maps(self, camera: Cameras, longer_side: int, mask: Tensor | None):
+        """Features in a camera → clip [h, w, C], dense [h, w, D] or None, mask [h, w]; decoded before or
+        after compositing, depending on the encoder."""
+        encoder, carried = self.semantic_field, self.carried
+        assert encoder is not None and carried is not None
+        if not encoder.per_gaussian:
+            codes = self.composite(camera, carried)
+            return self._decode_small(codes, mask, fitted_size(codes, longer_side))
+        # The last layer is linear, so hidden activations are composited and divided by coverage.
+        known = carried.isfinite().all(1, keepdim=True)
+        hidden = torch.where(known, encoder.hidden(torch.where(known, carried, 0.0)), 0.0)
+        maps = self.composite(camera, torch.cat([hidden, known.to(hidden)], dim=1))
+        size = fitted_size(maps, longer_side)
+        maps = resize_nearest(maps, size)
+        clip = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3)
+        head = encoder.clip_head()
+        if head is not None:
+            clip = F.linear(clip, *head)
+        small = None if mask is None else resize_nearest(mask[..., None].float(), size)[..., 0]
+        return clip, None, small
+
+    # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────
+
+    def load_state_dict(self, state: Mapping[str, Any], **kwargs):  # type: ignore[override]
+        """Load a checkpoint of any number of Gaussians, with or without semantics.
+
+        Parameters are resized in place: the optimisers hold them, and new ones would never be trained.
+        """
+        self._match_semantics(state)
+        self._match_appearance(state)
+        self.config.sh_degree = isqrt(state["gauss_params.features_rest"].shape[1] + 1) - 1
+        if "camera_optimizer.pose_adjustment" in state and self.config.camera_optimizer.mode == "off":
+            self._make_camera_optimizer(wanted=True)
+            self.to(self.device)
+        self.step = self.config.total_steps
+        for name, parameter in self.gauss_params.items():
+            saved = state[f"gauss_params.{name}"]
+            inner = saved.shape[2:] if name == "features_rest" else saved.shape[1:]
+            expected = parameter.shape[2:] if name == "features_rest" else parameter.shape[1:]
+            if inner != expected or saved.shape[:1] != state["gauss_params.means"].shape[:1]:
+                raise UserError(
+                    f"the checkpoint's {name} have the shape {list(saved.shape)}: it is damaged, or from "
+                    "another method; copy it again, or pass a run of ns-train lang3dxl"
+                )
+            parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
+        return super(SplatfactoModel, self).load_state_dict(state, **kwargs)
+
+    def _match_appearance(self, state: Mapping[str, Any]) -> None:
+        """`auto` follows the checkpoint; `on` and `off` must agree with it."""
+        saved = "appearance.vectors" in state
+        if saved == (self.appearance is not None):
+            return
+        if self.config.appearance.use != "auto":
+            raise UserError(
+                f"the checkpoint was trained {'with' if saved else 'without'} appearance: load it with "
+                f"--pipeline.model.appearance.use auto, or train anew"
+            )
+        self.appearance = self._make_appearance().to(self.device) if saved else None
+
+    def _match_semantics(self, state: Mapping[str, Any]) -> None:
+        """Build the components that the checkpoint has, or raise an error about the difference."""
+        if "clip_mean" not in state:
+            return
+        saved = {"CLIP": state["clip_mean"], "dense": state["dense_mean"]}
+        if self.semantic_field is None:
+            self._add_semantics(*saved.values())
+        assert self.semantic_field is not None
+        if self.semantic_field.needs_lifting and "gauss_params.codes" in state:
+            self.gauss_params["codes"] = Parameter(state["gauss_params.codes"].clone(), requires_grad=False)
+        self.to(self.device)
+        for kind, mean, prepared in zip(
+            saved, saved.values(), (self.clip_mean, self.dense_mean), strict=True
+        ):
+            if len(mean) != len(prepared):
+                raise UserError(
+                    f"the checkpoint decodes to {kind} features of width {len(mean)}, but the prepared "
+                    f"targets have {len(prepared)}: pass the --pipeline.datamanager.{kind.lower()} that the "
+                    f"checkpoint was trained with, or train anew"
+                )

@@ -1,0 +1,118 @@
+"""Model settings: splatfacto's, the method's schedule, and the semantic components."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from gsplat.strategy import DefaultStrategy
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+
+from lang3dxl_ns.baselines.encoders import EncoderConfig
+from lang3dxl_ns.components.appearance import AppearanceConfig
+from lang3dxl_ns.components.downsampler import DownsamplerConfig
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+
+SHORT_FIELD_RUN = 5_000
+"""Runs with fewer iterations use the field's `short` preset."""
+
+
+@dataclass
+class Lang3DXLModelConfig(SplatfactoModelConfig):
+    """Splatfacto's settings, with the method's schedule and the semantic components."""
+
+    _target: type = field(default_factory=lambda: _model_class())
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """The feature decoder: the semantic field, or a baseline."""
+    semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
+    """Decoder from a 3-number code to CLIP and dense features."""
+    downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
+    """Reduces decoded features to the grid of the CLIP target; training only."""
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    """Colours that depend on each photo's light."""
+    clip_weight: float = 1.0
+    """Weight of the CLIP loss (mean absolute difference)."""
+    dense_weight: float | None = None
+    """Weight of the dense (DINO) loss. None: 2 in short runs, 0.5 in long ones."""
+    region_weight: float = 5e-4
+    """Weight of the feature variance inside regions, if the scene has regions."""
+    decode_size: tuple[int, int] | None = None
+    """The code map is decoded at a random size in this range: pixels of its longer side, inclusive.
+    None: 56 to 72 in short runs, 80 to 120 (the paper's) in long ones."""
+    warm_up: float = 0.0
+    """Fraction of the run that trains colours only, before the semantic losses start."""
+    feature_gradient_to_geometry: bool = False
+    """Let the semantic losses also move Gaussians and opacities, as in the authors' code."""
+    view_dependence: Literal["auto", "on", "off"] = "auto"
+    """Colours that depend on the viewing direction (spherical harmonics of `sh_degree`); off leaves one
+    colour and a quarter of the numbers per Gaussian. `auto`: by the scene's measured needs."""
+    camera_optimisation: Literal["auto", "on", "off"] = "auto"
+    """Refine the cameras during training. `auto`: if the COLMAP model's reprojection error is large."""
+    sky_gaussians: int = 2_000
+    """Gaussians on a sphere around the scene for the sky and the far distance, where a COLMAP
+    model has no points; 0 for none."""
+    total_steps: int = 30_000
+    """Iterations of the run, for the fractions below; set by the trainer."""
+    densify_from: float = 1 / 15
+    """Fraction of the run at which densification starts (the paper: 2,000 of 30,000)."""
+    densify_until: float = 0.5
+    """Fraction of the run at which it ends."""
+    densify_every: float = 1 / 15
+    """Fraction of the run between two densification steps (the paper: every 2,000)."""
+    background_color: Literal["random", "black", "white"] = "black"
+    """Black, as in the paper: where nothing is rendered the code is zero too."""
+    num_downscales: int = 0
+    """Photos already vary in size: no extra coarse-to-fine resolution."""
+    ssim_lambda: float = 0.5
+    """Weight of 1 − SSIM relative to L1 in the colour loss."""
+    cull_alpha_thresh: float = 0.005
+    """Gaussians below this opacity are pruned."""
+    use_absgrad: bool = False
+    """Densify by the norm of the mean gradient, as in the paper."""
+    densify_grad_thresh: float | None = None  # type: ignore[assignment]
+    """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-4 (the
+    paper's) in long runs; 2e-3 in short ones, which densify while gradients are still large."""
+
+    def fit_to_run(self, iterations: int) -> None:
+        """Resolve settings that depend on the length of the run."""
+        short = iterations < SHORT_FIELD_RUN
+        self.total_steps = iterations
+        if self.semantic_field.preset == "auto":
+            # Compression is a direct regression of a thousand steps, whatever the run's length.
+            self.semantic_field.preset = "short" if short or self.encoder.name == "lang3dxl" else "default"
+        if self.appearance.preset == "auto":
+            self.appearance.preset = "short" if short else "paper"
+        if self.densify_grad_thresh is None:
+            self.densify_grad_thresh = 2e-3 if short else 2e-4
+        if self.dense_weight is None:
+            self.dense_weight = 2.0 if short else 0.5
+        if self.decode_size is None:
+            self.decode_size = (56, 72) if short else (80, 120)
+
+
+def make_strategy(config: Lang3DXLModelConfig) -> DefaultStrategy:
+    """gsplat's densification with the run's schedule."""
+    steps = config.total_steps
+    return DefaultStrategy(
+        prune_opa=config.cull_alpha_thresh,
+        grow_grad2d=config.densify_grad_thresh,
+        grow_scale3d=config.densify_size_thresh,
+        grow_scale2d=config.split_screen_size,
+        prune_scale3d=config.cull_scale_thresh,
+        prune_scale2d=config.cull_screen_size,
+        refine_scale2d_stop_iter=0,
+        refine_start_iter=round(config.densify_from * steps),
+        refine_stop_iter=round(config.densify_until * steps),
+        refine_every=max(round(config.densify_every * steps), 1),
+        # The paper does not reset opacities in a run of 70,000 iterations.
+        reset_every=10**9,
+        pause_refine_after_reset=0,
+        absgrad=config.use_absgrad,
+        verbose=False,
+    )
+
+
+def _model_class() -> type:
+    from lang3dxl_ns.plugin.model import Lang3DXLModel  # circular import otherwise
+
+    return Lang3DXLModel

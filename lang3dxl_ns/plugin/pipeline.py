@@ -1,0 +1,415 @@
+"""Pipeline: data manager and model, evaluation, and readable errors."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from time import perf_counter
+from types import TracebackType
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
+from nerfstudio.utils.rich_utils import CONSOLE
+from PIL import Image
+from rich.markup import escape
+from torch import Tensor
+
+from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import host_peak, progress_bar, synchronize
+from lang3dxl_ns.evaluation.aggregate import average
+from lang3dxl_ns.evaluation.annotations import Truth
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
+from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
+from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resized
+from lang3dxl_ns.plugin.datamanager import EvalPhotos, Lang3DXLDataManager, Lang3DXLDataManagerConfig
+from lang3dxl_ns.plugin.label_limit import label_limit
+from lang3dxl_ns.plugin.lift_features import learn_from_photos
+from lang3dxl_ns.plugin.load_scene import NOT_FINISHED, describe_scene, scene_of_model
+from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.plugin.viewer.panel import AskPanel
+from lang3dxl_ns.query.answer import Asked
+from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
+from lang3dxl_ns.scene.photo import Photo
+
+QUERY_VARIABLE = "LANG3DXL_QUERY"
+Split = Literal["held-out", "seen", "test"]
+_COLOURS_OF_LIGHT = ("psnr", "ssim", "lpips")
+"""Image metrics that are meaningless where views are lit differently from the photos."""
+
+
+@dataclass
+class Lang3DXLPipelineConfig(VanillaPipelineConfig):
+    """Configuration of the pipeline."""
+
+    _target: type = field(default_factory=lambda: Lang3DXLPipeline)
+    datamanager: Lang3DXLDataManagerConfig = field(default_factory=Lang3DXLDataManagerConfig)
+    model: Lang3DXLModelConfig = field(default_factory=Lang3DXLModelConfig)
+    ground_truth: Path | None = None
+    """Folder of ground truth, in any of the layouts of docs/evaluation.md: `ns-eval` then reports how well
+    words find their pixels. Default: ground_truth/ or label/ in the data folder, or label/<scene> beside it,
+    if present."""
+    ground_truth_layout: Layout | Literal["auto"] = "auto"
+    """HolyScenes' masks, LERF-OVS' and PT-OVS' labels, or plain masks; "auto" detects it."""
+    evaluated_photos: Split = "held-out"
+    """Photos that `ns-eval` evaluates: those held out of training (and the scene's test views, if any); the
+    training photos with ground truth (the main tables of HolyScenes use photos seen in training); or the test
+    views alone."""
+    query: str = ""
+    """Prompts for `ns-render` ("rose window; dome"), and the viewer's initial ones; the environment variable
+    LANG3DXL_QUERY overrides it."""
+
+
+Score = Callable[[Cameras, "EvaluatedPhoto", dict, Photo], None]
+"""Adds word scores to an evaluated photo."""
+
+
+@dataclass
+class EvaluatedPhoto:
+    """An evaluated photo: its figures, and the pictures behind them."""
+
+    name: str
+    metrics: dict[str, float]
+    """psnr etc., `render_seconds`, and with ground truth `query_seconds` and the figures of
+    `evaluation.aggregate.average`: `ap_{category}` etc., with the prefixes of `evaluation.aggregate`."""
+    images: dict[str, Tensor]
+    """`img` (photo beside rendering, [H, 2W, 3]) and, with semantics, `bottleneck`."""
+    field_maps: Maps
+    """Relevancy by category as scored without prefix: blurred, at half the photo's size; empty without
+    ground truth."""
+    teacher_maps: Maps
+    """The same for the photo's own CLIP target."""
+    masked: bool = False
+    """Whether the maps are restricted to a foreground mask."""
+
+
+class Lang3DXLPipeline(VanillaPipeline):
+    """nerfstudio's pipeline; loads checkpoints strictly, evaluates colours, features and words."""
+
+    config: Lang3DXLPipelineConfig
+    datamanager: Lang3DXLDataManager
+    model: Lang3DXLModel
+    _engine: QueryEngine | None = None
+    """Split of the current evaluation."""
+    last_losses: dict[str, Tensor]
+    """The weighted losses of the latest training step."""
+
+    def __init__(self, *args, **kwargs):
+        print_user_errors_plainly()
+        super().__init__(*args, **kwargs)
+        self.panel = AskPanel(self)  # nerfstudio's viewer looks for controls here
+
+    # ── evaluation ──────────────────────────────────────────────────────────────────────────────────
+
+    @cached_property
+    def scorer(self) -> LanguageScorer | None:
+        """Scores words in photos, if the scene has ground truth and the run has semantics."""
+        folder = self.config.ground_truth or find_ground_truth(self.datamanager.data_folder)
+        if folder is None or self.model.semantic_field is None:
+            return None
+        truth = GroundTruth(folder, self.config.ground_truth_layout)
+        self._check_labels(truth)
+        return open_scorer(truth, self.datamanager.config.clip, self.device)
+
+    @cached_property
+    def _test_scorer(self) -> LanguageScorer | None:
+        """Scores words in the test views."""
+        views = self.datamanager.test_views
+        if views is None or self.model.semantic_field is None:
+            return None
+        truth = GroundTruth(views.folder / "ground_truth", "plain")
+        return open_scorer(truth, self.datamanager.config.clip, self.device)
+
+    def _scorer_of(self, split: Split) -> LanguageScorer | None:
+        return self._test_scorer if split == "test" else self.scorer
+
+    def _check_labels(self, truth: GroundTruth) -> None:
+        """Labels must belong to photos of the scene, each to one; warns of labels without a photo."""
+        named: dict[str, str] = {}
+        for name in self.datamanager.photos:
+            key = truth.key(name)
+            if key is not None and named.setdefault(key, name) != name:
+                raise UserError(
+                    f"the label {key} in {truth.folder} fits both {named[key]} and {name}: name labels with "
+                    f"their photos' folders"
+                )
+        absent = [photo for photo in truth.labelled if photo not in named]
+        if not named:
+            raise UserError(
+                f"no label in {truth.folder} belongs to a photo of the scene: labels are named like photos, "
+                f"but the first are {absent[0]} and {next(iter(self.datamanager.photos))}"
+            )
+        if absent:
+            CONSOLE.log(
+                f"[yellow]{len(absent)} labels in {truth.folder} belong to no photo of the scene and are not "
+                f"scored:[/yellow] {escape(some(absent))}"
+            )
+
+    @torch.no_grad()
+    def evaluate(self, split: Split | None = None) -> Iterator[EvaluatedPhoto]:
+        """Render and score the photos of a split (by default the configured one), with a progress bar."""
+        self.eval()
+        self._engine = None
+        split = split or self.config.evaluated_photos
+        photos, score = self._photos_of(split), None
+        scorer = self._scorer_of(split)
+        if scorer is not None:
+            score = partial(self._score_words, scorer, self._label_limit(scorer, photos))
+        views = self.datamanager.test_views if split == "test" else None
+        hidden = () if views is None or views.same_light else _COLOURS_OF_LIGHT
+        warm = False
+        with progress_bar() as bar:
+            for camera, batch in bar.track(photos, total=len(photos), description="evaluating"):
+                photo = photos.dataset.photos[batch["image_idx"]]
+                if not warm:  # warm-up, excluded from timing
+                    self._evaluate_photo(camera, batch, photo, score)
+                    warm = True
+                evaluated = self._evaluate_photo(camera, batch, photo, score)
+                for name in hidden:
+                    evaluated.metrics.pop(name, None)
+                yield evaluated
+        self.train()
+
+    def _photos_of(self, split: Split) -> EvalPhotos:
+        if split == "held-out":
+            return self.datamanager.fixed_indices_eval_dataloader
+        if split == "test":
+            return EvalPhotos(self.datamanager, self.datamanager.test_dataset)
+        if self.scorer is None:
+            raise UserError("seen photos can be evaluated only with ground truth and CLIP")
+        seen = self.datamanager.train_dataset
+        labelled = [photo.name for photo in seen.photos if self.scorer.truth.key(photo.name) is not None]
+        if not labelled:
+            raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
+        return EvalPhotos(self.datamanager, seen, labelled)
+
+    def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Cameras], Maps]:
+        """Maps of the labels themselves, lifted from the photos to the Gaussians."""
+        truth = scorer.truth
+
+        def labels():
+            for camera, photo in photos.cameras():
+                truths = _truths(truth, photo, truth.scoring_size(photo.height, photo.width))
+                yield camera, {category: found.mask for category, found in truths.items()}
+
+        return label_limit(self.model, labels(), truth.categories)
+
+    def _evaluate_photo(self, camera, batch: dict, photo: Photo, score: Score | None) -> EvaluatedPhoto:
+        start = perf_counter()
+        self.model.set_crop(None)
+        outputs = self.model.get_outputs(camera)
+        synchronize()
+        seconds = perf_counter() - start
+        metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
+        metrics |= self.model.feature_metrics(camera, batch)
+        metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, {}, "mask" in batch)
+        if score is not None:
+            score(camera, evaluated, batch, photo)
+        return evaluated
+
+    def _score_words(
+        self,
+        scorer: LanguageScorer,
+        limit: Callable[[Cameras], Maps],
+        camera: Cameras,
+        evaluated: EvaluatedPhoto,
+        batch: dict,
+        photo: Photo,
+    ) -> None:
+        size = scorer.truth.scoring_size(photo.height, photo.width)
+        keep = batch["mask"][..., 0] if "mask" in batch else None
+        start = perf_counter()
+        raw = scorer.named(self.relevancy(camera, scorer.queries.to(self.device)), size)
+        synchronize()
+        evaluated.metrics["query_seconds"] = perf_counter() - start
+        variants = scorer.variants(raw, keep, TEMPERATURE)
+        teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
+        evaluated.field_maps, evaluated.teacher_maps = variants[""], teacher
+        truths = _truths(scorer.truth, photo, map_size(raw))
+        for prefix, maps in (variants | {"teacher_": teacher}).items():
+            evaluated.metrics |= scorer.scores(photo.name, maps, prefix, truths)
+        evaluated.metrics |= bounds(inside(resized(limit(camera), size), keep), truths)
+
+    @torch.no_grad()
+    def relevancy(self, camera, queries: Queries) -> Tensor:
+        """Relevancy of every pixel to every prompt [q, h, w]."""
+        if self._engine is None:
+            encoder, carried = self.model.semantic_field, self.model.carried
+            if encoder is None or carried is None:
+                raise UserError(NOT_FINISHED)
+            self._engine = make_engine(encoder, carried.detach())
+        _, rendered = self.model.render(camera, self._engine.carried(queries))
+        assert rendered is not None
+        return self._engine.maps(rendered, queries)
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """Means and totals over the evaluated photos, and `peak_memory_mb` of the process (or of the GPU, if
+        one is used), for `ns-eval` and the trainer; see `evaluation.aggregate.average`.
+
+        output_path: folder for a picture of every photo, optional.
+        get_std: as passed by `ns-eval`; adds standard deviations, `protocol` (what was scored, and how),
+            `photos` (the figures of each), and with held-out photos the same for the scene's `test_views`.
+        """
+        results = self._averages(self.config.evaluated_photos, output_path, get_std)
+        results["peak_memory_mb"] = _peak_memory(self.device) / 2**20
+        beside = self.config.evaluated_photos == "held-out" and self.datamanager.test_views is not None
+        if get_std and beside:
+            results["test_views"] = self._averages("test", output_path, get_std)
+        return results
+
+    def _averages(self, split: Split, output_path: Path | None, get_std: bool) -> dict[str, Any]:
+        evaluated = []
+        for photo in self.evaluate(split):
+            if output_path is not None:
+                _write_pictures(photo, output_path)
+            photo.images, photo.field_maps, photo.teacher_maps = {}, {}, {}  # too large for all photos
+            evaluated.append(photo)
+        results = average([photo.metrics for photo in evaluated], get_std)
+        if get_std:
+            results["protocol"] = self._protocol(split, evaluated)
+            results["photos"] = {photo.name: photo.metrics for photo in evaluated}
+        return results
+
+    def _protocol(self, split: Split, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
+        scorer = self._scorer_of(split)
+        trained = {photo.name for photo in self.datamanager.train_dataset.photos}
+        seen, masked = (sum(p.name in trained for p in evaluated), sum(p.masked for p in evaluated))
+        photos = {"split": split, "evaluated_photos": len(evaluated), "seen_in_training": seen}
+        mask = f"predictions are 0 outside the foreground masks of {masked} of {len(evaluated)} photos"
+        if scorer is None:
+            return photos
+        words = scorer.protocol(mask if masked else "none")
+        if words["prompts_without_photos"]:
+            CONSOLE.log(
+                f"[yellow]no evaluated photo shows {', '.join(words['prompts_without_photos'])}; `lang3dxl "
+                f"evaluate run --split seen` scores the labelled training photos"
+            )
+        return photos | words
+
+    def get_train_loss_dict(self, step: int):
+        """Outputs, losses and metrics of the next photo."""
+        outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
+        return outputs, self.last_losses, metrics
+
+    @property
+    def query(self) -> str:
+        """The prompts for renderings."""
+        return os.environ.get(QUERY_VARIABLE) or self.config.query
+
+    @cached_property
+    def scene_file(self) -> SceneFile:
+        """The photos' names and cameras, and the CLIP."""
+        run = self.datamanager.config.run
+        if run is not None and (run / SCENE_FILE).is_file():
+            return SceneFile.read(run / SCENE_FILE)
+        return describe_scene(self.datamanager)
+
+    def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
+        """Load a checkpoint; for rendering, also prepare to answer the configured prompts."""
+        super().load_pipeline(loaded_state, step)
+        if self.test_mode != "val" and self.query:
+            self.model.answers = _Answers(self._asked())
+
+    def _asked(self) -> Asked:
+        scene = scene_of_model(self.model, self.scene_file, self.datamanager.config.run)
+        CONSOLE.log(f"Looking for {escape(self.query)}")
+        queries = scene.queries(scene.prompts(self.query))
+        return Asked(scene.engine, queries, min_alpha=scene.config.min_alpha)
+
+    def finish_training(self) -> None:
+        """Work after the last iteration: learn semantics, if the encoder learns none from renderings."""
+        if self.model.semantic_field is not None and self.model.semantic_field.needs_lifting:
+            self.learn_words()
+
+    def learn_words(self) -> None:
+        """Gather the training photos' features onto the present Gaussians, and learn codes."""
+        encoder = self.model.semantic_field
+        assert encoder is not None
+        training = self.model.training
+        self.model.train()
+        photos = self.datamanager.train_photos()
+        with progress_bar() as bar:
+            total = len(self.datamanager.train_dataset)
+            gathering = bar.track(photos, total=total, description="gathering features")
+            learning = bar.add_task("learning codes", total=encoder.learning_steps or None)
+            learn_from_photos(self.model, gathering, lambda: bar.advance(learning))
+        self.model.train(training)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
+        """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""
+        state = {key.removeprefix("_model."): v for key, v in state_dict.items() if key.startswith("_model.")}
+        try:
+            self.model.load_state_dict(state, strict=True)
+        except (RuntimeError, KeyError) as error:
+            raise UserError(
+                f"the checkpoint does not fit this configuration: {error}. "
+                f"Load it with the config.yml beside it, or with the options that it was trained with"
+            ) from error
+
+
+@dataclass
+class _Answers:
+    """The outputs that `ns-render` adds to every rendering."""
+
+    asked: Asked
+    shows_bottleneck: bool = True
+
+    def carried(self) -> Tensor | None:
+        return self.asked.carried
+
+    def outputs(
+        self, outputs: dict[str, Tensor], rendered: Tensor | None, seconds: float
+    ) -> dict[str, Tensor]:
+        return self.asked.outputs(outputs["rgb"], rendered, outputs["accumulation"][..., 0])
+
+
+def _write_pictures(evaluated: EvaluatedPhoto, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in evaluated.images.items():
+        pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
+        Image.fromarray(pixels).save(folder / f"{evaluated.name.replace('/', '_')}.{name}.jpg")
+
+
+def _truths(truth: GroundTruth, photo: Photo, size: tuple[int, int]) -> dict[str, Truth]:
+    """The photo's labels, undistorted like the photo, on whose file they were drawn. (Boxes no longer
+    fit then, so masks take their place.)"""
+    truths = truth.truths(photo.name, size)
+    if not photo.lens.distorts:
+        return truths
+    masks = {category: torch.from_numpy(found.mask).int() for category, found in truths.items()}
+    return {category: Truth(photo.undistort_labels(mask).numpy() == 1) for category, mask in masks.items()}
+
+
+def _peak_memory(device: torch.device | str) -> int:
+    return torch.cuda.max_memory_allocated() if torch.device(device).type == "cuda" else host_peak()
+
+
+_previous_hook = sys.excepthook
+
+
+def print_user_errors_plainly() -> None:
+    """Make commands end on a `UserError` with its message alone, without a traceback."""
+    global _previous_hook
+    if sys.excepthook is not _print_user_error:
+        _previous_hook, sys.excepthook = sys.excepthook, _print_user_error
+
+
+def _print_user_error(
+    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    if issubclass(kind, UserError):
+        CONSOLE.print(f"[bold red]Error:[/bold red] {escape(str(error))}", soft_wrap=True)
+    else:
+        _previous_hook(kind, error, traceback)

@@ -1,0 +1,175 @@
+"""Loading of a run's config.yml without executing code."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from importlib.metadata import entry_points
+from pathlib import Path, PurePath
+from typing import Any
+
+import yaml
+from nerfstudio.engine.trainer import TrainerConfig
+
+from lang3dxl_ns.common.errors import UserError
+
+TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
+_PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
+_PYTHON = "tag:yaml.org,2002:python/"
+
+
+def read_config(path: Path) -> TrainerConfig:
+    """The configuration of a run. The file is parsed as data only: settings, paths, and classes by name from
+    nerfstudio and this package (nerfstudio's own commands call whatever a file names).
+
+    Raises UserError for a missing or damaged file, one of another version, and one that asks for more.
+    """
+    try:
+        config = yaml.load(path.read_text(), Loader=_SettingsLoader)
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+        raise UserError(f"{path} is not a file: pass the config.yml of a run") from error
+    except (
+        *(yaml.YAMLError, OSError, LookupError, TypeError, AttributeError, ValueError),
+        *(RecursionError, ImportError),
+    ) as error:
+        raise UserError(
+            f"{path} can't be read ({error}): it is damaged, or from a version whose settings are no longer "
+            "known; restore it, or train anew"
+        ) from error
+    if not isinstance(config, TrainerConfig):
+        raise UserError(f"{path} is not the config.yml of a nerfstudio run")
+    if odd := next(_differences(config), None):
+        raise UserError(
+            f"{path} {odd}: it is truncated, or from another version; copy it again, or train anew"
+        )
+    return config
+
+
+def _differences(settings: Any, place: str = "") -> Iterator[str]:
+    """Settings that a file lacks or should not have, by their dotted names."""
+    known = {field.name for field in fields(settings)}
+    yield from (f"lacks the setting {place}{name}" for name in sorted(known - set(vars(settings))))
+    yield from (f"has the unknown setting {place}{name}" for name in sorted(set(vars(settings)) - known))
+    for name in sorted(known):
+        value = getattr(settings, name)
+        if is_dataclass(value) and not isinstance(value, type):
+            yield from _differences(value, f"{place}{name}.")
+
+
+def check_command_line(arguments: Sequence[str]) -> None:
+    """Exit from an `ns-…` command whose `--load-config` file asks for more than settings.
+
+    nerfstudio calls whatever such a file names, for any method. It imports the methods first, this one among
+    them, which is the earliest moment a plugin can check. The YAML nodes are inspected, not constructed.
+    """
+    for path in _load_configs(arguments):
+        if os.environ.get(TRUST_VARIABLE) != "1" and (why := _asks_for(path)):
+            sys.exit(
+                f"Error: {path} asks to {why}, which settings never need: nothing in it was run. If you "
+                f"trust its author, set {TRUST_VARIABLE}=1"
+            )
+
+
+def _load_configs(arguments: Sequence[str]) -> Iterator[Path]:
+    for i, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        if option.replace("_", "-") == "--load-config":
+            path = Path(value if equals else "".join(arguments[i + 1 : i + 2]))
+            if path.is_file():
+                yield path
+
+
+def _asks_for(path: Path) -> str | None:
+    """What a file's settings should not ask for, in a few words; None if there is nothing."""
+    try:
+        root = yaml.compose(path.read_text(), Loader=yaml.Loader)
+    except (yaml.YAMLError, OSError, ValueError, RecursionError):
+        return None  # the command can't read it either
+    known = {"torch", *_PACKAGES, *_plugins()}
+    for tag in _tags(root):
+        kind, _, name = tag.removeprefix(_PYTHON).partition(":")
+        package, last = name.partition(".")[0], name.rpartition(".")[2]
+        if kind == "module":
+            return f"load the module {name}"
+        if kind in ("object/apply", "object/new") and not _is_harmless(name, known):
+            return f"call {name}"
+        if kind == "object" and not (package in known and last[:1].isupper()):
+            return f"make a {name}"
+        if kind == "name" and not (package in known and (last[:1].isupper() or _is_settings_function(name))):
+            return f"load {name}"
+    return None
+
+
+def _tags(node: yaml.Node | None) -> Iterator[str]:
+    """The Python tags of a file's nodes."""
+    waiting, seen = [node], set()
+    while waiting:
+        node = waiting.pop()
+        if node is None or id(node) in seen:
+            continue
+        seen.add(id(node))
+        if node.tag.startswith(_PYTHON):
+            yield node.tag
+        if isinstance(node, yaml.MappingNode):
+            waiting += [part for pair in node.value for part in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            waiting += node.value
+
+
+def _is_harmless(name: str, known: set[str]) -> bool:
+    """Whether this constructs a path, a member of an enumeration, or a class of another plugin."""
+    if name == "_operator.getitem":  # how types are written in nerfstudio's own settings
+        return True
+    module, _, last = name.rpartition(".")
+    if module.partition(".")[0] not in known or not last[:1].isupper():
+        return False
+    if module in sys.modules:
+        kind = getattr(sys.modules[module], last, None)
+        return isinstance(kind, type) and issubclass(kind, PurePath | Enum)
+    return module.partition(".")[0] in _plugins()
+
+
+def _is_settings_function(name: str) -> bool:
+    """Whether this is the one function in nerfstudio's settings, or may be one in another plugin's."""
+    ours = ("nerfstudio.", "torch.", "lang3dxl_ns.", "pathlib.")
+    return name == "nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate" or not name.startswith(ours)
+
+
+def _plugins() -> set[str]:
+    """Installed packages that provide methods and data parsers for nerfstudio."""
+    groups = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
+    modules = [point.module for group in groups for point in entry_points(group=group)]
+    for definition in os.environ.get("NERFSTUDIO_METHOD_CONFIGS", "").split(","):
+        modules.append(definition.partition("=")[2].partition(":")[0])
+    return {module.partition(".")[0] for module in modules if module}
+
+
+class _SettingsLoader(yaml.UnsafeLoader):
+    """Constructs only settings, paths and enumeration members."""
+
+    def find_python_name(self, name: str, mark: Any) -> Any:  # type: ignore[override]
+        """A class from the packages that define settings."""
+        if not name.startswith(tuple(f"{package}." for package in _PACKAGES)):
+            raise yaml.constructor.ConstructorError(None, None, f"it asks for {name}", mark)
+        found = super().find_python_name(name, mark)
+        if not isinstance(found, type):
+            raise yaml.constructor.ConstructorError(
+                None, None, f"it asks for {name}, which is not a class", mark
+            )
+        return found
+
+    def find_python_module(self, name: str, mark: Any) -> Any:  # type: ignore[override]
+        """Modules are rejected: settings contain none."""
+        raise yaml.constructor.ConstructorError(None, None, f"it asks for the module {name}", mark)
+
+    def make_python_instance(
+        self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False
+    ) -> Any:
+        """Settings (without calling them), paths and enumeration members."""
+        kind = self.find_python_name(suffix, node.start_mark)
+        if not (is_dataclass(kind) and newobj) and not issubclass(kind, PurePath | Enum):
+            raise yaml.constructor.ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+        return super().make_python_instance(suffix, node, args, kwds, newobj)

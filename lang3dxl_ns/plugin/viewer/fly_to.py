@@ -1,0 +1,113 @@
+"""Viewer camera flights to a photo's viewpoint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from lang3dxl_ns.query.run_file import ScenePhoto
+from lang3dxl_ns.query.scene import Found, Viewpoint
+from lang3dxl_ns.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Pose of the viewer's camera: without roll, which its controls lack. The model's axes, z up."""
+
+    position: np.ndarray
+    """[3]."""
+    look_at: np.ndarray
+    """[3], orbit centre."""
+    fov: float
+    """Vertical field of view, radians."""
+
+
+def stand_of(camera: Camera, aspect: float, target: tuple[float, ...] | None = None) -> Stand:
+    """A photo's viewpoint in a window of this aspect ratio (width ÷ height), with all of the photo in view.
+
+    target: orbit centre, moved onto the photo's axis at its distance; None: a unit away.
+    """
+    view = camera.view_matrix.double().cpu().numpy()
+    forward, position = view[2, :3], -view[:3, :3].T @ view[:3, 3]
+    ahead = 1.0 if target is None else float((np.asarray(target) - position) @ forward)
+    k = camera.intrinsics.double().cpu().numpy()
+    half_height = max(k[1, 2], camera.height - k[1, 2]) / k[1, 1]
+    half_width = max(k[0, 2], camera.width - k[0, 2]) / k[0, 0]
+    fov = 2 * math.atan(max(half_height, half_width / aspect))
+    return Stand(position, position + max(ahead, 0.05) * forward, fov)
+
+
+def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePhoto:
+    """The farthest photo that sees the scene's centre near its own; otherwise the first."""
+    best, farthest = photos[0], 0.0
+    for photo in photos:
+        camera, lens = photo.camera, photo.lens
+        x, y, z = camera.view_matrix[:3, :3] @ torch.tensor(middle) + camera.view_matrix[:3, 3]
+        wide, high = abs(x) * lens.fx / lens.width, abs(y) * lens.fy / lens.height
+        if z > farthest and max(wide, high) < z / 4:
+            best, farthest = photo, float(z)
+    return best
+
+
+def flight(start: Stand, end: Stand, steps: int) -> Iterator[Stand]:
+    """Path from one stand to another, slow at both ends; the last is `end`.
+
+    Around the orbit centre instead of through it: turn, height and distance change evenly.
+    """
+    here, there = _around(start), _around(end)
+    there[0] = here[0] + math.remainder(there[0] - here[0], math.tau)  # the shorter way round
+    for step in range(1, steps):
+        t = step / steps
+        t = t * t * (3 - 2 * t)
+        look_at = (1 - t) * start.look_at + t * end.look_at
+        turn, height, distance = (1 - t) * here + t * there
+        offset = [math.cos(turn) * math.cos(height), math.sin(turn) * math.cos(height), math.sin(height)]
+        fov = (1 - t) * start.fov + t * end.fov
+        yield Stand(look_at + distance * np.array(offset), look_at, fov)
+    yield end
+
+
+def _around(stand: Stand) -> np.ndarray:
+    """Direction (turn about the vertical, elevation; radians) and distance of the camera from its orbit
+    centre."""
+    x, y, z = stand.position - stand.look_at
+    return np.array([math.atan2(y, x), math.atan2(z, math.hypot(x, y)), math.sqrt(x * x + y * y + z * z)])
+
+
+class Tour:
+    """Cyclic tour of a prompt's viewpoints."""
+
+    def __init__(self, found: Found) -> None:
+        self.found = found
+        self.place = -1
+        """Index of the viewpoint shown; −1: none yet."""
+
+    def best(self) -> Viewpoint:
+        """The best viewpoint."""
+        self.place = 0
+        return self.found.viewpoints[0]
+
+    def move(self, step: int) -> Viewpoint:
+        """The viewpoint `step` further on; at first, forward leads to the best, backward to the last."""
+        nowhere = 0 if step < 0 else -1
+        self.place = ((nowhere if self.place < 0 else self.place) + step) % len(self.found.viewpoints)
+        return self.found.viewpoints[self.place]
+
+    def __str__(self) -> str:
+        viewpoint = self.found.viewpoints[self.place]
+        return (
+            f"{self.place + 1} of {len(self.found.viewpoints)}: {viewpoint.name}, "
+            f"{viewpoint.area:.0%} of it matches"
+        )
+
+
+def box_lines(low: tuple[float, ...], high: tuple[float, ...]) -> np.ndarray:
+    """[16, 3] corners of a box in an order that draws all its edges in one line."""
+    path = ("000", "100", "110", "010", "000", "001", "101", "100", "101", "111", "110", "111", "011", "010",
+            "011", "001")  # fmt: skip
+    ends = np.array([low, high], dtype=np.float64)
+    return np.array([[ends[int(side), axis] for axis, side in enumerate(corner)] for corner in path])

@@ -1,0 +1,50 @@
+"""Background thread that runs only the latest submitted job."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+
+class Worker:
+    """Runs jobs in its own thread, one at a time; a new job replaces one still waiting.
+
+    So a text box can submit a delayed job per keystroke, and only the last one runs.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._changed = threading.Condition()
+        self._waiting: tuple[float, Callable[[], None]] | None = None
+        self._busy = False
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def submit(self, job: Callable[[], None], delay: float = 0.0) -> None:
+        """Run a job after `delay` seconds, unless another is submitted before."""
+        with self._changed:
+            self._waiting = time.monotonic() + delay, job
+            self._changed.notify_all()
+
+    def wait(self, timeout: float = 60.0) -> bool:
+        """Wait until all jobs are done; False if that takes longer."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._waiting is None and not self._busy, timeout)
+
+    def _run(self) -> None:
+        while True:
+            job = self._next()
+            try:
+                job()
+            finally:
+                with self._changed:
+                    self._busy = False
+                    self._changed.notify_all()
+
+    def _next(self) -> Callable[[], None]:
+        with self._changed:
+            while True:
+                left = None if self._waiting is None else self._waiting[0] - time.monotonic()
+                if self._waiting is not None and left is not None and left <= 0:
+                    job, self._waiting, self._busy = self._waiting[1], None, True
+                    return job
+                self._changed.wait(left)

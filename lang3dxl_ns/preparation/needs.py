@@ -1,0 +1,168 @@
+"""Scene needs: measurements that decide which optional components are built."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from lang3dxl_ns.common.reports import markdown_table, write_report
+from lang3dxl_ns.preparation.collection import SCALE_RATIO, CropPlan
+from lang3dxl_ns.preparation.physical_scale import crop_sides
+from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.photometry import Photometry, measure_photometry
+
+LIGHT = 0.3
+"""Spread of the photos' exposures, in natural logarithms of light: below half a stop, a camera's own metering
+explains it, and one colour per surface absorbs it."""
+SHEEN = 0.4
+"""Share of the residual colours explained by the viewing direction: 0.1 to 0.3 on matte landmarks, where haze
+and noise mimic it, 0.5 and more on real ones."""
+REPROJECTION = 2.0
+"""Pixels: COLMAP's bundle adjustment usually ends below one."""
+SPREAD_OF_SCALE = "physical widths of the photos, 95th over 5th percentile"
+CUT = 0.01
+"""Share of the pixels removed by masks."""
+
+NEEDS_FILE = "scene_needs"
+
+
+@dataclass(frozen=True)
+class Need:
+    """A component, its measurement, and the verdict."""
+
+    component: str
+    needed: bool
+    measured: str
+    """What is measured."""
+    value: float | None
+    """None if nothing could be measured."""
+    threshold: float | None
+    """The component is needed above this value; None if no number decides."""
+
+    @property
+    def verdict(self) -> str:
+        return "needed" if self.needed else "left out"
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Sources that the configuration adds to the photos."""
+
+    dense: bool
+    regions: bool
+
+
+def scene_needs(
+    photos: Sequence[Photo],
+    reconstruction: Reconstruction,
+    crops: CropPlan,
+    sources: Sources,
+) -> list[Need]:
+    """Measure the need for every optional component; takes seconds for a hundred photos."""
+    photometry = measure_photometry(photos, reconstruction)
+    return [
+        _appearance(photometry),
+        _view_dependence(photometry),
+        Need("physical scale", crops.pixel_sizes is not None, SPREAD_OF_SCALE, crops.spread, SCALE_RATIO),
+        _pyramid_levels(photos, crops),
+        _foreground(photos),
+        Need("regions", sources.regions, "a source of regions is given", None, None),
+        Need("dense head", sources.dense, "a dense encoder is given; queries never use it", None, None),
+        _camera_optimiser(reconstruction),
+    ]
+
+
+def _appearance(photometry: Photometry | None) -> Need:
+    measured = "spread of the photos' exposures along tracks (log of light)"
+    value = None if photometry is None else photometry.spread
+    return Need("appearance", value is None or value > LIGHT, measured, value, LIGHT)
+
+
+def _view_dependence(photometry: Photometry | None) -> Need:
+    measured = "share of the tracks' colour residuals explained by the viewing direction"
+    value = None if photometry is None else photometry.view_dependence
+    return Need("view dependence", value is None or value > SHEEN, measured, value, SHEEN)
+
+
+def _pyramid_levels(photos: Sequence[Photo], crops: CropPlan) -> Need:
+    """Levels are clipped to 32 pixels and to the photo; duplicates are never made."""
+    measured = f"distinct pyramid levels per photo, mean over the photos, of {len(crops.scales)}"
+    sizes = {p.name: 1 / p.width for p in photos} if crops.pixel_sizes is None else crops.pixel_sizes
+    value = float(np.mean([len(crop_sides(crops.scales, sizes[p.name], p.width)[0]) for p in photos]))
+    return Need("pyramid levels", value > 1, measured, value, 1.0)
+
+
+def _foreground(photos: Sequence[Photo], at_most: int = 20) -> Need:
+    measured = "share of the pixels removed by masks"
+    masked = [photo for photo in photos if photo.mask_path is not None]
+    if not masked:
+        return Need("foreground", False, "no masks", None, None)
+    cuts = []
+    for photo in masked[:: -(-len(masked) // at_most)]:
+        mask = photo.read_mask(scale=min(1.0, 256 / max(photo.width, photo.height)))
+        if mask is not None:
+            cuts.append(1 - float(mask.float().mean()))
+    value = float(np.mean(cuts)) * len(masked) / len(photos) if cuts else None
+    return Need("foreground", value is None or value > CUT, measured, value, CUT)
+
+
+def _camera_optimiser(reconstruction: Reconstruction) -> Need:
+    measured = "reprojection error of the model (pixels, median over the photos)"
+    errors = [error for photo in reconstruction.photos.values() if (error := _reprojection_error(photo))]
+    value = float(np.median(errors)) if errors else None
+    return Need("camera optimiser", value is not None and value > REPROJECTION, measured, value, REPROJECTION)
+
+
+def _reprojection_error(photo: Any) -> float | None:
+    """Mean distance in pixels between a photo's keypoints and its projected points; None without any."""
+    import cv2
+
+    if not len(photo.points) or len(photo.points) != len(photo.pixels):  # a scene without tracks
+        return None
+    rotation, translation = photo.camera_from_world[:, :3], photo.camera_from_world[:, 3]
+    lens = photo.lens
+    coefficients = np.array(lens.distortion or (0.0,) * 4)
+    project = cv2.fisheye.projectPoints if lens.fisheye else cv2.projectPoints
+    vector = cv2.Rodrigues(np.ascontiguousarray(rotation))[0]
+    points: Float[Array, "n 1 3"] = np.ascontiguousarray(photo.points)[:, None]
+    found = project(points, vector, translation, lens.matrix.numpy(), coefficients)[0].reshape(-1, 2)
+    error = np.linalg.norm(found - photo.pixels, axis=1)
+    error = error[np.isfinite(error)]
+    return float(error.mean()) if len(error) else None
+
+
+def needs_table(needs: Sequence[Need]) -> str:
+    """The needs as a markdown table."""
+    rows = [[n.component, n.measured, _figure(n.value), _figure(n.threshold), n.verdict] for n in needs]
+    return markdown_table(["component", "measured", "value", "needed above", "verdict"], rows)
+
+
+def as_data(needs: Sequence[Need]) -> dict[str, dict[str, Any]]:
+    """The needs for JSON, by component."""
+    return {n.component: {**asdict(n), "verdict": n.verdict} for n in needs}
+
+
+def write_needs(needs: Sequence[Need], folder: Path) -> None:
+    """scene_needs.json and .md in the run's folder."""
+    write_report(folder, NEEDS_FILE, f"# What this scene needs\n\n{needs_table(needs)}", as_data(needs))
+
+
+def read_needs(folder: Path) -> dict[str, bool]:
+    """The verdicts in a run's folder, by component; empty if there are none."""
+    path = folder / f"{NEEDS_FILE}.json"
+    if not path.is_file():
+        return {}
+    return {component: need["needed"] for component, need in json.loads(path.read_text()).items()}
+
+
+def _figure(value: float | None) -> str | None:
+    return None if value is None or not math.isfinite(value) else f"{value:.3g}"

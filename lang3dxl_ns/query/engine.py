@@ -1,0 +1,77 @@
+"""Query engines: prompts to relevancy maps, decoding Gaussian by Gaussian or pixel by pixel.
+
+Callers treat both alike: composite what Gaussians carry for the prompts, in the pass that renders their
+colors, and let the engine compute maps from the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.relevancy import TEMPERATURE, Decode, Queries, relevancy_of_codes
+
+
+class QueryEngine(Protocol):
+    """Answers prompts about a scene."""
+
+    def carried(self, queries: Queries) -> Float[Tensor, "n d"]:
+        """Values that Gaussians must carry in a rendering that answers these prompts."""
+
+    def maps(self, rendered: Float[Tensor, "h w d"], queries: Queries) -> Float[Tensor, "q h w"]:
+        """Relevancy of every pixel, 0…1, from the carried values composited over black."""
+
+    def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
+        """Relevancy of every Gaussian by itself, 0…1."""
+
+
+@dataclass(frozen=True)
+class PerGaussian:
+    """One relevancy per Gaussian and prompt, composited: Σ w ρ, not divided by coverage. A pixel's value is
+    the share of it covered by matching Gaussians, also at edges and half-transparent places."""
+
+    features: GaussianFeatures
+    temperature: float = TEMPERATURE
+
+    def carried(self, queries: Queries) -> Float[Tensor, "n q"]:
+        return self.of_gaussians(queries).T.contiguous()
+
+    def maps(self, rendered: Float[Tensor, "h w q"], queries: Queries) -> Float[Tensor, "q h w"]:
+        return rendered.permute(2, 0, 1)
+
+    def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
+        return self.features.relevancy(queries, self.temperature)
+
+
+@dataclass(frozen=True)
+class PerPixel:
+    """Codes are composited, then decoded pixel by pixel, as in Lang3D-XL."""
+
+    decode: Decode
+    codes: Float[Tensor, "n d"]
+    temperature: float = TEMPERATURE
+
+    def carried(self, queries: Queries) -> Float[Tensor, "n d"]:
+        return self.codes
+
+    def maps(self, rendered: Float[Tensor, "h w d"], queries: Queries) -> Float[Tensor, "q h w"]:
+        return relevancy_of_codes(self.decode, rendered, queries, temperature=self.temperature)
+
+    def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
+        return relevancy_of_codes(self.decode, self.codes, queries, temperature=self.temperature)
+
+
+@torch.no_grad()
+def make_engine(
+    encoder: SemanticEncoder, carried: Float[Tensor, "n d"], temperature: float = TEMPERATURE
+) -> QueryEngine:
+    """The engine for a feature decoder, with its own order of compositing and decoding."""
+    if encoder.per_gaussian:
+        return PerGaussian(GaussianFeatures.of(encoder, carried), temperature)
+    return PerPixel(encoder.decode_clip, carried, temperature)

@@ -1,0 +1,198 @@
+"""Scene description in a run's folder: the photos' names and cameras, and the CLIP.
+
+Written when training starts, so that a finished run can be queried without its photos.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.scene.camera import MOST_PIXELS, Camera, Lens, view_matrix
+from lang3dxl_ns.scene.photo import Photo
+
+SCENE_FILE = "lang3dxl_scene.json"
+"""File name, beside config.yml."""
+LONGEST_SIDE = 1 << 16
+"""Most pixels of a picture to render."""
+_VERSION = 2
+
+
+@dataclass(frozen=True)
+class ScenePhoto:
+    """A photo's name and camera, at training resolution."""
+
+    name: str
+    split: Literal["train", "eval"]
+    camera_to_world: list[list[float]]
+    """[3, 4], the model's frame, nerfstudio's camera axes (x right, y up, z backward)."""
+    lens: Lens
+    """Of the file: masks are drawn on the distorted photo, while views are undistorted."""
+    mask: str | None = None
+    """File of the photo's foreground mask."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera for the rasterizer."""
+        return self.lens.camera(view_matrix(torch.tensor(self.camera_to_world)))
+
+    def photo(self, folder: Path = Path()) -> Photo:
+        """The photo in its folder; without its mask if that is gone."""
+        mask = None if self.mask is None else Path(self.mask)
+        return Photo(
+            name=self.name,
+            path=folder / self.name,
+            mask_path=mask if mask is not None and mask.is_file() else None,
+            lens=self.lens,
+        )
+
+    def foreground(self) -> Bool[Tensor, "h w"] | None:
+        """The photo's foreground; None if it has no mask, or the mask is gone."""
+        return self.photo().read_mask()
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """The contents of the file."""
+
+    photos: list[ScenePhoto]
+    """Training photos, then held-out ones."""
+    clip: str | None
+    """Folder or name of the CLIP that made the targets; None for a run of colours only."""
+    clip_identity: str | None
+    """Fingerprint of its weights."""
+    scale: float
+    """The model's frame = scale · transform · COLMAP's frame."""
+    transform: list[list[float]]
+    """[3, 4]."""
+    data: str
+    """Folder that the photos came from."""
+
+    def write(self, path: Path) -> None:
+        """Write the file, atomically."""
+        write_atomically(path, json.dumps({"version": _VERSION, **asdict(self)}) + "\n")
+
+    @classmethod
+    def read(cls, path: Path) -> SceneFile:
+        """Read the file. Raises UserError if it is missing, damaged, or of another version."""
+        if not path.is_file():
+            raise UserError(
+                f"{path.parent} has no {path.name}, which training writes when it starts: the run is from "
+                f"an earlier version, or its folder is incomplete"
+            )
+        try:
+            content: dict[str, Any] = json.loads(path.read_text())
+            if content.pop("version") != _VERSION:
+                raise ValueError("another version wrote it")
+            content["photos"] = [_photo(**photo) for photo in content["photos"]]
+            return _checked(cls(**content))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise UserError(f"{path} can't be read ({error}): restore it, or train anew") from error
+
+    def photo(self, name: str) -> ScenePhoto:
+        """The photo with this name, or with this file name or stem if that is unique.
+
+        Raises UserError with similar names if there is none.
+        """
+        for form in (str, lambda n: PurePosixPath(n).name, lambda n: PurePosixPath(n).stem):
+            found = [photo for photo in self.photos if form(photo.name) == name]
+            if len(found) == 1:
+                return found[0]
+        names = [photo.name for photo in self.photos]
+        similar = get_close_matches(name, names, n=3) or names[:3]
+        raise UserError(
+            f"the scene has no photo {name!r}: there are {len(names)}, such as {', '.join(similar)}"
+        )
+
+
+def _photo(lens: dict[str, Any], **rest: Any) -> ScenePhoto:
+    distortion = tuple(lens.pop("distortion"))
+    return ScenePhoto(lens=Lens(**lens, distortion=distortion), **rest)
+
+
+def _checked(scene: SceneFile) -> SceneFile:
+    """The scene, after validating all its values. Raises ValueError."""
+    _expect(scene.photos != [], "it lists no photo")
+    for photo in scene.photos:
+        _expect(isinstance(photo.name, str) and photo.name != "", f"a photo is called {photo.name!r}")
+        _expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
+        _expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
+        _expect(_is_pose(photo.camera_to_world), f"{photo.name} has no pose")
+        check_lens(photo.lens)
+    _expect(len({photo.name for photo in scene.photos}) == len(scene.photos), "a photo is listed twice")
+    for text in (scene.clip, scene.clip_identity):
+        _expect(isinstance(text, str | None), f"its CLIP is {text!r}")
+    _expect(isinstance(scene.data, str), f"its data are in {scene.data!r}")
+    _expect(
+        isinstance(scene.scale, float | int) and 0 < scene.scale < math.inf, f"its scale is {scene.scale!r}"
+    )
+    _expect(_is_pose(scene.transform), "it has no transform")
+    return scene
+
+
+def _expect(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise ValueError(otherwise)
+
+
+def _is_pose(rows: object) -> bool:
+    """Whether these are three rows of four finite numbers."""
+    if not isinstance(rows, list) or [len(row) for row in rows if isinstance(row, list)] != [4, 4, 4]:
+        return False
+    return len(rows) == 3 and all(_is_number(value) for row in rows for value in row)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
+
+
+def check_lens(lens: Lens) -> None:
+    """Raises ValueError for a lens that cannot be rendered with."""
+    numbers = (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
+    _expect(all(map(_is_number, numbers)), "a lens has a value that is not a number")
+    sizes = isinstance(lens.width, int) and isinstance(lens.height, int) and min(lens.width, lens.height) > 0
+    _expect(sizes, f"a picture has {lens.width} × {lens.height} pixels")
+    _expect(
+        lens.width * lens.height <= MOST_PIXELS and max(lens.width, lens.height) <= LONGEST_SIDE,
+        f"{lens.width} × {lens.height} pixels are too many",
+    )
+    _expect(min(lens.fx, lens.fy) > 0, f"a lens has the focal lengths {lens.fx}, {lens.fy}")
+    _expect(
+        isinstance(lens.fisheye, bool) and len(lens.distortion) in (0, 4, 5, 8),
+        "a lens has no known distortion",
+    )
+
+
+def read_camera_path(path: Path) -> Sequence[Camera]:
+    """Cameras of a camera path saved by nerfstudio's viewer. Raises UserError for other files."""
+    try:
+        content = json.loads(path.read_text())
+        width, height = int(content["render_width"]), int(content["render_height"])
+        _expect(content["camera_path"] != [], "it has no camera")
+        return [_path_camera(frame, width, height) for frame in content["camera_path"]]
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, AttributeError) as error:
+        raise UserError(
+            f"{path} is not a camera path ({error!r}): save one in the viewer (Render tab, Save Path)"
+        ) from error
+
+
+def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
+    pose = torch.tensor(frame["camera_to_world"], dtype=torch.float32).reshape(4, 4)
+    turned = pose[:3, :3].det()
+    _expect(bool(pose.isfinite().all()) and 0.5 < float(turned) < 2, "a camera has no pose")
+    _expect(0 < frame["fov"] < 180, f"a camera has a field of view of {frame['fov']} degrees")
+    focal = height / 2 / math.tan(math.radians(frame["fov"]) / 2)
+    lens = Lens(width, height, focal, focal, width / 2, height / 2)
+    check_lens(lens)
+    return lens.camera(view_matrix(pose[:3]))

@@ -1,0 +1,72 @@
+"""Visible Gaussians per view and their sizes, for ranking views without rendering them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lang3dxl_ns.query.cache import load_tensors, save_tensors
+from lang3dxl_ns.scene.camera import Camera
+
+_LEAST = 1e-3
+"""Pixels below which a Gaussian counts as not visible."""
+
+
+@dataclass(frozen=True)
+class VisibleGaussians:
+    """The Gaussians visible in one view."""
+
+    camera: Camera
+    rows: Int[Tensor, " m"]
+    """Indices of the visible Gaussians."""
+    pixels: Float[Tensor, " m"]
+    """Share of the view that each fills, half precision."""
+
+    @classmethod
+    def of(cls, camera: Camera, mass: Float[Tensor, " n"]) -> VisibleGaussians:
+        """From the pixels that every Gaussian fills."""
+        rows = (mass > _LEAST).nonzero().squeeze(1)
+        return cls(camera, rows.int(), mass[rows].half())
+
+    def share(self, values: Float[Tensor, " n"]) -> float:
+        """Mean of the Gaussians' values over the view."""
+        area = self.camera.width * self.camera.height
+        return float((values[self.rows] * self.pixels.float()).sum()) / area
+
+    def highest(self, values: Float[Tensor, " n"], least: float) -> float:
+        """Highest value among Gaussians that fill at least this many pixels, or 0."""
+        large = self.rows[self.pixels >= least]
+        return float(values[large].max()) if len(large) else 0.0
+
+    def distance(self, means: Float[Tensor, "n 3"]) -> float:
+        """Median depth of the visible Gaussians, world units; NaN if there are none."""
+        view = self.camera.view_matrix.to(means)
+        depths = means[self.rows] @ view[2, :3] + view[2, 3]
+        return float(depths.median()) if len(depths) else float("nan")
+
+
+def save_visible(path: Path, views: Mapping[str, VisibleGaussians], key: str) -> None:
+    """Write the views, concatenated into one tensor per field."""
+    parts = {
+        "rows": torch.cat([view.rows for view in views.values()]),
+        "pixels": torch.cat([view.pixels for view in views.values()]),
+    }
+    save_tensors(path, parts, key, [len(view.rows) for view in views.values()])
+
+
+def load_visible(
+    path: Path, key: str, cameras: Mapping[str, Camera], device: torch.device | str
+) -> dict[str, VisibleGaussians] | None:
+    """The views cached under this key, which covers names and cameras."""
+    found = load_tensors(path, key)
+    if found is None:
+        return None
+    tensors, sizes = found
+    rows, pixels = (tensors[name].to(device).split(sizes) for name in ("rows", "pixels"))  # type: ignore[arg-type]
+    named = zip(cameras.items(), rows, pixels, strict=True)
+    return {name: VisibleGaussians(camera, r, p) for (name, camera), r, p in named}

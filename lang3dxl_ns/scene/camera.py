@@ -1,0 +1,136 @@
+"""Lens, camera and poses: intrinsics, nerfstudio's and OpenCV's conventions, frustum culling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+
+MOST_PIXELS = 180_000_000
+"""Most pixels of a picture: Pillow rejects larger ones as an attack."""
+
+
+def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
+    """Width and height of a photo at `scale`, at least one pixel each."""
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of a photo of `width` × `height` pixels; origin at the corner of the top-left pixel."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    """In OpenCV's order: k1 k2 p1 p2 [k3 …], or k1 k2 k3 k4 for a fisheye; empty without distortion."""
+    fisheye: bool = False
+
+    @property
+    def distorts(self) -> bool:
+        """Whether photos need undistortion to match a pinhole camera."""
+        return self.fisheye or any(self.distortion)
+
+    @property
+    def matrix(self) -> Float[Tensor, "3 3"]:
+        """Intrinsic matrix in float64, pixels."""
+        rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(rows, dtype=torch.float64)
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens at another resolution."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
+        )
+
+    def scaled(self, scale: float) -> Lens:
+        """The lens at `scale`, exact for the rounded size."""
+        return self.resized(*scaled_size(self.width, self.height, scale))
+
+    def camera(self, view_matrix: Float[Tensor, "4 4"]) -> Camera:
+        """This lens, undistorted, at a pose (world → camera, OpenCV axes)."""
+        return Camera(view_matrix, self.matrix.float(), self.width, self.height)
+
+
+@dataclass
+class Camera:
+    """A pinhole camera without distortion and skew; OpenCV axes (x right, y down, z forward)."""
+
+    view_matrix: Float[Tensor, "4 4"]
+    """World to camera, rigid, world units."""
+    intrinsics: Float[Tensor, "3 3"]
+    """Pixels; origin at the top-left corner of the top-left pixel, so pixel centres lie at +0.5."""
+    width: int
+    height: int
+
+    def detach(self) -> Camera:
+        """The same camera, without gradient."""
+        return Camera(self.view_matrix.detach(), self.intrinsics.detach(), self.width, self.height)
+
+    def at_origin(self, like: Tensor) -> tuple[Camera, Float[Tensor, "3"]]:
+        """The camera in a world whose origin is the camera's position (rounded), and that position.
+
+        Far from the origin (map coordinates are in the millions) R·x + t is a small difference of large
+        numbers. R·(x − position) + (R·position + t) is not, if the last bracket is computed in float64. Type
+        and device are those of `like`.
+        """
+        view = self.view_matrix.to(like.device, torch.float64)
+        place = -(view[:3, :3].T @ view[:3, 3]).detach().to(like.dtype)
+        shift = torch.eye(4).to(view)
+        shift[:3, 3] = place
+        return Camera((view @ shift).to(like.dtype), self.intrinsics, self.width, self.height), place
+
+
+def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
+    """World → camera (OpenCV axes) from nerfstudio's camera → world (OpenGL axes)."""
+    rotation = (camera_to_world[:, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).T
+    top = torch.cat([rotation, -rotation @ camera_to_world[:, 3:]], dim=1)
+    return torch.cat([top, camera_to_world.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
+    """The inverse of `view_matrix`: nerfstudio's camera → world from world → camera (OpenCV axes)."""
+    rotation = view_matrix[:3, :3].T
+    position = -rotation @ view_matrix[:3, 3:]
+    return torch.cat([rotation * view_matrix.new_tensor([1.0, -1.0, -1.0]), position], dim=1)
+
+
+@torch.no_grad()
+def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Which Gaussians may be visible: includes all that are, and some that aren't.
+
+    Tests the ball of 3.5 standard deviations around each against the planes through the image's edges.
+    """
+    points = means @ camera.view_matrix[:3, :3].T + camera.view_matrix[:3, 3]
+    reach = 3.5 * scales.amax(dim=1)
+    seen = points[:, 2] > 0
+    margin = 8  # pixels: the rasteriser blurs every splat by one or two
+    for axis, size in ((0, camera.width), (1, camera.height)):
+        focal, middle = camera.intrinsics[axis, axis], camera.intrinsics[axis, 2]
+        for side, edge in ((-1, middle + margin), (1, size + margin - middle)):
+            outside = side * focal * points[:, axis] - edge * points[:, 2]
+            seen &= outside <= reach * torch.hypot(focal, edge)
+    return seen
+
+
+def resized(camera: Camera, longer_side: int) -> Camera:
+    """The same view with fewer pixels, never more."""
+    factor = min(longer_side / max(camera.width, camera.height), 1.0)
+    width, height = max(round(camera.width * factor), 1), max(round(camera.height * factor), 1)
+    zoom = camera.intrinsics.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
+    return Camera(camera.view_matrix, camera.intrinsics * zoom, width, height)
+
+
+def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:
+    """A camera at a pose (camera → world, nerfstudio's axes) with the lens and size of `like`."""
+    if pose.shape not in ((3, 4), (4, 4)):
+        raise UserError(f"a pose has shape [3, 4] or [4, 4], not {list(pose.shape)}")
+    return Camera(view_matrix(pose[:3].float()), like.intrinsics, like.width, like.height)

@@ -1,0 +1,177 @@
+"""Reading and validating a COLMAP model: cameras, poses, 3D points and their tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray as Array
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.scene.camera import MOST_PIXELS, Lens
+from lang3dxl_ns.scene.colmap_check import check_binary_model
+from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+
+if TYPE_CHECKING:
+    import pycolmap
+
+PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+FISHEYE_MODELS = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+"""COLMAP camera models with OpenCV's distortion, and their parameters in OpenCV's order."""
+FARTHEST = 1e12
+"""Largest coordinate, world units; map coordinates are below 1e8."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPhoto:
+    """A photo of a COLMAP model: lens, pose and the 3D points tracked in it."""
+
+    name: str
+    lens: Lens
+    camera_from_world: Float[Array, "3 4"]
+    """COLMAP's camera frame: x right, y down, z forward."""
+    points: Float[Array, "n 3"]
+    """World units."""
+    pixels: Float[Array, "n 2"]
+    """Positions of the points in the (distorted) photo."""
+
+    @property
+    def width(self) -> int:
+        """Pixels."""
+        return self.lens.width
+
+    @property
+    def height(self) -> int:
+        """Pixels."""
+        return self.lens.height
+
+    @property
+    def centre(self) -> Float[Array, "3"]:
+        """The camera's position in the world."""
+        return -self.camera_from_world[:, :3].T @ self.camera_from_world[:, 3]
+
+    def resized(self, width: int, height: int) -> TrackedPhoto:
+        """The same photo at another resolution."""
+        factor = [width / self.width, height / self.height]
+        return replace(self, lens=self.lens.resized(width, height), pixels=self.pixels * factor)
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """A COLMAP model: its photos, sorted by name, and its points with their colours."""
+
+    photos: dict[str, TrackedPhoto]
+    points: Float[Array, "m 3"]
+    colours: UInt8[Array, "m 3"]
+
+
+def read_reconstruction(model_dir: Path) -> Reconstruction:
+    """Read a COLMAP model (.bin or .txt) with its tracks.
+
+    Raises UserError for a folder without a model, a damaged or empty model, and a camera model that OpenCV
+    can't undistort.
+    """
+    model = _read_model(Path(model_dir))
+    images = {
+        name: image for i, image in model.images.items() if image.has_pose and (name := _name(i, image))
+    }
+    if not images:
+        raise UserError(f"the COLMAP model in {model_dir} has no photo with a pose: run the mapper again")
+    # Drop NaN, and coordinates whose squares overflow float32.
+    points = {i: point for i, point in model.points3D.items() if (np.abs(point.xyz) < FARTHEST).all()}
+    if len(points) < len(model.points3D):
+        say(f"{len(model.points3D) - len(points)} points of {model_dir} are invalid and skipped")
+    positions = {i: point.xyz for i, point in points.items()}
+    return Reconstruction(
+        photos={
+            name: _tracked_photo(images[name], model.cameras[images[name].camera_id], positions)
+            for name in sorted(images)
+        },
+        points=np.array(list(positions.values()), dtype=np.float64).reshape(-1, 3),
+        colours=np.array([point.color for point in points.values()], dtype=np.uint8).reshape(-1, 3),
+    )
+
+
+def _name(number: int, image: pycolmap.Image) -> str | None:
+    """A photo's name; None (logged) if it can't be read."""
+    try:
+        return image.name
+    except UnicodeDecodeError:
+        say(
+            f"photo {number} of the COLMAP model is left out: its name is not UTF-8; rename its file (convmv "
+            "-f latin1 -t utf8 --notest images/*) and make the model again"
+        )
+        return None
+
+
+def photos_in_model(model_dir: Path) -> int:
+    """Number of photos in a COLMAP model, from the header or lines of its images file alone."""
+    binary, text = model_dir / "images.bin", model_dir / "images.txt"
+    if binary.is_file():
+        with binary.open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    with text.open(errors="replace") as lines:
+        return sum(not line.startswith("#") for line in lines) // 2  # each is followed by a line of keypoints
+
+
+def _read_model(folder: Path) -> pycolmap.Reconstruction:
+    """pycolmap's model; UserError with the reason if it can't be read."""
+    pycolmap = load_pycolmap()
+    parts = ("cameras", "images", "points3D")
+    if not any(all((folder / (part + ending)).is_file() for part in parts) for ending in (".bin", ".txt")):
+        raise UserError(
+            f"no COLMAP model in {folder}: looked for cameras, images and points3D, .bin or .txt. Give the "
+            "folder that holds them (usually sparse/0), or make one from photos: "
+            "lang3dxl reconstruct --data PHOTOS"
+        )
+    check_binary_model(folder)
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, IndexError, RuntimeError, UnicodeDecodeError, MemoryError) as error:
+        raise UserError(f"the COLMAP model in {folder} is damaged, copy or make it again: {error}") from error
+
+
+def _tracked_photo(
+    image: pycolmap.Image, camera: pycolmap.Camera, positions: dict[int, Array]
+) -> TrackedPhoto:
+    fx, fy = camera.focal_length_x, camera.focal_length_y
+    pixels = camera.width * camera.height
+    if min(pixels, fx, fy) <= 0 or pixels > MOST_PIXELS or not np.isfinite(camera.params).all():
+        raise UserError(f"photo {image.name} has an impossible camera, remove it from the model: {camera}")
+    distortion, fisheye = _distortion(image.name, camera)
+    tracked = [point for point in image.get_observation_points2D() if point.point3D_id in positions]
+    return TrackedPhoto(
+        name=image.name,
+        lens=Lens(
+            width=camera.width,
+            height=camera.height,
+            fx=fx,
+            fy=fy,
+            cx=camera.principal_point_x,
+            cy=camera.principal_point_y,
+            distortion=distortion,
+            fisheye=fisheye,
+        ),
+        camera_from_world=image.cam_from_world().matrix(),
+        points=np.array([positions[point.point3D_id] for point in tracked], dtype=np.float64).reshape(-1, 3),
+        pixels=np.array([point.xy for point in tracked], dtype=np.float64).reshape(-1, 2),
+    )
+
+
+def _distortion(name: str, camera: pycolmap.Camera) -> tuple[tuple[float, ...], bool]:
+    """OpenCV's distortion coefficients for a COLMAP camera, and whether it is a fisheye."""
+    model = camera.model_name
+    coefficients = tuple(camera.params[camera.extra_params_idxs()].tolist())
+    coefficients += (0.0,) * (4 - len(coefficients))
+    if model in PERSPECTIVE_MODELS:
+        return coefficients if any(coefficients) else (), False
+    if model in FISHEYE_MODELS:
+        return coefficients, True
+    raise UserError(
+        f"photo {name} has a {model} camera, which can't be undistorted here: "
+        "run colmap image_undistorter and use its images and model"
+    )

@@ -1,0 +1,51 @@
+"""Paths of files that a model or list names (photos, masks, label maps), kept inside their folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from lang3dxl_ns.common.errors import UserError
+
+
+def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
+    """The path in `folder` of a file that a model or a list names; sub-folders are allowed.
+
+    Models come from other people, so a name may not leave the folder: through `..`, as an absolute path, or
+    by a symbolic link (unless `follow_links`). The folder itself may be a link. Raises UserError otherwise.
+    """
+    path = folder / name
+    if not name or "\0" in name or os.path.isabs(name) or ".." in Path(name).parts:
+        raise UserError(f"{name!r} leads out of {folder}: names are relative to that folder, without ..")
+    target = Path(os.path.realpath(path))  # unlike resolve(), accepts links in a circle
+    if not follow_links and not target.is_relative_to(os.path.realpath(folder)):
+        raise UserError(
+            f"{path} is a link that leads out of {folder}, to {target}: copy the file there, or, "
+            "if you trust the links, pass `lang3dxl-colmap --follow-links True` after all other options"
+        )
+    return path
+
+
+def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bool = False) -> Path | None:
+    """The file in `folder` for a photo: `name` with a suffix appended (COLMAP's photo.jpg.png, which
+    distinguishes photo.jpg from photo.png) or replaced. None if there is none.
+
+    Raises UserError for a name that leads out of the folder.
+    """
+    path = inside(folder, name, follow_links=True)  # the photo's name; the file found is checked below
+    candidates = [path.with_name(path.name + suffix) for suffix in suffixes]
+    candidates += [path.with_suffix(suffix) for suffix in suffixes]
+    found = next((candidate for candidate in candidates if candidate.is_file()), None)
+    return None if found is None else inside(folder, str(found.relative_to(folder)), follow_links)
+
+
+def named_folder(choice: str, data: Path, option: str) -> Path:
+    """The folder given to an option, relative to `data`. Raises UserError if it does not exist."""
+    folder = data / Path(choice).expanduser()
+    if not folder.is_dir():
+        raise UserError(
+            f"--pipeline.datamanager.{option} {choice}: there is no folder {folder}; give an existing one "
+            "(relative to the data folder, or absolute), or one of the choices listed by --help"
+        )
+    return folder

@@ -1,0 +1,82 @@
+"""Test views: cameras that are not a photo's, with reference pictures and labels, in test_views/.
+
+`test_views/cameras.json` holds the cameras in the COLMAP model's world, `images/` the pictures, `masks/`
+(optional) the foreground, `ground_truth/<category>/` the labels. They are not in the COLMAP model; only
+evaluation reads them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.colmap import TrackedPhoto
+
+FOLDER = "test_views"
+_CAMERAS = "cameras.json"
+
+
+@dataclass(frozen=True)
+class NovelViews:
+    """A scene's test views."""
+
+    folder: Path
+    cameras: list[TrackedPhoto]
+    """Cameras in the COLMAP model's world, each with some of the surface points it sees. Names are
+    `test_views/NNNN.jpg`, relative to the scene; the pictures are in `images/`."""
+    same_light: bool
+    """Whether the photos were taken in the same light, so that colours can be compared."""
+
+    def image(self, view: TrackedPhoto) -> Path:
+        """The file of a view's picture."""
+        return self.folder / "images" / Path(view.name).name
+
+
+def read_novel_views(scene: Path) -> NovelViews | None:
+    """A scene's test views, or None if it has none. Raises UserError for a damaged cameras.json."""
+    path = scene / FOLDER / _CAMERAS
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text())
+        cameras = [_tracked(view) for view in content["views"]]
+        return NovelViews(path.parent, cameras, bool(content["same_light"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is damaged ({error!r}): make the scene again, or remove the file") from error
+
+
+def write_novel_cameras(folder: Path, cameras: Sequence[TrackedPhoto], same_light: bool) -> None:
+    """Write cameras.json into a scene's `folder`; views are named after their files."""
+    views = [
+        {
+            "name": g.name,
+            "width": g.width,
+            "height": g.height,
+            "intrinsics": [g.lens.fx, g.lens.fy, g.lens.cx, g.lens.cy],
+            "camera_from_world": g.camera_from_world.tolist(),
+            "points": g.points.round(6).tolist(),
+        }
+        for g in cameras
+    ]
+    content = {"same_light": same_light, "views": views}
+    (folder / FOLDER / _CAMERAS).write_text(json.dumps(content) + "\n")
+
+
+def _tracked(view: dict) -> TrackedPhoto:
+    fx, fy, cx, cy = (float(value) for value in view["intrinsics"])
+    points = np.array(view["points"], dtype=np.float64).reshape(-1, 3)
+    pose = np.array(view["camera_from_world"], dtype=np.float64).reshape(3, 4)
+    x, y, z = pose @ np.column_stack([points, np.ones(len(points))]).T
+    return TrackedPhoto(
+        name=f"{FOLDER}/{view['name']}",
+        lens=Lens(int(view["width"]), int(view["height"]), fx, fy, cx, cy),
+        camera_from_world=pose,
+        points=points,
+        pixels=np.column_stack([fx * x / z + cx, fy * y / z + cy]),
+    )

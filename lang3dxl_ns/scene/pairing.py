@@ -1,0 +1,78 @@
+"""Photo pairs to match: all, or each photo with its most similar ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy import ndarray as Array
+
+EXHAUSTIVE = 200
+"""Most photos for which every pair is matched: 19,900 pairs."""
+NEIGHBORS = 40
+"""Partners of each photo in larger collections."""
+_WORDS = 64
+_SAMPLE = 50_000  # descriptors for learning the words
+_PER_PHOTO = 1_500  # descriptors per photo
+
+Descriptors = Callable[[str], UInt8[Array, "n 128"]]
+"""SIFT descriptors of a photo."""
+
+
+def pairs_to_match(
+    names: Sequence[str], descriptors: Descriptors, step: Callable[[], None] = lambda: None
+) -> list[tuple[str, str]]:
+    """Pairs of photos that may overlap: all of them up to EXHAUSTIVE photos, beyond that those found by
+    `similar_pairs`, and neighbors in name order, which is the order of a video or a walk.
+
+    `step` is called for every photo described.
+    """
+    if len(names) <= EXHAUSTIVE:
+        return list(combinations(names, 2))
+    found = set(similar_pairs(names, descriptors, NEIGHBORS, step))
+    for apart in (1, 2, 4, 8):
+        found.update(zip(names[:-apart], names[apart:], strict=True))
+    return sorted(found)
+
+
+def similar_pairs(
+    names: Sequence[str], descriptors: Descriptors, neighbors: int, step: Callable[[], None]
+) -> list[tuple[str, str]]:
+    """Each photo with the `neighbors` whose aggregated descriptors (VLAD, Jégou et al. 2010) are nearest."""
+    from sklearn.cluster import MiniBatchKMeans
+
+    rng = np.random.default_rng(0)
+    some = [names[i] for i in rng.permutation(len(names))[:200]]
+    sample = np.concatenate([_rows(descriptors(name), _SAMPLE // len(some), rng) for name in some])
+    words = MiniBatchKMeans(min(_WORDS, len(sample)), random_state=0, n_init=3).fit(sample).cluster_centers_
+    vectors = np.zeros((len(names), words.size), np.float32)
+    for vector, name in zip(vectors, names, strict=True):
+        vector[:] = _aggregate(_rows(descriptors(name), _PER_PHOTO, rng), words)
+        step()
+    pairs: set[tuple[str, str]] = set()
+    for start in range(0, len(names), 256):
+        likeness = vectors[start : start + 256] @ vectors.T
+        nearest = np.argpartition(-likeness, min(neighbors, len(names) - 1), axis=1)[:, : neighbors + 1]
+        for row, others in enumerate(nearest, start):
+            pairs.update((names[min(row, o)], names[max(row, o)]) for o in others if o != row)
+    return sorted(pairs)
+
+
+def _rows(descriptors: UInt8[Array, "n 128"], most: int, rng: np.random.Generator) -> Float[Array, "m 128"]:
+    """A sample of the rows as RootSIFT."""
+    chosen = rng.permutation(len(descriptors))[:most]
+    rows = descriptors[chosen].astype(np.float32)
+    return np.sqrt(rows / np.maximum(rows.sum(1, keepdims=True), 1e-9))
+
+
+def _aggregate(rows: Float[Array, "n 128"], words: Float[Array, "k 128"]) -> Float[Array, " d"]:
+    """Sum of the descriptors' differences from their nearest word, normalized per word and overall."""
+    if not len(rows):
+        return np.zeros(words.size, np.float32)
+    nearest = (np.square(words).sum(1) - 2 * rows @ words.T).argmin(1)
+    total = np.zeros_like(words)
+    np.add.at(total, nearest, rows - words[nearest])
+    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
+    return (total / max(np.linalg.norm(total), 1e-9)).ravel()

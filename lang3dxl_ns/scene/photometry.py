@@ -1,0 +1,136 @@
+"""Photometric variation across photos: exposure, tint and view dependence of tracked 3D points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.photo import Photo
+
+_SIDE = 512  # pixels, longer side at which colours are read: one pixel then averages a patch of the surface
+_DARK, _BRIGHT = 0.03, 0.97  # beyond these, sensors do not record brightness faithfully
+_GAMMA = 2.2
+_FEWEST_POINTS = 20
+
+
+@dataclass(frozen=True)
+class Photometry:
+    """How well photos agree on the colours of the same points, in natural logarithms of linear light."""
+
+    spread: float
+    """Standard deviation of the photos' exposures and tints (per channel): 0.7 is a stop. 0 if they agree."""
+    residual: float
+    """Robust deviation of single observations after removing each photo's exposure and tint."""
+    view_dependence: float
+    """Share of the residuals' variance that a linear function of the viewing direction explains, beyond
+    chance, 0…1: highlights and sheen."""
+    photos: int
+    points: int
+    """Photos and points used."""
+
+
+def measure_photometry(
+    photos: Sequence[Photo], reconstruction: Reconstruction, at_most: int = 60
+) -> Photometry | None:
+    """Fit log colour = point + photo (robust per photo) to at most `at_most` photos, evenly spaced.
+
+    None if fewer than three photos share enough tracked points. Unreadable photos are skipped.
+    """
+    chosen = photos[:: -(-len(photos) // at_most)] if photos else []
+    point_of: dict[bytes, int] = {}
+    rows: list[tuple[Array, Array, Array]] = []
+    for photo in chosen:
+        tracked = reconstruction.photos.get(photo.name)
+        if tracked is None or len(tracked.points) < _FEWEST_POINTS:
+            continue
+        if len(tracked.pixels) != len(tracked.points):  # a scene without tracks
+            continue
+        try:
+            colours, usable = _log_colours(photo, tracked.pixels / [tracked.width, tracked.height])
+        except UserError:
+            continue
+        ids = np.array([point_of.setdefault(p.tobytes(), len(point_of)) for p in tracked.points])
+        rays = tracked.points - tracked.centre
+        rays = rays / np.linalg.norm(rays, axis=1, keepdims=True).clip(1e-12)
+        rows.append((ids[usable], colours[usable], rays[usable]))
+    if len(rows) < 3:
+        return None
+    point = np.concatenate([ids for ids, _, _ in rows])
+    photo_index = np.repeat(np.arange(len(rows)), [len(ids) for ids, _, _ in rows])
+    colour = np.concatenate([colours for _, colours, _ in rows])
+    ray = np.concatenate([rays for _, _, rays in rows])
+    shared = np.bincount(point, minlength=len(point_of))[point] >= 2
+    if shared.sum() < 2 * _FEWEST_POINTS:
+        return None
+    return _fit(point[shared], photo_index[shared], colour[shared], ray[shared])
+
+
+def _log_colours(photo: Photo, places: Float[Array, "n 2"]) -> tuple[Float[Array, "n 3"], Array]:
+    """Log of linear RGB at `places` (fractions of width and height); where it is neither dark nor clipped."""
+    pixels = photo.read_file(_SIDE).double().numpy() / 255
+    height, width = pixels.shape[:2]
+    column = (places[:, 0] * width).astype(int).clip(0, width - 1)
+    row = (places[:, 1] * height).astype(int).clip(0, height - 1)
+    value = pixels[row, column]
+    usable = ((value > _DARK) & (value < _BRIGHT)).all(axis=1)
+    return _GAMMA * np.log(value.clip(_DARK, 1)), usable
+
+
+def _fit(
+    point: Int[Array, " m"], photo: Int[Array, " m"], colour: Float[Array, "m 3"], ray: Float[Array, "m 3"]
+) -> Photometry:
+    """Alternate between the points' means and the photos' medians until both converge."""
+    point = np.unique(point, return_inverse=True)[1]
+    count = np.bincount(point).astype(float)
+    order = np.argsort(photo, kind="stable")
+    groups = np.split(order, np.cumsum(np.bincount(photo))[:-1])
+    groups = [group for group in groups if len(group)]
+    offset = np.zeros((len(groups), 3))
+    observed = np.empty(len(photo), dtype=int)
+    for index, group in enumerate(groups):
+        observed[group] = index
+    for _ in range(50):
+        mean = _point_means(point, colour - offset[observed], count)
+        new = np.stack([np.median(colour[group] - mean[point[group]], axis=0) for group in groups])
+        new -= new.mean(axis=0)
+        change = np.abs(new - offset).max()
+        offset = new
+        if change < 1e-4:
+            break
+    residual = colour - offset[observed] - _point_means(point, colour - offset[observed], count)[point]
+    return Photometry(
+        spread=float(np.sqrt((offset**2).mean())),
+        residual=float(1.4826 * np.median(np.abs(residual))),
+        view_dependence=_explained_by_direction(point, residual, ray),
+        photos=len(groups),
+        points=len(count),
+    )
+
+
+def _point_means(point: Int[Array, " m"], values: Float[Array, "m 3"], count: Float[Array, " n"]) -> Array:
+    return np.stack([np.bincount(point, values[:, c]) / count for c in range(3)], axis=1)
+
+
+def _explained_by_direction(
+    point: Int[Array, " m"], residual: Float[Array, "m 3"], ray: Float[Array, "m 3"], fewest: int = 6
+) -> float:
+    """Adjusted R² of a linear function of the direction, over points seen at least `fewest` times."""
+    order = np.argsort(point, kind="stable")
+    explained, total = 0.0, 0.0
+    for group in np.split(order, np.cumsum(np.bincount(point))[:-1]):
+        if len(group) < fewest:
+            continue
+        centred = ray[group] - ray[group].mean(axis=0)
+        grey = residual[group].mean(axis=1)
+        grey = grey - grey.mean()
+        rest = grey - centred @ np.linalg.lstsq(centred, grey, rcond=1e-3)[0]
+        n = len(group)
+        total += float(grey @ grey) / (n - 1)
+        explained += float(grey @ grey) / (n - 1) - float(rest @ rest) / (n - 4)
+    return float(np.clip(explained / total, 0, 1)) if total > 0 else 0.0

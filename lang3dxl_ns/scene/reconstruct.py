@@ -1,0 +1,415 @@
+"""Structure from motion: from a folder of photos to cameras, poses and points, with COLMAP's library.
+
+SIFT features, matching, and COLMAP's incremental or global mapper. Features and matches are stored in a
+database as they are made, so that an interrupted reconstruction continues; the model appears when it is
+complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lang3dxl_ns.common.console import progress, say, some
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+from lang3dxl_ns.scene.pairing import pairs_to_match
+from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.reconstruction_settings import ReconstructionSettings
+from lang3dxl_ns.scene.video import extract_frames, is_video
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_MEMORY_PER_THREAD = 1e9  # bytes, SIFT on a photo of MAX_SIZE pixels
+_FEW_FEATURES = 50
+_SMALLEST_MODEL = 3  # photos; COLMAP's ten may be more than there are
+_CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar, and the most work lost if killed
+
+
+@dataclass(frozen=True)
+class ReconstructionReport:
+    """Result of a reconstruction."""
+
+    photos: int
+    registered: int
+    points: int
+    error: float
+    """Mean reprojection error in pixels."""
+    cameras: int
+    mapper: str
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Photos without a pose, with reasons."""
+    other_models: tuple[int, ...] = ()
+    """Sizes of further models, of photos not connected to the largest one."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Per stage; for a resumed reconstruction, of the last attempt."""
+
+    def lines(self) -> list[str]:
+        """The report in words."""
+        found = [
+            f"{self.registered} of {self.photos} photos have a pose; {self.points} points, mean error "
+            f"{self.error:.2f} px, {self.cameras} camera{'s' * (self.cameras > 1)}, {self.mapper} mapper, "
+            f"{sum(self.seconds.values()):.0f} s"
+        ]
+        if self.other_models:
+            sizes = " and ".join(map(str, self.other_models))
+            found.append(
+                f"the photos fall into {len(self.other_models) + 1} unconnected groups: the "
+                f"largest, of {self.registered}, is used; the others have {sizes}. Add photos that connect "
+                "them, or give each group its own folder"
+            )
+        reasons: dict[str, list[str]] = {}
+        for name, why in self.left_out.items():
+            reasons.setdefault(why, []).append(name)
+        found += [f"left out, {why}: {some(names, 20)}" for why, names in reasons.items()]
+        return found
+
+
+def reconstruct(
+    photos: PhotoFolder, work: Path, model: Path, settings: ReconstructionSettings | None = None
+) -> ReconstructionReport:
+    """Reconstruct photos; writes the largest model to `model`/0, others to `model`/1 …, intermediate results
+    to `work`. Resumes an earlier attempt with the same photos and settings.
+
+    Raises UserError for fewer than two photos, if `model` already exists, and if the photos do not
+    make a scene; the message says what to do.
+    """
+    settings = settings or ReconstructionSettings()
+    if model.exists() and (model_in(model) or any(model.iterdir())):
+        raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
+    good, left_out = readable(photos)
+    good, twins = _without_twins(good)
+    left_out |= twins
+    _check_count(photos, good, left_out)
+    clock: dict[str, float] = {}
+    with _quiet():
+        with _timed(clock, "features"):
+            database = _database(good, work, settings)
+            _extract(database, good, settings)
+        with _timed(clock, "matching"):
+            _match(database, good.names)
+        with _timed(clock, "mapping"):
+            models = _map(database, good, work, settings.mapper)
+    if not models:
+        raise UserError(_why_no_model(database, good.names))
+    best = models[0]
+    report = ReconstructionReport(
+        photos=len(photos.names),
+        registered=best.num_reg_images(),
+        points=best.num_points3D(),
+        error=float(best.compute_mean_reprojection_error()),
+        cameras=len({image.camera_id for image in best.images.values() if image.has_pose}),
+        mapper=settings.mapper,
+        left_out=left_out | _reasons(database, good.names, models),
+        other_models=tuple(other.num_reg_images() for other in models[1:]),
+        seconds={stage: round(seconds, 1) for stage, seconds in clock.items()},
+    )
+    _publish(models, work, model)
+    write_atomically(work / "report.json", json.dumps(asdict(report), indent=2))
+    return report
+
+
+def reconstruct_scene(
+    data: Path, cache_dir: Path | None = None, settings: ReconstructionSettings | None = None
+) -> tuple[Path, Path]:
+    """Reconstruct a folder of photos or a video, and log the result. Returns the scene's folder and model.
+
+    The model goes to sparse/0 in the scene's folder or, if sparse is taken or the folder is read-only,
+    to the cache. Raises UserError like `reconstruct` and `extract_frames`.
+    """
+    data = data.expanduser().absolute()
+    if is_video(data):
+        data = extract_frames(data)
+    photos = find_photos(data)
+    work = (cache_dir or data / "lang3dxl_cache").expanduser().absolute() / "reconstruction"
+    model = data / "sparse"
+    if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
+        model = work / "sparse"
+    say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
+    report = reconstruct(photos, work, model, settings)
+    say(*report.lines())
+    return data, model / "0"
+
+
+def model_in(folder: Path) -> bool:
+    """Whether a folder or one of its sub-folders holds a COLMAP model."""
+    return any(folder.glob("images.*")) or any(folder.glob("*/images.*"))
+
+
+def _check_count(photos: PhotoFolder, good: PhotoFolder, left_out: dict[str, str]) -> None:
+    if len(good.names) >= 2:
+        return
+    if not photos.names:
+        raise UserError(
+            f"{photos.folder} holds neither photos nor a COLMAP model: give the folder with your photos "
+            "(JPEG or PNG), or a video"
+        )
+    if len(photos.names) == 1:
+        raise UserError(
+            f"{photos.folder} holds one photo: a scene needs at least three, taken from different places"
+        )
+    name, why = next(iter(left_out.items()))
+    raise UserError(
+        f"of the {len(photos.names)} photos in {photos.folder} {len(good.names)} are usable, but a scene "
+        f"needs at least three different ones: {name}: {why}"
+    )
+
+
+def _without_twins(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
+    """The photos without duplicate files."""
+    first: dict[str, str] = {}
+    twins = {}
+    for name in photos.names:
+        with (photos.folder / name).open("rb") as file:
+            content = (
+                hashlib.file_digest(file, "blake2b").hexdigest()
+                if hasattr(hashlib, "file_digest")
+                else (hashlib.blake2b(file.read()).hexdigest())
+            )
+        if content in first:
+            twins[name] = f"the same file as {first[content]}"
+        first.setdefault(content, name)
+    return PhotoFolder(photos.folder, tuple(first.values())), twins
+
+
+def _database(photos: PhotoFolder, work: Path, settings: ReconstructionSettings) -> Path:
+    """The database of photos and cameras: an earlier attempt's, if photos and settings are the same."""
+    pycolmap = load_pycolmap()
+    states = [(photos.folder / name).stat() for name in photos.names]
+    stamp = json.dumps(
+        {
+            "photos": [[n, s.st_size, s.st_mtime_ns] for n, s in zip(photos.names, states, strict=True)],
+            "settings": [settings.max_size, settings.features, settings.one_camera],
+        }
+    )
+    database, stamped = work / "database.db", work / "photos.json"
+    if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
+        return database
+    work.mkdir(parents=True, exist_ok=True)
+    for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*")):
+        old.unlink(missing_ok=True)
+    importing = work / "importing.db"
+    pycolmap.Database.open(importing).close()
+    groups = shared_cameras(photos)
+    if settings.one_camera is not None:
+        groups = [list(photos.names)] if settings.one_camera else [[name] for name in photos.names]
+    for group in groups:
+        pycolmap.import_images(importing, photos.folder, pycolmap.CameraMode.SINGLE, group)
+    importing.rename(database)
+    write_atomically(stamped, stamp)
+    return database
+
+
+def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
+    """Extract missing SIFT features."""
+    pycolmap = load_pycolmap()
+    with _opened(database) as db:
+        done = {image.name for image in db.read_all_images() if db.exists_keypoints(image.image_id)}
+    missing = [name for name in photos.names if name not in done]
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = settings.max_size
+    options.num_threads = _threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2)
+    options.sift.max_num_features = settings.features
+    with progress("features of photos", len(missing)) as advance:
+        for chunk in _chunks(missing, _CHUNK_PHOTOS):
+            pycolmap.extract_features(database, photos.folder, chunk, extraction_options=options)
+            for _ in chunk:
+                advance()
+
+
+def _match(database: Path, names: Sequence[str]) -> None:
+    """Find and verify missing matches of pairs."""
+    pycolmap = load_pycolmap()
+    with _opened(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
+        pairs = pairs_to_match(known, lambda name: db.read_descriptors(ids[name]).data)
+        missing = [
+            (a, b)
+            for a, b in pairs
+            if not (db.exists_matches(ids[a], ids[b]) and db.exists_two_view_geometry(ids[a], ids[b]))
+        ]
+    options = pycolmap.FeatureMatchingOptions()
+    options.num_threads = _threads(5e8)
+    listed = database.with_name("pairs.txt")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = listed
+    with progress("pairs of photos", len(missing)) as advance:
+        for chunk in _chunks(missing, _CHUNK_PAIRS):
+            listed.write_text("".join(f"{a} {b}\n" for a, b in chunk))
+            pycolmap.match_image_pairs(database, options, pairing)
+            for _ in chunk:
+                advance()
+
+
+def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pycolmap.Reconstruction]:
+    """Models, largest first. If the usual thresholds find none, lower ones are tried."""
+    pycolmap = load_pycolmap()
+    folder = work / "mapping"
+    for relaxed in (False, True):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        with progress("photos with a pose", len(photos.names)) as advance:
+            if kind == "global":
+                found = pycolmap.global_mapping(database, photos.folder, folder, _global_options())
+            else:
+                found = pycolmap.incremental_mapping(
+                    database,
+                    photos.folder,
+                    folder,
+                    _incremental_options(relaxed),
+                    next_image_callback=advance,
+                )
+        shutil.rmtree(folder, ignore_errors=True)
+        least = min(_SMALLEST_MODEL, len(photos.names))
+        models = [m for m in found.values() if m.num_reg_images() >= least and m.num_points3D()]
+        if models:
+            break
+    return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def _incremental_options(relaxed: bool) -> Any:
+    pycolmap = load_pycolmap()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.min_model_size = _SMALLEST_MODEL
+    options.random_seed = 0
+    options.num_threads = os.cpu_count() or 1
+    if relaxed:
+        options.mapper.init_min_num_inliers = 30
+        options.mapper.init_min_tri_angle = 4.0
+        options.mapper.abs_pose_min_num_inliers = 15
+    return options
+
+
+def _global_options() -> Any:
+    pycolmap = load_pycolmap()
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = 0
+    options.num_threads = os.cpu_count() or 1
+    return options
+
+
+def _publish(models: list[pycolmap.Reconstruction], work: Path, model: Path) -> None:
+    """Move all models into place at once."""
+    complete = model.with_name(f".{model.name}.{os.getpid()}.tmp")
+    shutil.rmtree(complete, ignore_errors=True)
+    try:
+        for index, found in enumerate(models):
+            (complete / str(index)).mkdir(parents=True)
+            found.write_binary(complete / str(index))
+        complete.rename(model)
+    except OSError as error:
+        raise UserError(
+            f"the model can't be written to {model} ({error}): make room, or choose --out"
+        ) from error
+    finally:
+        shutil.rmtree(complete, ignore_errors=True)
+
+
+def _reasons(database: Path, names: Sequence[str], models: list[pycolmap.Reconstruction]) -> dict[str, str]:
+    """Reasons for the photos without a pose in the largest model."""
+    posed = [{image.name for image in model.images.values() if image.has_pose} for model in models]
+    with _opened(database) as db:
+        features = {image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()}
+    partners = _partners(database)
+    reasons = {}
+    for name in names:
+        if name in posed[0]:
+            continue
+        elsewhere = next((len(group) for group in posed[1:] if name in group), None)
+        if elsewhere:
+            reasons[name] = f"in a separate model of {elsewhere} photos"
+        elif features.get(name, 0) < _FEW_FEATURES:
+            reasons[name] = "hardly any detail to match (blurred, dark or blank), or not readable"
+        elif not partners.get(name):
+            reasons[name] = "matches no other photo"
+        else:
+            reasons[name] = "matches others too weakly, or contradicts them"
+    return reasons
+
+
+def _partners(database: Path) -> dict[str, int]:
+    """Number of photos with which each has verified matches."""
+    pycolmap = load_pycolmap()
+    partners: dict[str, int] = {}
+    with _opened(database) as db:
+        names = {image.image_id: image.name for image in db.read_all_images()}
+        pairs, inliers = db.read_two_view_geometry_num_inliers()
+    for pair, count in zip(pairs, inliers, strict=True):
+        if count >= 15:
+            for image in pycolmap.pair_id_to_image_pair(pair):
+                partners[names[image]] = partners.get(names[image], 0) + 1
+    return partners
+
+
+def _why_no_model(database: Path, names: Sequence[str]) -> str:
+    """Explanation why no two photos could start a model."""
+    partners = _partners(database)
+    with _opened(database) as db:
+        features = [db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()]
+    if sum(count >= _FEW_FEATURES for count in features) < 2:
+        return (
+            f"the {len(names)} photos have hardly any detail to match (median {np.median(features):.0f} "
+            "features): take sharp, well-lit ones, or larger copies"
+        )
+    if not partners:
+        return (
+            f"no two of the {len(names)} photos show the same thing: take photos that overlap by half, a "
+            "step apart from each other"
+        )
+    return (
+        f"{len(partners)} of the {len(names)} photos match others, but no two of them start a model: they "
+        "seem to be taken from one place, or show a flat picture. Take photos from places a step apart"
+    )
+
+
+def _threads(memory_each: float) -> int:
+    """Number of cores, limited by half of the machine's memory."""
+    return int(max(1, min(os.cpu_count() or 1, machine_memory() / 2 // memory_each)))
+
+
+def _chunks(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
+    for start in range(0, len(items), size):
+        yield list(items[start : start + size])
+
+
+@contextmanager
+def _opened(database: Path) -> Iterator[Any]:
+    pycolmap = load_pycolmap()
+    db = pycolmap.Database.open(database)
+    try:
+        yield db
+    finally:
+        db.close()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Suppress COLMAP's log of thousands of lines; the report has what matters."""
+    pycolmap = load_pycolmap()
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+@contextmanager
+def _timed(clock: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.monotonic()
+    yield
+    clock[stage] = time.monotonic() - start

@@ -1,0 +1,158 @@
+"""Hostile and damaged config.yml files and checkpoints, in our commands and in nerfstudio's."""
+
+import contextlib
+import shutil
+
+import pytest
+import torch
+import yaml
+from conftest import make_trainer
+from nerfstudio.configs.method_configs import all_methods
+from scenes import write_scene
+
+from lang3dxl_ns.cli import main
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.plugin.load_scene import load_scene
+from lang3dxl_ns.plugin.open_run import open_run
+from lang3dxl_ns.plugin.saved_config import TRUST_VARIABLE, check_command_line, read_config
+
+TRAPS = [
+    "!!python/object/apply:os.system ['touch {trap}']",
+    '!!python/object/apply:builtins.eval [\'__import__("os").system("touch {trap}")\']',
+    "!!python/object/apply:nerfstudio.utils.scripts.run_command ['touch {trap}']",
+    "!!python/object/apply:nerfstudio.engine.trainer.Trainer ['touch {trap}']",
+    "!!python/object/new:subprocess.Popen [['touch', '{trap}']]",
+    "!!python/object/new:lang3dxl_ns.plugin.model.Lang3DXLModel []",
+    "!!python/name:os.system ''",
+    "!!python/name:torch.hub.load ''",
+    "!!python/module:antigravity ''",
+    "!!python/object:collections.OrderedDict {{}}",
+]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, tiny_clip, tiny_dense):
+    root = tmp_path_factory.mktemp("run")
+    data = write_scene(root / "scene", photos=4, points=60)
+    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=2)
+    trainer.setup()
+    trainer.train()
+    return trainer.base_dir
+
+
+@pytest.fixture
+def copy(run, tmp_path):
+    """A run folder to damage."""
+    return shutil.copytree(run, tmp_path / "run")
+
+
+def trapped(folder, text):
+    """A config.yml with a trap among its settings, and the file that appears if the trap runs."""
+    lines = yaml.dump(lang3dxl.config).splitlines()
+    lines.insert(1, f"vis: {text.format(trap=folder / 'trap')}")
+    (folder / "config.yml").write_text("\n".join(lines))
+    return folder / "config.yml", folder / "trap"
+
+
+@pytest.mark.parametrize("text", TRAPS)
+@pytest.mark.parametrize("command", ["query --text a", "export --text a", "evaluate run", "view"])
+def test_our_commands_run_nothing_in_a_config(tmp_path, text, command):
+    path, trap = trapped(tmp_path, text)
+    out = [] if command == "view" else ["--out", str(tmp_path / "out.ply")]
+    with pytest.raises(SystemExit, match=r"Error: .*config\.yml can't be read"):
+        main([*command.split(), "--load-config", str(path), *out])
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize("text", TRAPS)
+@pytest.mark.parametrize("option", ["--load-config {}", "--load-config={}", "--load_config {}"])
+def test_nerfstudios_commands_end_before_they_read_such_a_config(tmp_path, text, option):
+    path, trap = trapped(tmp_path, text)
+    with pytest.raises(SystemExit, match=r"config\.yml asks to (call|load|make)"):
+        check_command_line(["ns-eval", *option.format(path).split()])
+    assert not trap.exists()
+
+
+def test_a_config_whose_writer_is_trusted_passes(tmp_path, monkeypatch):
+    path, _ = trapped(tmp_path, TRAPS[0])
+    monkeypatch.setenv(TRUST_VARIABLE, "1")
+    check_command_line(["--load-config", str(path)])
+
+
+def test_the_trap_would_have_worked(tmp_path):
+    path, trap = trapped(tmp_path, TRAPS[0])
+    yaml.load(path.read_text(), Loader=yaml.Loader)
+    assert trap.exists()
+
+
+@pytest.mark.parametrize("method", sorted(all_methods))
+def test_every_method_of_nerfstudio_passes(tmp_path, method):
+    (tmp_path / "config.yml").write_text(yaml.dump(all_methods[method]))
+    check_command_line(["--load-config", str(tmp_path / "config.yml"), "--load-config", "absent.yml"])
+    check_command_line(["--load-config"])
+
+
+def test_a_run_opens_without_nerfstudios_reader_wherever_it_lies(copy):
+    config, pipeline, step = open_run(copy / "config.yml")
+    assert step == 1 and config.get_base_dir() == copy
+    assert pipeline.datamanager.get_datapath() == copy
+    assert not pipeline.training
+
+
+def cuts(text: str) -> list[int]:
+    """Places to truncate a config: after some lines, and inside others."""
+    ends = [i for i, c in enumerate(text) if c == "\n"]
+    return [*ends[::23], *(end + 9 for end in ends[3::41])]
+
+
+def test_a_config_that_is_cut_short_is_named_wherever_it_is_cut(copy):
+    path = copy / "config.yml"
+    text = path.read_text()
+    whole = read_config(path)
+    for cut in cuts(text):
+        path.write_text(text[:cut])
+        with contextlib.suppress(UserError):  # or what is missing took its default
+            config = read_config(path)
+            assert all(hasattr(config.pipeline.model, name) for name in vars(whole.pipeline.model))
+            assert all(hasattr(config, name) for name in vars(whole))
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        {"step": 1, "pipeline": {}},
+        {"step": 1, "pipeline": {"_model.field.weight": torch.ones(3)}},
+        {"step": 1},
+        {"pipeline": {}, "step": "one"},
+        {"step": 1, "pipeline": 3},
+        [1, 2],
+        torch.ones(3),
+    ],
+)
+def test_checkpoints_of_other_methods_and_shapes_are_named(copy, state):
+    path = max((copy / "nerfstudio_models").glob("*.ckpt"))
+    torch.save(state, path)
+    for opening in (load_scene, open_run):
+        with pytest.raises(UserError, match=r"checkpoint"):
+            opening(copy / "config.yml")
+
+
+@pytest.mark.parametrize("name", ["means", "features_dc", "codes"])
+def test_a_checkpoint_with_a_parameter_of_another_shape_is_named(copy, name):
+    path = max((copy / "nerfstudio_models").glob("*.ckpt"))
+    state = torch.load(path, weights_only=True)
+    (key,) = [k for k in state["pipeline"] if k.endswith(f"gauss_params.{name}")]
+    for value in (torch.ones(3), torch.ones(5, 7), torch.ones(0)):
+        state["pipeline"][key] = value
+        torch.save(state, path)
+        for opening in (load_scene, open_run):
+            with pytest.raises(UserError, match="checkpoint"):
+                opening(copy / "config.yml")
+
+
+def test_the_config_of_another_method_is_named(copy):
+    (copy / "config.yml").write_text(yaml.dump(all_methods["splatfacto"]))
+    for opening in (load_scene, open_run):
+        with pytest.raises(UserError, match="another method"):
+            opening(copy / "config.yml")

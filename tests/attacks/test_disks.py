@@ -1,0 +1,160 @@
+"""Full and read-only disks, names that are files or too long, and servers that never answer."""
+
+import errno
+import os
+import shutil
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import make_trainer
+from scenes import write_scene
+
+from lang3dxl_ns.cli import main
+from lang3dxl_ns.common import files
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import slugs
+from lang3dxl_ns.plugin.load_scene import load_scene
+from lang3dxl_ns.preparation import workers
+from lang3dxl_ns.preparation.prepare import _gigabytes
+from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.workers import Workers
+
+
+@pytest.fixture(scope="module")
+def trainer(tmp_path_factory, tiny_clip, tiny_dense):
+    root = tmp_path_factory.mktemp("run")
+    data = write_scene(root / "scene", photos=4, points=60)
+    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=2)
+    trainer.setup()
+    trainer.train()
+    return trainer
+
+
+@pytest.fixture
+def run(trainer, tmp_path):
+    return shutil.copytree(trainer.base_dir, tmp_path / "run")
+
+
+def refuse(number):
+    def fail(*_args, **_options):
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+# ── checkpoints ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def full_after(count, error):
+    """torch.save to a disk with room for so many bytes."""
+
+    def save(_state, path, *_):
+        Path(path).write_bytes(bytes(count))
+        raise error
+
+    return save
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left"), RuntimeError("PytorchStreamWriter failed writing file")]
+)
+def test_a_full_disk_leaves_no_half_checkpoint_and_training_goes_on(trainer, monkeypatch, error, capsys):
+    before = sorted(trainer.checkpoint_dir.iterdir())
+    monkeypatch.setattr(torch, "save", full_after(100, error))
+    monkeypatch.setattr(trainer, "_is_ending", False)
+    trainer.save_checkpoint(500)
+    assert sorted(trainer.checkpoint_dir.iterdir()) == before
+    assert not list(trainer.base_dir.rglob("*.partial"))
+    assert "Training continues" in " ".join(capsys.readouterr().out.split())
+    monkeypatch.setattr(trainer, "_is_ending", True)
+    with pytest.raises(UserError, match=r"step-000000500\.ckpt can't be written .* GB are free"):
+        trainer.save_checkpoint(500)
+    assert not list(trainer.base_dir.rglob("*.partial"))
+
+
+# ── asking and exporting ────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC, errno.EACCES])
+def test_a_run_that_can_not_be_written_to_answers(run, monkeypatch, number):
+    monkeypatch.setattr(files.os, "replace", refuse(number))
+    scene = load_scene(run / "config.yml")
+    assert scene.query("dome", "photo_000")[0].relevancy.isfinite().all()
+    assert len(scene.find("dome")) == 1
+    assert not list(run.glob("*.tmp"))
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC])
+@pytest.mark.parametrize("command", ["query", "export"])
+def test_a_full_or_read_only_disk_is_one_line_and_leaves_no_half_file(
+    run, tmp_path, monkeypatch, number, command
+):
+    out = tmp_path / "out" / ("found" if command == "query" else "found.ply")
+    monkeypatch.setattr(files.os, "fsync", refuse(number))
+    options = ["--threshold", "0"] + (["--image", "photo_000"] if command == "query" else [])
+    with pytest.raises(SystemExit, match=r"Error: .*found.*" + os.strerror(number)):
+        main([command, "--load-config", str(run / "config.yml"), "--text", "a", "--out", str(out), *options])
+    assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("command", ["query", "export"])
+@pytest.mark.parametrize("out", ["file/below", "file/far/below", "n" * 300, "/proc/none/found"])
+def test_places_that_can_not_be_written_to_are_told_before_the_work(tmp_path, command, out):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(SystemExit, match=r"Error: .*(not a file|shorter|does not exist|another place)"):
+        main([command, "--load-config", "none.yml", "--text", "a", "--out", str(tmp_path / out / "x")])
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_file_is_no_folder_and_a_folder_no_file(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(SystemExit, match=r"Error: .*file: File exists; name a folder"):
+        main(["query", "--load-config", "none.yml", "--text", "a", "--out", str(tmp_path / "file")])
+    with pytest.raises(SystemExit, match=r"Error: --out .* is a folder: name"):
+        main(["export", "--load-config", "none.yml", "--text", "a", "--out", str(tmp_path)])
+
+
+@pytest.mark.parametrize("place", ["/dev/null", "/dev/null/below", "/proc/none", "n" * 300])
+def test_a_store_that_can_be_none_is_one_line(place):
+    with pytest.raises(UserError, match="--cache-dir DIR"):
+        FeatureStore(Path(place)).make_folder()
+
+
+def test_folders_of_prompts_never_collide():
+    for texts in (["a", "a 3", "A!"], ["a", "a", "a-2", "a 3"], ["!", "text-1", "?"], ["x"] * 5):
+        assert len(set(slugs(texts))) == len(texts)
+    assert slugs(["rose window", "dome"]) == ["rose-window", "dome"]
+
+
+def test_sizes_are_told_in_a_unit_that_shows_them():
+    assert [_gigabytes(x) for x in (1_500, 2_500_000, 3 * 10**9)] == ["1.50 kB", "2.50 MB", "3.00 GB"]
+
+
+# ── a cluster that never answers ────────────────────────────────────────────────────────────────────────
+
+
+def test_a_job_that_never_ends_is_left_after_its_time():
+    forever = threading.Event()
+    with pytest.raises(TimeoutError, match="no answer within 0 s"):
+        workers._within(0.01, forever.wait)
+    forever.set()
+    with pytest.raises(KeyError):
+        workers._within(10, lambda: {}["x"])
+    workers._within(10, lambda: None)
+
+
+def test_a_cluster_that_never_answers_is_one_line(monkeypatch, capsys):
+    """A port that takes connections and says nothing."""
+    ray = pytest.importorskip("ray")
+    asked = []
+    monkeypatch.setattr(workers, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(ray, "init", lambda **options: (asked.append(options), threading.Event().wait(30)))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(UserError, match=f"no Ray cluster answers at {address}"):
+            list(Workers(1, "ray", address).run(None, [1], "cpu"))
+    assert [options["address"] for options in asked] == [address]
+    assert f"connecting to the Ray cluster at {address}" in " ".join(capsys.readouterr().out.split())

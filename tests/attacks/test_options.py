@@ -1,0 +1,108 @@
+"""Options that make no sense end in one line before any work."""
+
+import math
+from copy import deepcopy
+
+import pytest
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.query.scene import QueryConfig
+from lang3dxl_ns.query.text import TextConfig
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"crop_batch": 0},
+        {"crop_batch": -1},
+        {"dense_tokens": -4},
+        {"dense_tokens": 0},
+        {"scales": 0},
+        {"scales": 1_000_000},
+        {"workers": 0},
+        {"scale_range": (-0.1, 0.5)},
+        {"scale_range": (0.5, 0.1)},
+        {"scale_range": (0.0, 0.5)},
+        {"scale_range": (math.nan, 0.5)},
+        {"scale_range": (0.1, math.inf)},
+        {"scale_range": (0.1, 24.0), "scale_mode": "relative"},
+        {"scale_range": (1.0, 2.0), "scale_preset": "holyscenes/milano"},
+    ],
+)
+def test_preparations(options):
+    with pytest.raises(UserError, match=r"--pipeline.datamanager"):
+        PreparationConfig(**options).check()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"camera_res_scale_factor": 0.0},
+        {"camera_res_scale_factor": -1.0},
+        {"camera_res_scale_factor": math.nan},
+        {"cache_gb": -1.0},
+        {"cache_gb": math.nan},
+        {"read_ahead": -3},
+        {"crop_batch": 0},
+    ],
+)
+def test_trainings(options, tmp_path):
+    config = deepcopy(lang3dxl.config)
+    config.output_dir = tmp_path / "outputs"
+    vars(config.pipeline.datamanager).update(options)
+    with pytest.raises(UserError, match=r"--pipeline.datamanager"):
+        config.set_timestamp()
+    assert not config.output_dir.exists()
+
+
+@pytest.mark.parametrize(("owner", "name", "value"), [("machine", "seed", -1), ("", "max_num_iterations", 0)])
+def test_runs(owner, name, value, tmp_path):
+    config = deepcopy(lang3dxl.config)
+    setattr(getattr(config, owner) if owner else config, name, value)
+    with pytest.raises(UserError, match=name.replace("_", "-")):
+        config.set_timestamp()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"threshold": math.nan},
+        {"threshold": -0.1},
+        {"threshold": 1.5},
+        {"temperature": 0.0},
+        {"temperature": math.nan},
+        {"min_alpha": math.nan},
+        {"views": 0},
+        {"view_side": 0},
+    ],
+)
+def test_questions(options):
+    (name,) = options
+    with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is"):
+        QueryConfig(**options)
+
+
+def test_a_prompt_needs_something_to_compete_with():
+    for negatives in ((), ("",), (" ", "")):
+        with pytest.raises(UserError, match="--negatives is empty"):
+            TextConfig(negatives=negatives)
+
+
+def test_what_makes_sense_passes():
+    PreparationConfig(scale_range=(0.05, 0.5), scale_mode="relative", scales=1, crop_batch=1).check()
+    QueryConfig(threshold=0.0)
+    QueryConfig(threshold=1.0)
+
+
+def test_two_runs_that_start_in_one_second_have_a_folder_each(tmp_path, scene):
+    folders = []
+    for _ in range(3):
+        config = deepcopy(lang3dxl.config)
+        config.output_dir, config.data, config.pipeline.datamanager.clip = tmp_path, scene, "none"
+        config.experiment_name = "scene"
+        config.pipeline.datamanager.clip = config.pipeline.datamanager.dense = "none"
+        config.set_timestamp()
+        folders.append(config.get_base_dir())
+    assert len(set(folders)) == 3

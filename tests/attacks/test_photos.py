@@ -1,0 +1,265 @@
+"""Pictures and COLMAP models of strangers."""
+
+import io
+import shutil
+import struct
+
+import numpy as np
+import pycolmap
+import pytest
+from conftest import make_trainer
+from PIL import Image
+from scenes import write_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import FORMATS, NoPictureError, open_picture
+from lang3dxl_ns.evaluation.annotations import read_grey
+from lang3dxl_ns.plugin import photo_cache
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.preparation.foreground import with_foreground
+from lang3dxl_ns.preparation.regions import _read_labels
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.scene.colmap import read_reconstruction
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n%%EndComments\n(trap) run\n%%EOF\n"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_scene(tmp_path / "scene", photos=4, points=40)
+
+
+def used(folder):
+    parser = PhotoCollectionDataParserConfig(data=folder).setup()
+    parser.get_dataparser_outputs(split="train")
+    return {photo.name: photo for photo in parser.photos.values()}
+
+
+def save_as(path, form):
+    """A photo in another format under its old name; to memory, since Pillow would take the suffix for it."""
+    content = io.BytesIO()
+    Image.open(path).convert("F" if form == "SPIDER" else "RGB").save(content, form)
+    path.write_bytes(content.getvalue())
+
+
+@pytest.mark.parametrize("form", ["EPS", "DDS", "SPIDER", "TGA", "PPM", "ICO", "PCX"])
+def test_a_photo_in_another_format_than_those_named_is_left_out(folder, form, capsys):
+    path = folder / "images" / "photo_001.jpg"
+    if form == "EPS":
+        path.write_bytes(EPS)
+    else:
+        save_as(path, form)
+    assert set(used(folder)) == {"photo_000.jpg", "photo_002.jpg", "photo_003.jpg"}
+    assert "not a picture in one of the formats JPEG" in " ".join(capsys.readouterr().out.split())
+
+
+def test_ghostscript_is_never_asked(tmp_path, monkeypatch):
+    (tmp_path / "a.jpg").write_bytes(EPS)
+    monkeypatch.setattr("PIL.EpsImagePlugin.EpsImageFile.load", lambda *_: pytest.fail("EPS was opened"))
+    for read in (lambda path: read_grey(path), lambda path: _read_labels(path, "a")):
+        with pytest.raises(UserError, match="not a picture in one of the formats"):
+            read(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_every_format_that_is_named_is_read(folder, form):
+    path = folder / "images" / "photo_001.jpg"
+    save_as(path, form)
+    photo = used(folder)["photo_001.jpg"]
+    assert photo.read().shape == (72, 96, 3)
+
+
+@pytest.mark.parametrize("form", ["AVIF", "DDS", "SPIDER", "WEBP", "TIFF", "GIF"])
+def test_a_damaged_file_of_any_format_is_left_out_and_does_not_end_the_run(folder, form, capsys):
+    path = folder / "images" / "photo_001.jpg"
+    save_as(path, form)
+    content = path.read_bytes()
+    for cut in (20, len(content) // 3, len(content) - 30):
+        path.write_bytes(content[:cut])
+        photo = used(folder).get("photo_001.jpg")
+        if photo is not None:  # its head is whole
+            with pytest.raises(UserError, match=r"photo_001\.jpg"):
+                photo.read()
+    capsys.readouterr()
+
+
+def test_what_decoders_raise_is_one_error(tmp_path, monkeypatch):
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    for error in (RuntimeError, KeyError, struct.error, ZeroDivisionError, MemoryError, OverflowError):
+
+        def fail(*_, kind=error):
+            raise kind("damaged")
+
+        monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.load", fail)
+        with pytest.raises(NoPictureError), open_picture(tmp_path / "a.png") as image:
+            image.convert("RGB")
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (5, 0), (0, 0)])
+def test_an_empty_label_map_is_named(tmp_path, shape):
+    np.save(tmp_path / "a.npy", np.zeros(shape, np.int64))
+    with pytest.raises(UserError, match=r"a\.npy holds .* not one whole"):
+        _read_labels(tmp_path / "a.npy", "a.jpg")
+
+
+def test_a_symlink_loop_among_photos_is_passed_over(folder, capsys):
+    (folder / "images" / "loop").symlink_to(folder / "images")
+    (folder / "images" / "self.jpg").symlink_to(folder / "images" / "self.jpg")
+    photo = folder / "images" / "photo_001.jpg"
+    photo.unlink()
+    photo.symlink_to(photo)
+    assert set(used(folder)) == {"photo_000.jpg", "photo_002.jpg", "photo_003.jpg"}
+    assert "photo_001.jpg" in capsys.readouterr().out
+
+
+# ── models ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def change_points(folder, xyz):
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    for i in list(model.points3D):
+        if xyz is None:
+            model.delete_point3D(i)
+        else:
+            model.points3D[i].xyz = np.array(xyz)
+    model.write_binary(folder / "sparse" / "0")
+
+
+@pytest.mark.parametrize("xyz", [None, [np.nan] * 3, [np.inf, 0, 0], [1e300] * 3])
+def test_training_without_usable_points_says_so(folder, xyz, tiny_clip, tiny_dense, tmp_path):
+    change_points(folder, xyz)
+    trainer = make_trainer(folder, tiny_clip, tiny_dense, tmp_path / "out", 2, semantics=False)
+    with pytest.raises(UserError, match=r"has 0 3D points.*--pipeline\.model\.random-init True"):
+        trainer.setup()
+
+
+def test_training_without_points_can_start_at_random(folder, tiny_clip, tiny_dense, tmp_path):
+    change_points(folder, None)
+    trainer = make_trainer(
+        folder, tiny_clip, tiny_dense, tmp_path / "out", 2, pipeline__model__random_init=True
+    )
+    trainer.setup()
+    trainer.train()
+    assert trainer.pipeline.model.means.isfinite().all()
+
+
+def test_one_point_at_the_end_of_the_world_is_left_out(folder, capsys):
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    first = next(iter(model.points3D.values()))
+    first.xyz = np.array([1e300, 0, 0])
+    model.write_binary(folder / "sparse" / "0")
+    assert np.abs(read_reconstruction(folder / "sparse" / "0").points).max() < 10
+    assert "1 points of" in capsys.readouterr().out
+
+
+def test_photos_whose_names_are_not_utf8_are_left_out_and_named(folder, capsys):
+    path = folder / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"photo_001.jpg", b"ph\xf6to_01.jpg"))
+    assert set(used(folder)) == {"photo_000.jpg", "photo_002.jpg", "photo_003.jpg"}
+    assert "its name is not UTF-8" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_camera_of_billions_of_pixels_is_refused(folder):
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    for camera in model.cameras.values():
+        camera.width, camera.height = 70_000, 40_000
+    model.write_binary(folder / "sparse" / "0")
+    with pytest.raises(UserError, match=r"photo_000\.jpg has an impossible camera"):
+        read_reconstruction(folder / "sparse" / "0")
+
+
+# ── photos that vanish while training runs ──────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def training(tmp_path, tiny_clip, tiny_dense, monkeypatch):
+    """A run of colours that reads every photo anew, and its photos' folder; nobody waits."""
+    monkeypatch.setattr(photo_cache, "PATIENCE_S", (0.0, 0.0, 0.0))
+    data = write_scene(tmp_path / "scene", photos=9, points=60)
+    options = {"pipeline__datamanager__cache_gb": 0.0, "pipeline__datamanager__read_ahead": 0}
+    trainer = make_trainer(data, tiny_clip, tiny_dense, tmp_path / "out", 40, semantics=False, **options)
+    trainer.setup()
+    return trainer, data / "images"
+
+
+def during(trainer, step, what):
+    """Do something before an iteration."""
+    iterate = trainer.train_iteration
+
+    def train_iteration(now):
+        if now == step:
+            what()
+        return iterate(now)
+
+    trainer.train_iteration = train_iteration
+
+
+def test_photos_that_vanish_end_the_training_with_a_checkpoint(training, tmp_path):
+    trainer, photos = training
+    during(trainer, 11, lambda: photos.rename(tmp_path / "gone"))
+    with pytest.raises(UserError, match=r"2 of 7 training photos.*Stopped after 11 iterations.*--load-dir"):
+        trainer.train()
+    assert [path.name for path in trainer.checkpoint_dir.iterdir()][-1:] == ["step-000000010.ckpt"]
+
+
+def test_photos_that_come_back_are_waited_for(training, tmp_path, monkeypatch, capsys):
+    trainer, photos = training
+    waits = []
+
+    def sleep(seconds):
+        waits.append(seconds)
+        if (tmp_path / "gone").exists():
+            (tmp_path / "gone").rename(photos)
+
+    during(trainer, 11, lambda: photos.rename(tmp_path / "gone"))
+    monkeypatch.setattr(photo_cache.time, "sleep", sleep)
+    trainer.train()
+    assert waits and "retrying" in " ".join(capsys.readouterr().out.split())
+    assert not trainer.pipeline.datamanager._left_out
+
+
+def test_a_photo_that_is_damaged_is_not_waited_for(training, monkeypatch):
+    trainer, photos = training
+    shutil.copy(__file__, photos / "photo_001.jpg")
+    monkeypatch.setattr(photo_cache.time, "sleep", lambda _: pytest.fail("waited"))
+    trainer.train()
+    assert len(trainer.pipeline.datamanager._left_out) == 1
+
+
+# ── masks ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def masks(folder, colours):
+    """The photos with masks of these colours; None: a damaged file."""
+    (folder / "masks").mkdir()
+    for i, colour in enumerate(colours):
+        path = folder / "masks" / f"photo_{i:03d}.png"
+        Image.new("L", (8, 6), colour or 0).save(path)
+        if colour is None:
+            path.write_bytes(path.read_bytes()[:40])
+    return list(used(folder).values())
+
+
+def masked(photos, folder, **options):
+    lines = []
+    config = PreparationConfig(**options)
+    found = with_foreground(photos, config, folder, folder / "cache", "cpu", lines.append)
+    return {photo.name for photo in found if photo.mask_path is not None}, " ".join(lines)
+
+
+def test_damaged_masks_are_named_all_at_once_and_left_out_where_asked(folder):
+    photos = masks(folder, [None, 255, None, 255])
+    with pytest.raises(UserError, match=r"2 masks can't be read: .*photo_000\.png .*photo_002\.png .*True"):
+        masked(photos, folder)
+    names, said = masked(photos, folder, skip_damaged_masks=True)
+    assert names == {"photo_001.jpg", "photo_003.jpg"}
+    assert "2 masks can't be read" in said and "photo_002.jpg" in said
+
+
+def test_masks_that_are_all_black_are_said_to_be(folder):
+    photos = masks(folder, [0, 100, 0, 0])
+    with pytest.raises(UserError, match="all 4 masks are black"):
+        masked(photos, folder)
+    Image.new("L", (8, 6), 255).save(folder / "masks" / "photo_002.png")
+    _, said = masked(photos, folder)
+    assert "the masks of 3 photos are all black" in said

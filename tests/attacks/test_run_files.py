@@ -1,0 +1,125 @@
+"""Scene files and camera paths with wrong contents: one line that names the file."""
+
+import json
+import math
+
+import pytest
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
+from lang3dxl_ns.scene.camera import Lens
+
+POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]]
+
+
+def scene_file(folder, change):
+    photos = [
+        ScenePhoto(f"photo_{i}.jpg", "train", POSE, Lens(40, 30, 50.0, 51.0, 20.0, 15.0)) for i in range(2)
+    ]
+    path = folder / "scene.json"
+    SceneFile(photos, "clip", "identity", 1.0, POSE, "data").write(path)
+    content = json.loads(path.read_text())
+    SceneFile.read(path)
+    change(content)
+    path.write_text(json.dumps(content))
+    return path
+
+
+def set_of_photo(name, value):
+    return lambda content: content["photos"][1].update({name: value})
+
+
+def set_of_lens(name, value):
+    return lambda content: content["photos"][1]["lens"].update({name: value})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.update(photos=[]),
+        lambda content: content.update(photos={}),
+        lambda content: content.update(photos=[1]),
+        lambda content: content.update(photos=content["photos"][:1] * 2),
+        lambda content: content.update(scale="1"),
+        lambda content: content.update(scale=0),
+        lambda content: content.update(scale=math.nan),
+        lambda content: content.update(transform=POSE[:2]),
+        lambda content: content.update(transform=[["a"] * 4] * 3),
+        lambda content: content.update(clip=3),
+        lambda content: content.update(data=None),
+        set_of_photo("name", 3),
+        set_of_photo("name", ""),
+        set_of_photo("split", "none"),
+        set_of_photo("mask", 5),
+        set_of_photo("camera_to_world", POSE[0]),
+        set_of_photo("camera_to_world", [[math.nan] * 4] * 3),
+        set_of_photo("camera_to_world", [[True] * 4] * 3),
+        set_of_lens("width", 0),
+        set_of_lens("width", -40),
+        set_of_lens("width", 40.5),
+        set_of_lens("width", "40"),
+        set_of_lens("height", 2_000_000),
+        set_of_lens("fx", 0),
+        set_of_lens("fx", math.inf),
+        set_of_lens("cx", None),
+        set_of_lens("distortion", [1.0]),
+        set_of_lens("distortion", 3),
+        set_of_lens("distortion", ["a"] * 4),
+        set_of_lens("fisheye", 2),
+    ],
+)
+def test_a_scene_file_with_something_of_another_kind_is_named(tmp_path, change):
+    path = scene_file(tmp_path, change)
+    with pytest.raises(UserError, match=r"scene\.json can't be read"):
+        SceneFile.read(path)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "", "null", "3", "\x00", '{"version": 2}'])
+def test_a_scene_file_that_is_none_is_named(tmp_path, text):
+    (tmp_path / "scene.json").write_text(text)
+    with pytest.raises(UserError, match=r"scene\.json can't be read"):
+        SceneFile.read(tmp_path / "scene.json")
+
+
+MATRIX = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 2, 0, 0, 0, 1]
+
+
+def camera_path(folder, **changes):
+    frame = {"camera_to_world": MATRIX, "fov": 60.0, "aspect": 1.3}
+    content = {"render_width": 40, "render_height": 30, "camera_path": [frame]}
+    for name, value in changes.items():
+        (frame if name in frame else content)[name] = value
+    text = json.dumps(content)
+    (folder / "path.json").write_text(text.replace('"1e309"', "1e309"))
+    return folder / "path.json"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"fov": 0},
+        {"fov": -60},
+        {"fov": 180},
+        {"fov": 1e9},
+        {"fov": math.nan},
+        {"fov": "60"},
+        {"render_width": 0},
+        {"render_width": -40},
+        {"render_width": 2_000_000},
+        {"render_width": "1e309"},
+        {"render_width": None},
+        {"render_height": 0},
+        {"render_width": 60_000, "render_height": 60_000},
+        {"camera_path": []},
+        {"camera_path": 3},
+        {"camera_path": [3]},
+        {"camera_to_world": MATRIX[:12]},
+        {"camera_to_world": [0.0] * 16},
+        {"camera_to_world": [math.nan] * 16},
+        {"camera_to_world": [1e300] * 16},
+    ],
+)
+def test_a_camera_path_that_nothing_can_be_rendered_from_is_named(tmp_path, changes):
+    assert len(read_camera_path(camera_path(tmp_path))) == 1
+    with pytest.raises(UserError, match=r"path\.json is not a camera path"):
+        read_camera_path(camera_path(tmp_path, **changes))

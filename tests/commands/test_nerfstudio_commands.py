@@ -1,0 +1,180 @@
+"""nerfstudio's commands on our method, as in the README."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from processes import output as command
+from processes import run as attempt
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("commands")
+
+
+@pytest.fixture(scope="module")
+def run(scene, tiny_clip, tiny_dense, folder) -> Path:
+    """A run folder made by ns-train."""
+    command(
+        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 30, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--output-dir", folder / "outputs", "--timestamp", "first"),
+        cwd=folder,
+        shell=True,
+    )
+    return folder / "outputs" / scene.name / "lang3dxl" / "first"
+
+
+def test_prepare_alone(scene, tiny_clip, tiny_dense, folder):
+    words = ("lang3dxl", "prepare", "--data", scene, "--clip", tiny_clip, "--dense", tiny_dense)
+    words += ("--cache-dir", folder / "cache")
+    assert "preparing 12 photos" in command(*words, cwd=folder)
+    assert "preparing" not in command(*words, cwd=folder)
+
+
+def test_eval(run, folder):
+    words = ("ns-eval", "--load-config", run / "config.yml", "--output-path", folder / "eval.json")
+    command(*words, cwd=folder, shell=True)
+    results = json.loads((folder / "eval.json").read_text())["results"]
+    assert {"psnr", "ssim", "clip_l1", "clip_psnr", "clip_cosine", "psnr_std"} <= set(results)
+
+
+def test_resume(run, scene, tiny_clip, tiny_dense, folder):
+    output = command(
+        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 40, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *(
+            "--output-dir",
+            folder / "outputs",
+            "--timestamp",
+            "second",
+            "--load-dir",
+            run / "nerfstudio_models",
+        ),
+        cwd=folder,
+    )
+    assert "Resuming at iteration 30 of 40" in output
+
+
+@pytest.fixture
+def camera_path(folder) -> Path:
+    """As the viewer saves it."""
+    pose = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 1]
+    frames = [{"camera_to_world": pose, "fov": 60.0, "aspect": 1.5}] * 2
+    path = {"camera_type": "perspective", "render_width": 48, "render_height": 32, "seconds": 0.1}
+    (folder / "path.json").write_text(json.dumps({**path, "camera_path": frames, "crop": None}))
+    return folder / "path.json"
+
+
+@pytest.mark.parametrize("views", ["interpolate", "dataset", "camera-path"])
+def test_render_shows_what_is_asked_for(run, folder, camera_path, monkeypatch, views):
+    monkeypatch.setenv("LANG3DXL_QUERY", "rose window; dome")
+    target = folder / f"rendered-{views}"
+    words = {
+        "interpolate": ("--interpolation-steps", 2, "--output-format", "images"),
+        "dataset": ("--split", "test"),
+        "camera-path": ("--camera-path-filename", camera_path, "--output-format", "images"),
+    }[views]
+    command(
+        *("ns-render", views, "--load-config", run / "config.yml", "--output-path", target, *words),
+        *("--rendered-output-names", "rgb", "relevancy_0", "relevancy_1", "overlay", "bottleneck"),
+        cwd=folder,
+        shell=views == "interpolate",
+    )
+    pictures = sorted(path.relative_to(target) for path in target.rglob("*.jpg"))
+    if views == "dataset":  # a folder per output
+        outputs = {"rgb", "relevancy_0", "relevancy_1", "overlay", "bottleneck"}
+        assert {path.parts[1] for path in pictures} == outputs
+    else:  # the outputs side by side
+        with Image.open(target / pictures[0]) as picture:
+            assert picture.width % 5 == 0 and picture.width > picture.height
+    if views == "camera-path":
+        assert len(pictures) == 2 and picture.size == (5 * 48, 32)
+
+
+def test_export_splat(run, folder):
+    words = (
+        "ns-export",
+        "gaussian-splat",
+        "--load-config",
+        run / "config.yml",
+        "--output-dir",
+        folder / "ply",
+    )
+    command(*words, cwd=folder, shell=True)
+    header = (folder / "ply" / "splat.ply").read_bytes()[:2000]
+    assert header.startswith(b"ply")
+    assert b"f_dc_0" in header
+
+
+def test_transforms_json_scenes_train_too(scene, tiny_clip, tiny_dense, folder):
+    """nerfstudio-data, as LERF-OVS and DL3DV scenes come: no tracks, so sizes come from the seed points."""
+    data = transforms_scene(scene, folder / "transforms_scene")
+    output = command(
+        *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 5, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--output-dir", folder / "outputs", "nerfstudio-data"),
+        cwd=folder,
+    )
+    assert "crop sides" in output
+
+
+def test_transforms_json_without_points_takes_relative_crops(scene, tiny_clip, tiny_dense, folder):
+    data = transforms_scene(scene, folder / "no_points", points=False)
+    output = command(
+        *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 3, "--vis", "tensorboard"),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--pipeline.model.random-init", "True", "--pipeline.model.num-random", 200),
+        *("--output-dir", folder / "outputs", "nerfstudio-data"),
+        cwd=folder,
+    )
+    assert "no 3D points" in output
+
+
+def test_a_mistake_is_one_sentence_without_traceback(folder):
+    options = ("--vis", "tensorboard", "--output-dir", folder / "outputs")
+    options += ("--pipeline.datamanager.clip", "none")
+    done = attempt("ns-train", "lang3dxl", "--data", "nowhere", *options, cwd=folder)
+    assert done.returncode == 1
+    assert "nowhere is not a folder" in done.stdout
+    assert "Traceback" not in done.stdout + done.stderr
+
+
+def transforms_scene(scene: Path, target: Path, points: bool = True) -> Path:
+    """The COLMAP scene rewritten as nerfstudio's transforms.json."""
+    import numpy as np
+
+    from lang3dxl_ns.scene.colmap import read_reconstruction
+
+    reconstruction = read_reconstruction(scene / "sparse" / "0")
+    target.mkdir()
+    os.symlink(scene / "images", target / "images")
+    frames = []
+    for g in reconstruction.photos.values():
+        pose = np.linalg.inv(np.vstack([g.camera_from_world, [0, 0, 0, 1]]))
+        pose[:3, 1:3] *= -1
+        lens = g.lens
+        intrinsics = {
+            "fl_x": lens.fx,
+            "fl_y": lens.fy,
+            "cx": lens.cx,
+            "cy": lens.cy,
+            "w": g.width,
+            "h": g.height,
+        }
+        frames.append({"file_path": f"images/{g.name}", "transform_matrix": pose.tolist(), **intrinsics})
+    meta = {"camera_model": "OPENCV", "frames": frames}
+    if points:
+        meta["ply_file_path"] = "points.ply"
+        lines = [f"{x} {y} {z} 128 128 128" for x, y, z in reconstruction.points]
+        header = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n"
+        header += "".join(f"property float {a}\n" for a in "xyz")
+        header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+        (target / "points.ply").write_text(header + "\n".join(lines) + "\n")
+    (target / "transforms.json").write_text(json.dumps(meta))
+    return target

@@ -1,0 +1,68 @@
+"""Compiled kernels: logged once, cached on disk, compiled anew without a writable cache."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lang3dxl_ns.common.jit import in_threads
+
+PROGRAM = """
+import numpy as np
+from kernel_module import doubled
+print(doubled(np.arange(3.0)))
+"""
+MODULE = """
+from lang3dxl_ns.common.jit import kernel
+
+@kernel
+def doubled(values):
+    return 2 * values
+"""
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run a program that calls a kernel in a separate process; returns its output."""
+    (tmp_path / "kernel_module.py").write_text(MODULE)
+
+    def program(**environment: str) -> str:
+        path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM],
+            env={**os.environ, "PYTHONPATH": path, **environment},
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        return done.stdout
+
+    return program
+
+
+def test_a_kernel_is_compiled_once_with_a_word_and_then_read_from_the_disk(run):
+    first, second = run(), run()
+    assert first.count("Compiling") == 1
+    assert "Compiling" not in second
+    assert first.endswith("[0. 2. 4.]\n") and second.endswith("[0. 2. 4.]\n")
+
+
+def test_without_a_folder_that_can_be_written_a_kernel_is_compiled_anew(run, tmp_path):
+    (tmp_path / "__pycache__").write_text("a file where the folder would be")
+    for _ in range(2):
+        printed = run(XDG_CACHE_HOME=str(tmp_path / "__pycache__" / "cache"))
+        assert printed.count("Compiling") == 1
+        assert printed.endswith("[0. 2. 4.]\n")
+    assert not list(Path(tmp_path).rglob("*.nbi"))
+
+
+def test_threads_return_results_in_the_order_of_the_arguments():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        assert in_threads(lambda a, b: a * b, [(k, k) for k in range(20)]) == [k * k for k in range(20)]
+    finally:
+        torch.set_num_threads(before)
+    assert in_threads(np.sum, []) == []

@@ -1,0 +1,97 @@
+"""Laws of compressing features on Gaussians to three numbers each."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, compress
+from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+
+CHANNELS = 24
+QUICK = CompressionConfig(steps=300, batch=512)
+
+
+def field() -> SemanticField:
+    return SemanticField(SemanticFieldConfig("short"), CHANNELS, generator=torch.Generator().manual_seed(0))
+
+
+def clusters(sizes, spread=0.05, seed=0):
+    """Features around as many centres, and the centre that each belongs to."""
+    generator = torch.Generator().manual_seed(seed)
+    centres = torch.randn(len(sizes), CHANNELS, generator=generator)
+    owner = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
+    noise = spread * torch.randn(len(owner), CHANNELS, generator=generator)
+    return centres[owner] + noise, owner
+
+
+def compressed(features, mass, config=QUICK):
+    trained = field()
+    codes = compress(features, mass, trained, config, torch.Generator().manual_seed(0))
+    return codes, trained
+
+
+def agreement(features, codes, trained):
+    with torch.no_grad():
+        return F.cosine_similarity(trained.decode_clip(codes), features, dim=1)
+
+
+def test_features_come_back():
+    features, _ = clusters([300] * 8)
+    codes, trained = compressed(features, torch.ones(len(features)))
+    assert codes.shape == (len(features), 3)
+    assert agreement(features, codes, trained).mean() > 0.98
+
+
+def test_a_class_of_half_a_percent_survives_beside_walls_of_great_mass():
+    features, owner = clusters([1500, 800, 400, 285, 15])
+    mass = torch.where(owner == 4, 2.0, 200.0)
+    codes, trained = compressed(features, mass)
+    cosines = agreement(features, codes, trained)
+    assert cosines[owner == 4].mean() > 0.9
+    # And it is told from every other class.
+    centres = torch.stack([features[owner == i].mean(0) for i in range(5)])
+    with torch.no_grad():
+        found = F.normalize(trained.decode_clip(codes[owner == 4]), dim=1) @ F.normalize(centres, dim=1).T
+    assert (found.argmax(1) == 4).all()
+
+
+def test_what_no_photo_shows_stays_unknown_and_changes_nothing():
+    features, _ = clusters([200] * 4)
+    mass = torch.ones(len(features))
+    alone, _ = compressed(features, mass)
+    more = torch.cat([features, torch.full((5, CHANNELS), 1e6)])
+    codes, _ = compressed(more, F.pad(mass, (0, 5)))
+    assert codes[-5:].isnan().all()
+    assert torch.equal(codes[:-5], alone)
+
+
+def test_equal_features_have_codes_that_say_the_same():
+    features, owner = clusters([400, 400, 400], spread=0.0)
+    codes, trained = compressed(features, torch.ones(len(features)))
+    with torch.no_grad():
+        decoded = trained.decode_clip(codes)
+    for i in range(3):
+        assert decoded[owner == i].std(0).max() < 0.1 * decoded.std(0).max()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_gaussians_or_one_material_are_no_trouble(count):
+    features = torch.ones(count, CHANNELS)
+    codes, trained = compressed(features, torch.ones(count))
+    assert codes.isfinite().all()
+    torch.testing.assert_close(trained.decode_clip(codes).detach(), features, atol=1e-2, rtol=0)
+
+
+def test_a_scene_that_nobody_has_seen_is_unknown():
+    codes, _ = compressed(torch.zeros(4, CHANNELS), torch.zeros(4))
+    assert codes.shape == (4, 3) and codes.isnan().all()
+
+
+def test_learning_again_begins_anew():
+    """As the viewer does while a run goes on, with Gaussians that have come meanwhile."""
+    features, _ = clusters([200] * 4)
+    encoder = CompressedField(SemanticFieldConfig("short"), CHANNELS, QUICK)
+    first = encoder.learn_gaussians(features, torch.ones(len(features)))
+    encoder.learn_gaussians(features.flip(0)[:300], torch.ones(300))
+    again = encoder.learn_gaussians(features, torch.ones(len(features)))
+    assert torch.equal(first, again)

@@ -1,0 +1,121 @@
+"""Numerics: every hard case is within its bound, and the harness detects one that is not."""
+
+import json
+
+import pytest
+import torch
+
+from lang3dxl_ns import cli
+from lang3dxl_ns.numerics import catalogue, command
+from lang3dxl_ns.numerics.catalogue import GROUPS
+from lang3dxl_ns.numerics.command import measure_all
+from lang3dxl_ns.numerics.measure import Bounds, Case, Problem, measure
+from lang3dxl_ns.numerics.optimisation import Run, runs
+
+BOUNDS = {"float32": Bounds(), "bf16": Bounds(1e-2, 1e-2, 1e-2, 1e-2)}
+
+
+def squares(distort=lambda out: out, **settings) -> Case:
+    """x ↦ x², with a planted error."""
+
+    def problem() -> Problem:
+        x = torch.linspace(-1, 1, 24, dtype=torch.float64).view(4, 6, 1)
+        return Problem(
+            {"x": x},
+            lambda leaves: {"out": distort(leaves["x"].square())},
+            lambda leaves: {"out": leaves["x"] * leaves["x"]},
+            **settings,
+        )
+
+    return Case("squares", "a case", problem, BOUNDS)
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__.rpartition(".")[2])
+def test_every_hard_case_is_within_its_bound(group):
+    rows = measure_all(list(group.cases(quick=True, device="cpu")), quick=True, device="cpu")
+    assert rows
+    assert [(row.case, row.mode, row.misses) for row in rows if row.misses] == []
+
+
+def test_a_right_component_passes():
+    row = measure(squares(smooth=True), "float32")
+    assert row.misses == []
+    assert row.finite_difference < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("distort", "miss"),
+    [
+        (lambda out: out * 1.001, "output max"),
+        (lambda out: out + 0.01 * (out - out.detach()), "gradient max"),
+        (lambda out: torch.where(out > 0.9, torch.nan, out), "not finite"),
+        (lambda out: out.detach(), "gradient rms"),
+    ],
+)
+def test_a_wrong_component_misses(distort, miss):
+    assert any(miss in found for found in measure(squares(distort), "float32").misses)
+
+
+def test_a_wrong_gradient_of_the_reference_is_found_by_finite_differences():
+    case = squares(smooth=True)
+    problem = case.build()
+    problem.reference = lambda leaves: {"out": leaves["x"].square().detach() + 0 * leaves["x"]}
+    row = measure(Case("squares", "a case", lambda: problem, BOUNDS), "float32")
+    assert any("finite difference" in miss for miss in row.misses)
+
+
+def test_flipped_pixels_are_counted_and_left_out_of_the_gradient():
+    def flip(out):
+        return torch.cat([out[:1] * 1.01, out[1:]])
+
+    strict = measure(squares(flip), "float32")
+    row = measure(squares(flip, thresholds=True), "float32")
+    assert row.flipped == pytest.approx(0.25)
+    assert row.gradient_rms < 1e-6 < strict.gradient_rms
+    assert any("flipped" in miss for miss in row.misses)
+
+
+def test_long_and_stiff_optimisations_stay_finite_and_do_not_drift():
+    assert [(run.name, run.misses) for run in runs(quick=True) if run.misses] == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "miss"),
+    [
+        ({"finite": False}, "not finite"),
+        ({"losses": [1.0, 0.5, 0.6]}, "loss 0.600, was 0.500"),
+        ({"losses": [1.0, 0.5, float("nan")]}, "loss nan"),
+        ({"codes": [1.0, 5.0, 90.0]}, "largest code 90.0 > 25"),
+    ],
+)
+def test_an_optimisation_that_drifts_misses(changes, miss):
+    good = {"losses": [1.0, 0.6, 0.5], "codes": [1.0, 2.0, 3.0]}
+    assert Run("a run", 30, True, **good).misses == []
+    assert any(miss in found for found in Run("a run", 30, True, **good | changes).misses)
+
+
+def test_a_miss_is_reported_in_words_and_makes_the_exit_code_1(tmp_path, monkeypatch, capsys):
+    wrong = squares(lambda out: out * torch.where(out > 0.9, torch.inf, 1.001))
+    monkeypatch.setattr(command, "all_cases", lambda quick, device: [wrong, squares()])
+    broken = Run("fast", 30, True, losses=[1.0] * 10, codes=[1.0] * 10, finite=False)
+    monkeypatch.setattr(command, "runs", lambda quick: [broken])
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["numerics", "--out", str(tmp_path), "--quick"])
+    assert stop.value.code == 1
+    said = capsys.readouterr().out
+    assert "MISS squares, a case, float32: not finite" in said
+    assert "MISS optimisation, fast: not finite" in said
+    rows = json.loads((tmp_path / "numerics.json").read_text())["rows"]
+    assert [bool(row["misses"]) for row in rows] == [True, True, False, False]
+    report = (tmp_path / "numerics.md").read_text()
+    assert "**2 of 5 rows pass.**" in report
+    assert f"`lang3dxl numerics --out {tmp_path} --quick`" in report
+    assert (tmp_path / "numerics.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_catalogue_holds_every_group():
+    components = {case.component for case in catalogue.all_cases(quick=True, device="cpu")}
+    assert {"appearance", "relevancy"} <= components
+    assert {"rasteriser, torch", "hash grid", "decoder", "downsampler", "physical scale"} <= components
+    on_gpu = {case.component for case in catalogue.all_cases(quick=True, device="cuda")}
+    assert "rasteriser, gsplat" in on_gpu

@@ -1,0 +1,125 @@
+"""`--data` may be photos alone, a video, or a folder with a transforms.json."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+from scenes import speckled, write_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.data_folder import parser_for
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.scene.video import _sharpest, extract_frames
+
+needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """Photos of a speckled box, flat in a folder."""
+    folder = tmp_path_factory.mktemp("walk")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes, "texture", speckled)
+        write_scene(folder / "scene", photos=8, size=(240, 180))
+    return folder / "scene" / "images"
+
+
+def datamanager(data, **changes):
+    config = Lang3DXLDataManagerConfig(data=data, clip="none", dense="none", **changes)
+    return config.setup(device="cpu", test_mode="val")
+
+
+def test_a_flat_folder_of_photos_is_all_that_training_needs(walk, tmp_path):
+    data = shutil.copytree(walk, tmp_path / "data")
+    before = {path.name: path.stat().st_mtime_ns for path in data.iterdir()}
+    manager = datamanager(data)
+    assert len(manager.photos) == 8
+    assert {name: (data / name).stat().st_mtime_ns for name in before} == before
+    assert {path.name for path in data.iterdir()} - set(before) == {"sparse", "lang3dxl_cache"}
+    again = datamanager(data)  # finds the model, and the photos beside it
+    assert list(again.photos) == list(manager.photos)
+    assert (
+        again.train_dataset.cameras.camera_to_worlds == manager.train_dataset.cameras.camera_to_worlds
+    ).all()
+
+
+def test_sub_folders_of_photos_are_read_with_their_model(walk, tmp_path):
+    for i, path in enumerate(sorted(walk.iterdir())):
+        (tmp_path / "data" / f"day{i % 2}").mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, tmp_path / "data" / f"day{i % 2}" / path.name)
+    manager = datamanager(tmp_path / "data")
+    assert {name.split("/")[0] for name in manager.photos} == {"day0", "day1"}
+
+
+def test_a_run_whose_model_is_gone_gets_no_other_one(walk, tmp_path):
+    data = shutil.copytree(walk, tmp_path / "data")
+    with pytest.raises(UserError, match="no COLMAP model"):
+        datamanager(data, run=tmp_path)
+    assert not (data / "sparse").exists()
+
+
+def test_a_model_that_was_named_is_not_replaced_by_another(walk, tmp_path):
+    data = shutil.copytree(walk, tmp_path / "data")
+    named = PhotoCollectionDataParserConfig(data=data, colmap_path=Path("mine/0"))
+    assert parser_for(named, None, True).colmap_path == Path("mine/0")
+    assert not (data / "sparse").exists()
+
+
+def test_a_folder_with_transforms_is_read_as_nerfstudio_does(tmp_path):
+    data = tmp_path / "data"
+    data.mkdir()
+    frames = []
+    for i in range(12):
+        Image.fromarray(np.full((6, 8, 3), 20 * i, np.uint8)).save(data / f"{i}.png")
+        pose = np.eye(4)
+        pose[0, 3] = i
+        frames.append({"file_path": f"{i}.png", "transform_matrix": pose.tolist()})
+    lens = {"fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 3.0, "w": 8, "h": 6}
+    (data / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    parser = parser_for(PhotoCollectionDataParserConfig(data=data), None, True)
+    assert isinstance(parser, NerfstudioDataParserConfig)
+    manager = datamanager(data)
+    assert len(manager.train_dataset) + len(manager.eval_dataset) == 12
+
+
+def make_video(photos, path):
+    command = ["ffmpeg", "-v", "error", "-framerate", "2", "-i", str(photos / "photo_%03d.jpg"), "-r", "8"]
+    subprocess.run([*command, "-q:v", "2", str(path)], check=True)
+    return path
+
+
+@needs_ffmpeg
+def test_a_video_becomes_a_folder_of_frames_and_a_model(walk, tmp_path):
+    video = make_video(walk, tmp_path / "walk.mp4")
+    parser = parser_for(PhotoCollectionDataParserConfig(data=video), None, True)
+    assert parser.data == tmp_path / "walk_photos"
+    assert len(list((parser.data / "images").iterdir())) == 8  # four seconds, two frames of each
+    assert (parser.data / parser.colmap_path / "images.bin").is_file()
+    video.unlink()  # a run goes on without it
+    again = parser_for(PhotoCollectionDataParserConfig(data=video), None, False)
+    assert (again.data, again.colmap_path) == (parser.data, parser.colmap_path)
+
+
+@needs_ffmpeg
+def test_what_is_no_video_is_an_error(tmp_path):
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    with pytest.raises(UserError, match=r"a\.mp4 is not a video"):
+        extract_frames(tmp_path / "a.mp4")
+
+
+def test_a_video_without_ffmpeg_is_an_error_that_names_it(tmp_path, monkeypatch):
+    (tmp_path / "a.mp4").touch()
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(UserError, match="ffmpeg isn't installed"):
+        extract_frames(tmp_path / "a.mp4")
+
+
+def test_of_every_stretch_the_sharpest_frame_is_taken():
+    assert _sharpest(np.array([1, 5, 2, 9, 0, 3, 4.0]), 3).tolist() == [1, 3, 6]

@@ -1,0 +1,85 @@
+"""The data manager's photo cache, and cameras that fit the photos as read."""
+
+import pytest
+import torch
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.datamanager import PhotoDataset
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.photo_cache import PhotoCache
+from lang3dxl_ns.scene.camera import view_matrix
+from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.geometry import sphere_around
+
+
+def photo(index: int) -> dict[str, torch.Tensor]:
+    return {"image": torch.full((10, 10), index, dtype=torch.uint8)}
+
+
+def test_cache_returns_the_right_photo_and_stays_within_its_memory():
+    cache = PhotoCache(photo, max_bytes=500)
+    for step in range(60):
+        index = step * 7 % 20
+        assert int(cache.get(index, [(index + 7) % 20])["image"][0, 0]) == index
+    assert cache.bytes <= 500 + 100  # plus the one read ahead
+
+
+def test_cache_reads_a_photo_once_while_it_fits():
+    reads = []
+    cache = PhotoCache(lambda i: reads.append(i) or photo(i), max_bytes=10_000)
+    for index in [0, 1, 2, 0, 1, 2]:
+        cache.get(index, [(index + 1) % 3])
+    assert sorted(reads) == [0, 1, 2]
+
+
+def test_a_photo_that_failed_in_read_ahead_fails_no_other():
+    def read(index):
+        if index == 1:
+            raise UserError("photo 1 is torn")
+        return photo(index)
+
+    cache = PhotoCache(read, max_bytes=150)
+    cache.get(0, [1])
+    for index in (2, 3, 4, 5):  # evicts the broken photo's entry among the first
+        assert int(cache.get(index, [])["image"][0, 0]) == index
+
+
+def test_the_cache_raises_the_reading_error():
+    def broken(index):
+        raise UserError(f"photo {index} is torn")
+
+    cache = PhotoCache(broken, max_bytes=1)
+    with pytest.raises(UserError, match="photo 3 is torn"):
+        cache.get(3, [])
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.37])
+def test_points_project_to_their_observations_through_the_whole_chain(scene, scale):
+    """COLMAP pose and lens → dataparser's frame → scaled pinhole: pixels agree with the model's tracks."""
+    parser = PhotoCollectionDataParserConfig(data=scene).setup()
+    outputs = parser.get_dataparser_outputs(split="train")
+    dataset = PhotoDataset(outputs, scale)
+    geometries = read_reconstruction(scene / "sparse" / "0").photos
+    transform, world_scale = outputs.dataparser_transform, outputs.dataparser_scale
+    for i, taken in enumerate(dataset.photos):
+        geometry, camera = geometries[taken.name], dataset.cameras[i]
+        image = dataset.read(i)["image"]
+        assert image.shape[:2] == (int(camera.height), int(camera.width))
+        world = torch.cat([torch.tensor(geometry.points), torch.ones(len(geometry.points), 1)], dim=1).float()
+        world = world @ transform.T * world_scale
+        view = view_matrix(camera.camera_to_worlds)
+        local = world @ view[:3, :3].T + view[:3, 3]
+        pixels = local @ camera.get_intrinsics_matrices().T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        zoom = torch.tensor([image.shape[1] / geometry.width, image.shape[0] / geometry.height])
+        error = (pixels - torch.tensor(geometry.pixels) * zoom).norm(dim=1)
+        assert float(error.median()) < 1.0 * scale
+
+
+def test_sky_surrounds_the_scene_evenly():
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) + 5
+    sky = sphere_around(points, 1000)
+    radii = (sky - points.median(dim=0).values).norm(dim=1)
+    assert float(radii.std() / radii.mean()) < 1e-5
+    assert float(radii.min()) > 5 * float((points - 5).norm(dim=1).quantile(0.9))
+    assert float((sky.mean(dim=0) - points.median(dim=0).values).norm() / radii.mean()) < 1e-2

@@ -1,0 +1,102 @@
+"""Training runs of the baselines."""
+
+from functools import cache
+from typing import get_args
+
+import pytest
+import torch
+from conftest import make_trainer
+from nerfstudio.utils.eval_utils import eval_setup
+
+from lang3dxl_ns.baselines.encoders import EncoderConfig, EncoderName
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+
+
+@pytest.fixture(scope="module")
+def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
+    """The finished short run of an encoder by name, "none" for colours alone; each is made once."""
+
+    @cache
+    def made(name: str):
+        semantics = name != "none"
+        encoder = EncoderConfig(name, autoencoder_steps=20) if semantics else EncoderConfig()
+        changes = {"pipeline__model__encoder": encoder}
+        folder = tmp_path_factory.mktemp(name)
+        trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 6, semantics, **changes)
+        trainer.setup()
+        trainer.train()
+        return trainer
+
+    return made
+
+
+@pytest.mark.parametrize("name", get_args(EncoderName))
+def test_an_encoder_trains_gives_features_of_the_targets_width_and_is_the_same_once_loaded(run, name):
+    trainer = run(name)
+    model = trainer.pipeline.model.eval()
+    camera, batch = next(iter(trainer.pipeline.datamanager.fixed_indices_eval_dataloader))
+    _, images = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
+    assert model.semantic_field.decode_clip(model.carried).shape[-1] == batch["clip_target"].shape[-1]
+    assert images["bottleneck"].shape[-1] == 3
+    metrics = model.feature_metrics(camera, batch)
+    without_dense = name in ("langsplat", "lang3dxl", "lifting")
+    assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is not without_dense
+    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
+    loaded = pipeline.model.eval()
+    with torch.no_grad():
+        maps = [m.composite(camera, m.carried.nan_to_num(7.0)) for m in (loaded, model)]
+    torch.testing.assert_close(*maps)
+
+
+@pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "direct"])
+def test_what_an_encoder_trains_moves_and_geometry_is_left_to_the_colours(run, name):
+    alone = run("none").pipeline.model
+    model = run(name).pipeline.model
+    torch.testing.assert_close(model.means, alone.means)
+    if "codes" in model.gauss_params:
+        assert model.gauss_params["codes"].abs().max() > 0
+    trained = [p for group in model.semantic_field.parameter_groups().values() for p in group]
+    assert all(p.grad is not None and p.grad.abs().max() > 0 for p in trained)
+
+
+def test_only_fmgs_has_an_alignment_loss(run):
+    for name in ("lang3dxl", "fmgs"):
+        trainer = run(name)
+        assert ("alignment" in trainer.pipeline.last_losses) is (name == "fmgs")
+
+
+@pytest.mark.parametrize("name", ["lang3dxl", "lifting"])
+def test_gathered_features_come_near_the_targets_and_nothing_is_learned_before(run, name):
+    trainer = run(name)
+    assert set(trainer.pipeline.last_losses) == {"rgb"}
+    assert trainer.pipeline.datamanager.config.dense == "none"
+    metrics = trainer.pipeline.get_average_eval_image_metrics()
+    assert metrics["clip_l1"] < metrics["clip_l1_of_mean"] * 1.5
+    assert not trainer.pipeline.model.gauss_params["codes"].requires_grad
+
+
+@pytest.mark.parametrize(
+    "field", [SemanticFieldConfig("short", levels=0), SemanticFieldConfig("short", code_dim=6)]
+)
+def test_fields_of_the_ablation_train(train, scene, field):
+    trainer = train(
+        scene, iterations=3, pipeline__model__encoder__name="paper", pipeline__model__semantic_field=field
+    )
+    assert torch.isfinite(trainer.pipeline.last_losses["clip"])
+
+
+@pytest.mark.parametrize("match", ["resize-features", "resize-target"])
+def test_without_the_downsampler_codes_learn_all_the_same(train, scene, match):
+    trainer = train(
+        scene, iterations=3, pipeline__model__encoder__name="paper", pipeline__model__downsampler__match=match
+    )
+    assert trainer.pipeline.model.gauss_params["codes"].grad.abs().max() > 0
+    assert trainer.pipeline.model.downsampler.network is None
+
+
+def test_crops_of_one_size_are_the_middle_of_the_range(train, scene, tmp_path):
+    options = {"scale_mode": "relative", "scale_range": (0.4, 0.9), "scales": 1}
+    options["cache_dir"] = tmp_path / "targets"
+    trainer = train(scene, iterations=2, **{f"pipeline__datamanager__{k}": v for k, v in options.items()})
+    _, batch = trainer.pipeline.datamanager.next_train(0)
+    assert batch["crop_sides"] == [pytest.approx(0.6, abs=0.02)]

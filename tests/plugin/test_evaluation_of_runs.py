@@ -1,0 +1,143 @@
+"""`ns-eval` and `lang3dxl evaluate run`: their reports, and lists of held-out photos."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from label_sets import box_object, write_labels, write_plain
+from PIL import Image
+
+from lang3dxl_ns import cli
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+
+
+def label(scene, folder, numbers):
+    """A dome in the left half of these photos."""
+    for number in numbers:
+        width, height = Image.open(scene / "images" / f"photo_{number:03d}.jpg").size
+        mask = np.zeros((height, width), bool)
+        mask[:, : width // 2] = True
+        write_plain(folder, "dome", f"photo_{number:03d}", mask)
+    return folder
+
+
+@pytest.fixture
+def pipeline(train, scene):
+    return train(scene, iterations=2).pipeline
+
+
+@pytest.fixture
+def evaluate(pipeline):
+    """What ns-eval calls, after changes to the pipeline's configuration."""
+
+    def run(**changes):
+        pipeline.__dict__.pop("scorer", None)
+        for name, value in changes.items():
+            setattr(pipeline.config, name, value)
+        return pipeline.get_average_eval_image_metrics(get_std=True)
+
+    return run
+
+
+def test_ns_eval_reports_pictures_features_words_and_cost(evaluate, scene, tmp_path):
+    results = evaluate(ground_truth=label(scene, tmp_path / "truth", range(12)))
+    names = {
+        "psnr",
+        "ssim",
+        "clip_l1",
+        "clip_psnr",
+        "clip_cosine",
+        "ap_dome",
+        "raw_ap_dome",
+        "authors_ap_dome",
+    }
+    names |= {"teacher_ap_dome", "iou_dome", "render_seconds", "query_seconds"}
+    assert names | {f"{name}_std" for name in names} <= set(results)
+    assert {"map", "raw_map", "authors_map", "teacher_map", "miou", "localisation_accuracy"} <= set(results)
+    assert results["peak_memory_mb"] > 10
+    assert results["ap_dome_photos"] == 2
+    protocol = results["protocol"]
+    assert (protocol["evaluated_photos"], protocol["seen_in_training"]) == (2, 0)
+    assert protocol["foreground"] == "none"
+    assert set(results["photos"]) == {"photo_000.jpg", "photo_008.jpg"}
+    json.dumps(results, allow_nan=False)
+
+
+def test_photos_that_training_saw_are_scored_on_request_and_said_to_be(evaluate, scene, tmp_path):
+    results = evaluate(ground_truth=label(scene, tmp_path / "truth", (0, 1, 2)), evaluated_photos="seen")
+    assert set(results["photos"]) == {"photo_001.jpg", "photo_002.jpg"}
+    assert (results["protocol"]["evaluated_photos"], results["protocol"]["seen_in_training"]) == (2, 2)
+    with pytest.raises(UserError, match="none of the training photos has a label"):
+        evaluate(ground_truth=label(scene, tmp_path / "held_out", (0, 8)))
+
+
+def test_labels_of_other_scenes_are_refused_and_absent_photos_named(evaluate, scene, tmp_path, capsys):
+    write_plain(tmp_path / "truth", "dome", "0001", np.ones((72, 96), bool))
+    with pytest.raises(UserError, match=r"no label in .* belongs to a photo of the scene"):
+        evaluate(ground_truth=tmp_path / "truth")
+    evaluate(ground_truth=label(scene, tmp_path / "truth", (0,)))
+    assert "scene and are not scored: 0001" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_mask_of_another_shape_is_named(evaluate, scene, tmp_path):
+    write_plain(tmp_path / "truth", "dome", "photo_000", np.ones((40, 200), bool))
+    with pytest.raises(UserError, match=r"photo_000\.png has 200 × 40 pixels"):
+        evaluate(ground_truth=tmp_path / "truth")
+
+
+def test_labels_in_json_are_scored_at_the_photos_size_by_langsplats_measures(evaluate, scene, tmp_path):
+    width, height = Image.open(scene / "images" / "photo_000.jpg").size
+    truth, box = tmp_path / "truth", box_object("dome", 5, 5, 30, 30)
+    write_labels(truth, "photo_000", [box], width=width, height=height)
+    results = evaluate(ground_truth=truth)
+    assert {"smooth_localisation_accuracy", "smooth_miou", "localisation_accuracy"} <= set(results)
+    assert results["protocol"]["layout"] == "lerf_ovs"
+
+
+def test_evaluate_run_writes_the_report_of_a_run(train, scene, tmp_path):
+    trainer = train(scene, iterations=2)
+    truth = label(scene, tmp_path / "truth", (0, 1))
+    config = str(trainer.base_dir / "config.yml")
+    common = ["evaluate", "run", "--load-config", config, "--ground-truth", str(truth), "--split", "seen"]
+    cli.main([*common, "--out", str(tmp_path / "out")])
+    report = json.loads((tmp_path / "out" / "scores.json").read_text())
+    assert list(report["results"]["photos"]) == ["photo_001.jpg"]
+    assert "| dome | 1 |" in (tmp_path / "out" / "scores.md").read_text()
+
+
+# ── held-out photos by list ─────────────────────────────────────────────────────────────────────────────
+
+
+def split(scene, names, tmp_path):
+    path = tmp_path / "held_out.txt"
+    path.write_text(names)
+    parser = PhotoCollectionDataParserConfig(data=scene, held_out=path).setup()
+    return [
+        [photo.name for photo in parser.get_dataparser_outputs(part).metadata["photos"]]
+        for part in ("train", "test")
+    ]
+
+
+def test_listed_photos_and_no_others_are_held_out(scene, tmp_path):
+    train_photos, held_out = split(scene, "photo_003\nphoto_001.jpg  # a comment\n", tmp_path)
+    assert held_out == ["photo_001.jpg", "photo_003.jpg"]
+    assert len(train_photos) == 10 and not set(train_photos) & set(held_out)
+
+
+def test_a_listed_photo_that_is_not_there_is_named(scene, tmp_path):
+    with pytest.raises(UserError, match="names photo_099, which fits 0 photos"):
+        split(scene, "photo_099\n", tmp_path)
+
+
+def test_folders_of_pt_ovs_are_read_as_published(scene, tmp_path):
+    """brandenburg_gate/dense/{images,sparse} and label/brandenburg_gate/<photo>.json beside it."""
+    data = tmp_path / "brandenburg_gate"
+    shutil.copytree(scene / "images", data / "dense" / "images")
+    shutil.copytree(scene / "sparse" / "0", data / "dense" / "sparse")
+    write_labels(tmp_path / "label" / data.name, "photo_000", [box_object("column", 5, 5, 30, 30)])
+    outputs = PhotoCollectionDataParserConfig(data=data).setup().get_dataparser_outputs("test")
+    truth = GroundTruth(find_ground_truth(data))
+    assert [truth.key(photo.name) for photo in outputs.metadata["photos"]] == ["photo_000", None]

@@ -1,0 +1,84 @@
+"""The limit: exact labels lifted to the Gaussians and rendered back."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+
+from lang3dxl_ns.evaluation.annotations import Truth
+from lang3dxl_ns.evaluation.average_precision import average_precision
+from lang3dxl_ns.evaluation.scores import bounds
+from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.label_limit import label_limit
+from lang3dxl_ns.rendering import Gaussians, rasterize
+
+SIZE = 24
+
+
+def wall(opacity=0.99):
+    """A wall of opaque Gaussians in front of the camera, a fifth of a pixel wide, four per pixel."""
+    steps = (torch.arange(2 * SIZE) + 0.5) / 2 - SIZE / 2
+    y, x = torch.meshgrid(steps, steps, indexing="ij")
+    means = torch.stack([x.flatten(), y.flatten(), torch.full((4 * SIZE**2,), -float(SIZE))], dim=1)
+    count = len(means)
+    quats = torch.tensor([1.0, 0, 0, 0]).expand(count, 4)
+    gaussians = Gaussians(means, quats, torch.full((count, 3), 0.2), torch.full((count,), opacity))
+
+    def composite(camera, features):
+        view = to_rasterizer(camera, camera.camera_to_worlds[0], torch.device("cpu"))
+        return rasterize(gaussians, view, features).image
+
+    return SimpleNamespace(means=means, num_points=count, composite=composite)
+
+
+def camera(shift=0.0):
+    pose = torch.eye(4)[None, :3].clone()
+    pose[0, 0, 3] = shift
+    return Cameras(pose, float(SIZE), float(SIZE), SIZE / 2, SIZE / 2, SIZE, SIZE)
+
+
+@pytest.fixture
+def label():
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[4:11, 6:18] = True
+    return mask
+
+
+def score(maps, label):
+    return bounds(maps, {"dome": Truth(label)})
+
+
+def test_the_limit_of_a_perfect_scene_is_1(label):
+    found = score(label_limit(wall(), [(camera(), {"dome": label})], ["dome"])(camera()), label)
+    assert found["limit_ap_dome"] == pytest.approx(1, abs=1e-6)
+
+
+def test_views_that_disagree_lower_it(label):
+    other = np.roll(label, 6, axis=1)
+    limit = label_limit(wall(), [(camera(), {"dome": label}), (camera(), {"dome": other})], ["dome"])
+    assert score(limit(camera()), label)["limit_ap_dome"] < 0.9
+
+
+def test_a_view_without_a_label_is_ignored(label):
+    views = [(camera(), {"dome": label}), (camera(), {"window": ~label}), (camera(), {"window": ~label})]
+    maps = label_limit(wall(), views, ["dome", "window"])(camera())
+    alone = label_limit(wall(), views[:1], ["dome"])(camera())
+    torch.testing.assert_close(maps["dome"], alone["dome"])
+    assert score(maps, label)["limit_ap_dome"] == pytest.approx(1, abs=1e-6)
+
+
+def test_labels_are_lifted_from_larger_ones_than_the_rendering(label):
+    large = np.kron(label, np.ones((2, 2))).astype(bool)
+    maps = label_limit(wall(), [(camera(), {"dome": large})], ["dome"])(camera())
+    torch.testing.assert_close(
+        maps["dome"], label_limit(wall(), [(camera(), {"dome": label})], ["dome"])(camera())["dome"]
+    )
+
+
+def test_chance_is_the_share_of_positives(label):
+    found = score({"dome": torch.zeros(SIZE, SIZE)}, label)
+    assert found["chance_ap_dome"] == pytest.approx(label.mean())
+    assert average_precision(np.full(label.shape, 0.3), label) == pytest.approx(found["chance_ap_dome"])
+    assert score({"dome": torch.zeros(SIZE, SIZE)}, np.zeros_like(label)) == {}

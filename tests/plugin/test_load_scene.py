@@ -1,0 +1,140 @@
+"""Loading a scene from a run's folder alone."""
+
+import shutil
+from types import SimpleNamespace
+
+import pytest
+import torch
+from conftest import make_trainer
+from PIL import Image
+from scenes import write_scene
+
+import lang3dxl_ns
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.evaluation.language import open_scorer
+from lang3dxl_ns.plugin.cameras import view_of
+from lang3dxl_ns.plugin.load_scene import scene_of_model
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
+
+
+@pytest.fixture(scope="module")
+def trainer(tmp_path_factory, tiny_clip, tiny_dense):
+    """A run whose photos are gone."""
+    root = tmp_path_factory.mktemp("run")
+    data = write_scene(root / "scene", photos=6, points=200, mixed=True)
+    (data / "masks").mkdir()
+    Image.new("L", (8, 6), 255).save(data / "masks" / "photo_001.png")
+    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=30)
+    trainer.setup()
+    trainer.train()
+    data.rename(root / "moved")
+    return trainer
+
+
+@pytest.fixture
+def config(trainer):
+    return trainer.base_dir / "config.yml"
+
+
+@pytest.fixture(scope="module")
+def scene(trainer):
+    return lang3dxl_ns.load_scene(trainer.base_dir / "config.yml")
+
+
+def test_it_answers_without_its_photos(scene):
+    match = scene.query('rose window; dome not "tower"', "photo_002.jpg")[1]
+    photo = scene.file.photo("photo_002")
+    assert match.relevancy.shape == (photo.lens.height, photo.lens.width)
+    assert match.relevancy.min() >= 0 and match.relevancy.max() <= 1
+    assert len(scene.query_gaussians("dome")) == len(scene.gaussians["means"])
+    assert len(scene.find("dome")) == 1
+
+
+def test_the_loaded_model_renders_as_the_trained_one(scene, trainer):
+    model = trainer.pipeline.model.eval()
+    camera = scene.camera("photo_001.jpg")
+    outputs = model.get_outputs_for_camera(view_of(camera))
+    view = scene.query("dome", camera)[0].view
+    torch.testing.assert_close(view.image, outputs["rgb"])
+    torch.testing.assert_close(scene.gaussians["codes"], model.gauss_params["codes"], equal_nan=True)
+
+
+def test_cameras_are_those_that_were_trained_with(scene, trainer):
+    datamanager = trainer.pipeline.datamanager
+    for dataset in (datamanager.train_dataset, datamanager.eval_dataset):
+        for i, photo in enumerate(dataset.photos):
+            expected, camera = dataset.cameras[i], view_of(scene.camera(photo.name))
+            torch.testing.assert_close(camera.camera_to_worlds[0], expected.camera_to_worlds)
+            torch.testing.assert_close(
+                camera.get_intrinsics_matrices()[0], expected.get_intrinsics_matrices()
+            )
+            assert (int(camera.width), int(camera.height)) == (int(expected.width), int(expected.height))
+
+
+def test_the_files_frame_leads_back_to_colmaps(scene, trainer):
+    """scale · (transform · COLMAP's camera centre) is the camera's centre in the model."""
+    reconstruction = trainer.pipeline.datamanager.dataparser.reconstruction
+    transform = torch.tensor(scene.file.transform, dtype=torch.float64)
+    for photo in scene.file.photos:
+        pose = torch.from_numpy(reconstruction.photos[photo.name].camera_from_world)
+        centre = -pose[:, :3].T @ pose[:, 3]
+        here = scene.file.scale * (transform[:, :3] @ centre + transform[:, 3])
+        expected = torch.tensor(photo.camera_to_world, dtype=torch.float64)[:, 3]
+        torch.testing.assert_close(here, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_a_query_is_what_evaluation_scores(scene, trainer, tiny_clip):
+    """The same words, vectors and formula as ns-eval's average precision."""
+    scorer = open_scorer(SimpleNamespace(categories=["dome", "door"]), str(tiny_clip), "cpu")
+    pipeline, camera = trainer.pipeline, scene.camera("photo_003.jpg")
+    pipeline.eval()
+    maps = pipeline.relevancy(view_of(camera), scorer.queries)
+    for match, expected in zip(scene.query("dome; door", camera), maps, strict=True):
+        seen = match.view.alpha >= scene.config.min_alpha
+        torch.testing.assert_close(match.relevancy[seen], expected[seen])
+
+
+def test_a_folder_that_moved_can_be_asked(trainer, tmp_path):
+    shutil.copytree(trainer.base_dir, tmp_path / "elsewhere")
+    scene = lang3dxl_ns.load_scene(str(tmp_path / "elsewhere" / "config.yml"))
+    scene.find("dome")
+    assert (tmp_path / "elsewhere" / "lang3dxl_visible.safetensors").exists()
+
+
+def test_a_model_in_training_can_be_asked(trainer):
+    scene = scene_of_model(trainer.pipeline.model.eval(), SceneFile.read(trainer.base_dir / SCENE_FILE))
+    assert scene.query("dome", "photo_000")[0].relevancy.isfinite().all()
+
+
+def test_mistakes_are_reported(config, tmp_path):
+    with pytest.raises(UserError, match="is not a file"):
+        lang3dxl_ns.load_scene(tmp_path / "config.yml")
+    (tmp_path / "config.yml").write_text("a: 1")
+    with pytest.raises(UserError, match=r"not the config.yml of a nerfstudio run"):
+        lang3dxl_ns.load_scene(tmp_path / "config.yml")
+    shutil.copy(config, tmp_path)
+    with pytest.raises(UserError, match=SCENE_FILE):
+        lang3dxl_ns.load_scene(tmp_path / "config.yml")
+    shutil.copy(config.parent / SCENE_FILE, tmp_path)
+    with pytest.raises(UserError, match="holds no checkpoint"):
+        lang3dxl_ns.load_scene(tmp_path / "config.yml")
+
+
+def test_a_run_without_semantics_is_refused(trainer):
+    file = SceneFile.read(trainer.base_dir / SCENE_FILE)
+    with pytest.raises(UserError, match="no semantics"):
+        scene_of_model(trainer.pipeline.model, SceneFile(**{**vars(file), "clip": None}))
+
+
+def test_another_clip_is_refused(trainer):
+    file = SceneFile.read(trainer.base_dir / SCENE_FILE)
+    with pytest.raises(UserError, match="not the one this run was trained with"):
+        scene_of_model(trainer.pipeline.model, SceneFile(**{**vars(file), "clip_identity": "another"}))
+
+
+def test_a_run_remembers_its_foreground_masks(trainer, scene):
+    photos = trainer.pipeline.datamanager.photos
+    assert {photo.name for photo in scene.file.photos if photo.mask} == {"photo_001.jpg"}
+    photo = scene.file.photo("photo_001")
+    assert photo.mask == str(photos["photo_001.jpg"].mask_path)
+    assert photo.foreground() is None  # its file has moved with the data

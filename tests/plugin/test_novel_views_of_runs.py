@@ -1,0 +1,87 @@
+"""A scene's test views in a run: placed, prepared and scored like its photos."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from label_sets import write_plain
+from PIL import Image
+
+from lang3dxl_ns import cli
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.novel_views import FOLDER, write_novel_cameras
+
+HELD_OUT = ("photo_000.jpg", "photo_008.jpg")
+
+
+@pytest.fixture(scope="module")
+def data(scene, tmp_path_factory):
+    """The scene, with the held-out photos as its test views too: every figure must be the same."""
+    folder = tmp_path_factory.mktemp("with_views") / "scene"
+    shutil.copytree(scene, folder, ignore=shutil.ignore_patterns("lang3dxl_cache"))
+    photos = read_reconstruction(folder / "sparse" / "0").photos
+    (folder / FOLDER / "images").mkdir(parents=True)
+    for name in HELD_OUT:
+        shutil.copy(folder / "images" / name, folder / FOLDER / "images" / name)
+        width, height = Image.open(folder / "images" / name).size
+        mask = np.zeros((height, width), bool)
+        mask[:, : width // 2] = True
+        for truth in (folder / "ground_truth", folder / FOLDER / "ground_truth"):
+            write_plain(truth, "dome", name.removesuffix(".jpg"), mask)
+    write_novel_cameras(folder, [photos[name] for name in HELD_OUT], same_light=True)
+    return folder
+
+
+@pytest.fixture
+def pipeline(train, data):
+    return train(data, iterations=2).pipeline
+
+
+def test_a_photo_as_a_test_view_is_placed_and_scored_as_the_photo(pipeline):
+    manager = pipeline.datamanager
+    for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height"):
+        own, photo = (getattr(d.cameras, name) for d in (manager.test_dataset, manager.eval_dataset))
+        torch.testing.assert_close(own, photo, atol=1e-4, rtol=1e-5)
+    results = pipeline.get_average_eval_image_metrics(get_std=True)
+    beside = results["test_views"]
+    assert set(beside["photos"]) == {f"{FOLDER}/{name}" for name in HELD_OUT}
+    for name, photo in results["photos"].items():
+        view = beside["photos"][f"{FOLDER}/{name}"]
+        same = [key for key in photo if key not in ("fps", "render_seconds", "query_seconds")]
+        assert {"psnr", "ap_dome", "teacher_ap_dome", "limit_ap_dome", "chance_ap_dome", "clip_l1"} <= set(
+            same
+        )
+        assert {key: view[key] for key in same} == pytest.approx({key: photo[key] for key in same}, abs=1e-3)
+    assert beside["protocol"]["split"] == "test" and results["protocol"]["split"] == "held-out"
+    assert results["limit_map"] > results["chance_map"] == pytest.approx(0.5, abs=0.02)
+
+
+def test_in_another_light_colours_are_compared_once_matched(pipeline, data):
+    path = data / FOLDER / "cameras.json"
+    content = path.read_text()
+    path.write_text(json.dumps(json.loads(content) | {"same_light": False}))
+    try:
+        metrics = next(iter(pipeline.evaluate("test"))).metrics
+    finally:
+        path.write_text(content)
+    assert "cc_psnr" in metrics and not {"psnr", "ssim"} & set(metrics)
+
+
+def test_the_split_is_asked_for_by_name(pipeline, data, tmp_path, monkeypatch):
+    monkeypatch.setattr("lang3dxl_ns.plugin.open_run.open_run", lambda path: (None, pipeline, 0))
+    (tmp_path / "config.yml").touch()
+    command = ["evaluate", "run", "--load-config", str(tmp_path / "config.yml"), "--split", "test"]
+    monkeypatch.setattr("sys.argv", ["lang3dxl", *command, "--out", str(tmp_path / "out")])
+    cli.main()
+    table = (tmp_path / "out" / "scores.md").read_text()
+    assert "limit" in table and "chance" in table and "split: test" in table
+
+
+def test_a_scene_without_test_views_says_so(train, scene):
+    pipeline = train(scene, iterations=2, semantics=False).pipeline
+    assert "test_views" not in pipeline.get_average_eval_image_metrics(get_std=True)
+    with pytest.raises(UserError, match=r"has no test views: `lang3dxl demo-scene` makes"):
+        list(pipeline.evaluate("test"))

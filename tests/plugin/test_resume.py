@@ -1,0 +1,96 @@
+"""Exact resume: a resumed run equals the uninterrupted one to the last bit."""
+
+import pytest
+import torch
+from conftest import make_trainer
+
+from lang3dxl_ns.common.errors import UserError
+
+EVERYTHING = {
+    "pipeline__model__encoder__name": "paper",
+    "pipeline__model__densify_grad_thresh": 1e-7,  # at every second step, with random splits
+    "pipeline__model__densify_until": 0.75,
+    "pipeline__model__appearance__use": "on",
+    "pipeline__model__camera_optimisation": "on",
+    "pipeline__model__view_dependence": "on",
+    "pipeline__model__background_color": "random",
+    "steps_per_eval_image": 0,
+}
+
+
+def same(first, second, where="checkpoint") -> list[str]:
+    """Names of the entries that differ between two checkpoints."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys(), where
+        return [name for key in first for name in same(first[key], second[key], f"{where}.{key}")]
+    if isinstance(first, list | tuple):
+        assert len(first) == len(second), where
+        pairs = enumerate(zip(first, second, strict=True))
+        return [name for i, pair in pairs for name in same(*pair, f"{where}.{i}")]
+    if isinstance(first, torch.Tensor):
+        equal = first.shape == second.shape and bool(((first == second) | (first != first)).all())
+    else:
+        equal = first == second
+    return [] if equal else [where]
+
+
+def last_checkpoint(trainer) -> dict:
+    return torch.load(max(trainer.checkpoint_dir.glob("*.ckpt")), weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def whole(scene, tiny_clip, tiny_dense, tmp_path_factory):
+    """An uninterrupted run of 24 steps with a checkpoint every five."""
+    folder = tmp_path_factory.mktemp("whole")
+    changes = EVERYTHING | {"steps_per_save": 5, "save_only_latest_checkpoint": False}
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 24, **changes)
+    trainer.setup()
+    trainer.train()
+    return trainer
+
+
+@pytest.mark.parametrize("step", [5, 10])
+def test_resumed_at_a_step_the_run_ends_as_if_it_had_never_stopped(train, scene, whole, step):
+    """Densification follows both steps, and its statistics are half collected at 5."""
+    middle = whole.checkpoint_dir / f"step-{step:09d}.ckpt"
+    resumed = train(scene, iterations=24, load_checkpoint=middle, **EVERYTHING)
+    assert resumed.first_iteration == step + 1
+    before = len(torch.load(middle, weights_only=True)["pipeline"]["_model.gauss_params.means"])
+    assert resumed.pipeline.model.num_points > before
+    assert same(last_checkpoint(whole), last_checkpoint(resumed)) == []
+
+
+def test_one_seed_twice_gives_equal_checkpoints(train, scene, whole):
+    again = train(scene, iterations=24, **EVERYTHING)
+    assert same(last_checkpoint(whole), last_checkpoint(again)) == []
+
+
+def test_a_resume_from_a_folder_without_checkpoint_says_so(train, scene, tmp_path):
+    with pytest.raises(UserError, match="there is no checkpoint"):
+        train(scene, iterations=4, semantics=False, load_dir=tmp_path)
+
+
+def test_a_damaged_photo_does_not_change_the_order_of_the_others(train, scene, whole, monkeypatch):
+    """A resumed run meets it later, but continues with the same order of photos."""
+    datamanager = whole.pipeline.datamanager
+    make = type(datamanager)._batch
+
+    def damaged(self, dataset, index, data):
+        if index == 2:
+            raise UserError("cannot be read")
+        return make(self, dataset, index, data)
+
+    monkeypatch.setattr(type(datamanager), "_batch", damaged)
+    state = datamanager.round_state()
+
+    def names(count: int) -> list[str]:
+        return [datamanager.next_train(0)[1]["name"] for _ in range(count)]
+
+    started = names(5)
+    middle = datamanager.round_state()
+    whole_order = started + names(40)
+    datamanager._left_out.clear()
+    datamanager.restore_round(middle)
+    assert started + names(40) == whole_order
+    datamanager._left_out.clear()
+    datamanager.restore_round(state)

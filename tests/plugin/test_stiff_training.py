@@ -1,0 +1,94 @@
+"""Training with extreme photos and learning rates: every number stays finite."""
+
+import shutil
+
+import pytest
+import torch
+from scenes import write_scene
+
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+
+QUIET = {"steps_per_eval_image": 0}
+
+
+def all_finite(state) -> bool:
+    if isinstance(state, torch.Tensor):
+        return bool(state.isfinite().all())
+    values = state.values() if isinstance(state, dict) else state if isinstance(state, list | tuple) else ()
+    return all(map(all_finite, values))
+
+
+def is_sound(trainer) -> bool:
+    """No step was skipped, and the checkpoint holds only finite numbers."""
+    state = torch.load(next(trainer.checkpoint_dir.glob("*.ckpt")), weights_only=True)
+    codes = state["pipeline"]["_model.gauss_params.codes"]
+    assert (codes.isfinite() | codes.isnan().all(1, keepdim=True)).all()  # or unknown
+    codes.nan_to_num_(0.0)
+    return trainer.guard.skipped == 0 and all_finite(state["pipeline"]) and all_finite(state["optimizers"])
+
+
+def black(batch):
+    batch["image"] = torch.zeros_like(batch["image"])
+
+
+def no_foreground(batch):
+    batch["mask"] = torch.zeros(*batch["image"].shape[:2], 1, dtype=torch.bool)
+
+
+def overexposed(batch):
+    batch["image"] = batch["image"].float() / 255 * 100
+
+
+def underexposed(batch):
+    batch["image"] = batch["image"] // 100
+
+
+def loud_targets(batch):
+    batch["clip_target"] = 1e4 * batch["clip_target"]
+
+
+EXTREMES = (black, no_foreground, overexposed, underexposed, loud_targets)
+
+
+@pytest.fixture
+def spoil(monkeypatch):
+    """Changes the batches of photos by name; None: of all of them."""
+
+    def install(changes):
+        make = Lang3DXLDataManager._batch
+
+        def spoilt(self, dataset, index, data):
+            camera, batch = make(self, dataset, index, data)
+            change = changes.get(batch["name"], changes.get(None))
+            if change is not None:
+                change(batch)
+            return camera, batch
+
+        monkeypatch.setattr(Lang3DXLDataManager, "_batch", spoilt)
+
+    return install
+
+
+def test_extreme_photos_among_usual_ones_break_nothing(train, scene, spoil):
+    spoil({f"photo_{i:03d}.jpg": change for i, change in enumerate(EXTREMES, start=1)})
+    changes = {"pipeline__model__densify_grad_thresh": 1e-7, "pipeline__model__appearance__use": "on"}
+    assert is_sound(train(scene, iterations=20, **changes, **QUIET))
+
+
+@pytest.mark.parametrize("change", EXTREMES, ids=lambda change: change.__name__)
+def test_a_collection_of_nothing_but_extreme_photos_breaks_nothing(train, scene, spoil, change):
+    spoil({None: change})
+    assert is_sound(train(scene, iterations=6, **QUIET))
+
+
+def test_three_photos_are_enough(train, tmp_path):
+    assert is_sound(train(write_scene(tmp_path / "few", photos=3, points=100), iterations=12, **QUIET))
+
+
+@pytest.mark.parametrize("duplicates", [4, 5])
+def test_duplicates_of_a_photo_break_nothing(train, tmp_path, duplicates):
+    """Of six; five leave no distance between any two cameras."""
+    folder = write_scene(tmp_path / "same", photos=6, points=100, duplicates=duplicates)
+    for i in range(6 - duplicates, 6):
+        shutil.copy(folder / "images" / "photo_000.jpg", folder / "images" / f"photo_{i:03d}.jpg")
+    assert is_sound(train(folder, iterations=8, **QUIET))

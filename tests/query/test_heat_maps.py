@@ -1,0 +1,34 @@
+"""Heat maps of relevancy."""
+
+import pytest
+import torch
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.heat_maps import colour, heat, overlay
+
+RELEVANCY = torch.tensor([[0.0, 0.4, 0.5], [0.55, 0.6, 0.7]])
+IMAGE = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(0))
+
+
+def test_heat_starts_at_the_threshold_and_ends_at_the_highest():
+    torch.testing.assert_close(heat(RELEVANCY), torch.tensor([[0.0, 0.0, 0.0], [0.25, 0.5, 1.0]]))
+    torch.testing.assert_close(heat(RELEVANCY, highest=0.9)[1], torch.tensor([0.125, 0.25, 0.5]))
+
+
+def test_a_map_below_the_threshold_is_cold():
+    assert (heat(torch.full((2, 2), 0.3)) == 0).all()
+
+
+def test_only_what_matches_is_painted():
+    picture = overlay(IMAGE, RELEVANCY)
+    assert torch.equal(picture[0], IMAGE[0])
+    assert (picture[1] != IMAGE[1]).any(1).all()
+    assert picture.min() >= 0 and picture.max() <= 1
+    assert torch.equal(overlay(IMAGE, RELEVANCY, opacity=0.0), IMAGE)
+
+
+def test_colours_are_matplotlibs():
+    grey = colour(torch.tensor([0.0, 1.0, 2.0]), "gray")
+    torch.testing.assert_close(grey, torch.tensor([[0.0] * 3, [1.0] * 3, [1.0] * 3]))
+    with pytest.raises(UserError, match="no colour map 'rainbows'"):
+        colour(RELEVANCY, "rainbows")

@@ -1,0 +1,88 @@
+"""The scene description in a run's folder."""
+
+import json
+import math
+
+import pytest
+import torch
+from painted_scene import painted_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.run_file import SceneFile, read_camera_path
+from lang3dxl_ns.scene.camera import camera_to_world, posed, resized, view_matrix
+
+
+@pytest.fixture
+def file():
+    return painted_scene().file
+
+
+def test_it_reads_what_it_wrote(file, tmp_path):
+    file.write(tmp_path / "scene.json")
+    assert SceneFile.read(tmp_path / "scene.json") == file
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", '{"version": 2}', '{"version": 1, "photos": [{}]}'])
+def test_a_damaged_file_is_named(tmp_path, content):
+    (tmp_path / "scene.json").write_text(content)
+    with pytest.raises(UserError, match=r"scene.json can't be read"):
+        SceneFile.read(tmp_path / "scene.json")
+
+
+def test_a_missing_file_is_explained(tmp_path):
+    with pytest.raises(UserError, match="an earlier version"):
+        SceneFile.read(tmp_path / "scene.json")
+
+
+@pytest.mark.parametrize("name", ["left/0001.jpg", "0001.jpg", "0001"])
+def test_a_photo_goes_by_its_name_file_name_or_stem(file, name):
+    assert file.photo(name).name == "left/0001.jpg"
+
+
+def test_a_resized_camera_sees_the_same(file):
+    camera = file.photos[0].camera
+    small = resized(camera, 24)
+    assert (small.width, small.height) == (24, 24)
+    point = torch.tensor([0.3, 0.1, 1.0])
+    big, tiny = camera.intrinsics @ point / 96, small.intrinsics @ point / 24
+    torch.testing.assert_close(big[:2], tiny[:2])
+    assert resized(camera, 1000).width == 96
+
+
+def test_camera_to_world_is_the_inverse_of_the_view_matrix():
+    generator = torch.Generator().manual_seed(0)
+    pose = torch.cat(
+        [torch.linalg.qr(torch.randn(3, 3, generator=generator)).Q, torch.randn(3, 1, generator=generator)], 1
+    )
+    torch.testing.assert_close(camera_to_world(view_matrix(pose)), pose)
+
+
+def test_a_posed_camera_has_the_lens_of_another(file):
+    camera = file.photos[0].camera
+    again = posed(camera_to_world(camera.view_matrix), like=camera)
+    torch.testing.assert_close(again.view_matrix, camera.view_matrix)
+    assert torch.equal(again.intrinsics, camera.intrinsics)
+
+
+def test_a_camera_path_of_the_viewer_is_read(tmp_path):
+    frame = {"camera_to_world": torch.eye(4).flatten().tolist(), "fov": 90.0, "aspect": 1.5}
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"render_width": 60, "render_height": 40, "camera_path": [frame, frame]}))
+    cameras = read_camera_path(path)
+    assert len(cameras) == 2
+    # 90 degrees from top to bottom: half the height is one focal length away.
+    assert cameras[0].intrinsics[1, 1] == pytest.approx(20 / math.tan(math.pi / 4))
+    torch.testing.assert_close(cameras[0].view_matrix, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
+
+
+NO_FRAME, SMALL_POSE = "{}", '{"camera_to_world": [1], "fov": 1}'
+PATH = '{"render_width": 1, "render_height": 1, "camera_path": [%s]}'
+
+
+@pytest.mark.parametrize("content", [None, "", "{}", PATH % NO_FRAME, PATH % SMALL_POSE])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / "path.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(UserError, match="is not a camera path"):
+        read_camera_path(path)

@@ -1,0 +1,83 @@
+"""The compiled kernels: their exponential, threads, memory."""
+
+import numba
+import numpy as np
+import pytest
+import torch
+from splat_clouds import gradients, make_cloud, maps
+
+from lang3dxl_ns.rendering import fused_plan, rasterize
+from lang3dxl_ns.rendering.simd import LANES, exp2, load, store
+
+
+@numba.njit
+def powers(exponents, out):
+    for i in range(0, len(exponents), LANES):
+        store(out, i, exp2(load(exponents, i)))
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(np.float32, 3e-7), (np.float64, 3e-15)])
+def test_the_power_of_two_is_right_to_rounding(dtype, bound):
+    exponents = np.linspace(-100, 1, LANES * 4001).astype(dtype)
+    found = np.empty_like(exponents)
+    powers(exponents, found)
+    assert np.abs(found / np.exp2(exponents.astype(np.longdouble)) - 1).max() < bound
+
+
+def rendered(cloud, threads, **settings):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        leaves = cloud.leaves(torch.float32)
+        rendering = cloud.render(rasterize, leaves, backend="numba", **settings)
+        return maps(rendering), gradients(rendering, leaves)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_any_number_of_threads_gives_the_same():
+    cloud = make_cloud(2000, 70, 50, size=0.06)
+    alone, alone_gradients = rendered(cloud, 1)
+    for threads in (2, 5):
+        found, found_gradients = rendered(cloud, threads)
+        _, again_gradients = rendered(cloud, threads)
+        for name, value in alone.items():
+            assert torch.equal(found[name], value), name
+        for name, value in alone_gradients.items():
+            torch.testing.assert_close(found_gradients[name], value, rtol=1e-4, atol=1e-5)
+            assert torch.equal(found_gradients[name], again_gradients[name]), name
+
+
+@pytest.mark.parametrize("channels", [1, 4, 9])
+@pytest.mark.parametrize("features", [0, 1, 7])
+def test_any_number_of_channels_equals_the_torch_kernels(channels, features):
+    cloud = make_cloud(200, 40, 30)
+    generator = torch.Generator().manual_seed(5)
+    cloud.tensors["channels"] = torch.rand(200, channels, generator=generator).double()
+    cloud.tensors["features"] = torch.rand(200, features, generator=generator).double()
+    cloud.tensors["background"] = torch.rand(channels, generator=generator).double()
+    ours, theirs = cloud.leaves(), cloud.leaves()
+    found = cloud.render(rasterize, ours, backend="numba")
+    expected = cloud.render(rasterize, theirs, backend="torch")
+    for name, value in maps(expected).items():
+        torch.testing.assert_close(getattr(found, name), value, atol=1e-10, rtol=0)
+    expected_gradients = gradients(expected, theirs)
+    for name, value in gradients(found, ours).items():
+        torch.testing.assert_close(value, expected_gradients[name], atol=1e-9, rtol=1e-9)
+
+
+def test_gaussians_close_to_the_camera_take_four_bytes_a_tile(monkeypatch):
+    make, plans = fused_plan.make_plan, []
+
+    def kept(*arguments):
+        plans.append(make(*arguments))
+        return plans[-1]
+
+    monkeypatch.setattr("lang3dxl_ns.rendering.fused_compositing.make_plan", kept)
+    cloud = make_cloud(3000, 320, 240, size=0.02)
+    cloud.tensors["means"] *= 0.02
+    cloud.tensors["view_matrix"][:3, 3] *= 0.02
+    leaves = cloud.leaves(torch.float32)
+    cloud.render(rasterize, leaves, backend="numba").image.sum().backward()
+    assert plans[0].ranks.nbytes <= 4 * 3000 * 20 * 15
+    assert bool(leaves["means"].grad.isfinite().all())

@@ -1,0 +1,144 @@
+"""Laws of gathering pixels onto Gaussians."""
+
+import torch
+
+from lang3dxl_ns.baselines.lifting import LiftedFeatures
+from lang3dxl_ns.plugin.lift_features import pixel_features
+from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering.gathering import filled_pixels, gather
+from lang3dxl_ns.scene.camera import Camera
+
+SIZE = 24
+
+
+def gaussians(count: int = 5) -> Gaussians:
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5
+    means[-1] = torch.tensor([0.0, 0.0, -50.0])  # behind every camera
+    return Gaussians(
+        means,
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(count, 1),
+        torch.full((count, 3), 0.15, dtype=torch.float64),
+        torch.full((count,), 0.7, dtype=torch.float64),
+    )
+
+
+def cameras() -> list[Camera]:
+    intrinsics = torch.tensor([[20.0, 0.0, SIZE / 2], [0.0, 20.0, SIZE / 2], [0.0, 0.0, 1.0]])
+    views = []
+    for x in (-0.3, 0.3):
+        view = torch.eye(4, dtype=torch.float64)
+        view[:3, 3] = torch.tensor([x, 0.0, 2.0])
+        views.append(Camera(view, intrinsics.double(), SIZE, SIZE))
+    return views
+
+
+def composite(camera: Camera, carried: torch.Tensor) -> torch.Tensor:
+    scene = gaussians()
+    rendering = rasterize(scene, camera, torch.zeros(len(carried), 1).double(), features=carried)
+    return rendering.features
+
+
+def test_a_lifted_feature_is_the_mean_of_the_pixels_weighted_by_the_contribution():
+    """Weights by hand: what a Gaussian alone carries a 1 of is its contribution to every pixel."""
+    generator = torch.Generator().manual_seed(1)
+    pixels = [torch.rand(SIZE, SIZE, 4, generator=generator, dtype=torch.float64) for _ in cameras()]
+    for view in pixels:
+        view[..., -1] = 1
+        view[:, :3] = 0  # masked
+    views = [
+        (lambda carried, camera=camera: composite(camera, carried), view)
+        for camera, view in zip(cameras(), pixels, strict=True)
+    ]
+    lifted, mass = gather(5, views, 3, torch.zeros(1, dtype=torch.float64))
+
+    expected, masses = torch.zeros(5, 3, dtype=torch.float64), torch.zeros(5, dtype=torch.float64)
+    for index in range(4):
+        total = torch.zeros(3, dtype=torch.float64)
+        for camera, view in zip(cameras(), pixels, strict=True):
+            weight = composite(camera, torch.eye(5, dtype=torch.float64)[:, index : index + 1])
+            total += (weight * view[..., :-1]).sum((0, 1))
+            masses[index] += (weight * view[..., -1:]).sum()
+        expected[index] = total / masses[index]
+    torch.testing.assert_close(lifted, expected)
+    torch.testing.assert_close(mass, masses)
+    assert (lifted[-1] == 0).all()  # never seen
+
+
+def test_where_all_pixels_agree_the_rendered_feature_is_theirs_at_any_coverage():
+    feature = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
+    pixels = torch.cat([feature, torch.ones(1).double()]).expand(SIZE, SIZE, 4)
+    camera = cameras()[0]
+    encoder = LiftedFeatures(2, 1)
+    lifted = gather(5, [(lambda carried: composite(camera, carried), pixels)], 3, feature)
+    rendered = composite(camera, encoder.learn_gaussians(*lifted))
+    clip, dense = encoder(rendered)
+    seen = rendered[..., -1] > 1e-3
+    assert rendered[..., -1][seen].min() < 0.1
+    torch.testing.assert_close(clip[seen], feature[:2].expand(int(seen.sum()), 2))
+    torch.testing.assert_close(dense[seen], feature[2:].expand(int(seen.sum()), 1))
+
+
+def test_pixels_have_the_targets_at_their_places_and_nothing_off_the_mask():
+    ramp = ((torch.arange(8) + 0.5) / 8).expand(6, 8)[..., None]
+    mask = torch.zeros(12, 16, dtype=torch.bool)
+    mask[:, 8:] = True
+    pixels = pixel_features(ramp, torch.full((3, 3, 2), 5.0), mask, (12, 16))
+    assert pixels.shape == (12, 16, 4)
+    assert (pixels[:, :8] == 0).all()
+    torch.testing.assert_close(pixels[:, 8:15, 0], ((torch.arange(16) + 0.5) / 16)[8:15].expand(12, 7))
+    assert (pixels[:, 8:, 1:3] == 5).all() and (pixels[:, 8:, 3] == 1).all()
+    everywhere = pixel_features(ramp, None, None, (12, 16))
+    assert (everywhere[..., -1] == 1).all() and everywhere.shape == (12, 16, 2)
+
+
+def test_the_order_of_photos_does_not_matter_and_a_photo_that_counts_nowhere_adds_nothing():
+    generator = torch.Generator().manual_seed(2)
+    pixels = [torch.rand(SIZE, SIZE, 4, generator=generator, dtype=torch.float64) for _ in range(2)]
+    for view in pixels:
+        view[..., -1] = 1
+    views = [
+        (lambda carried, camera=camera: composite(camera, carried), view)
+        for camera, view in zip(cameras(), pixels, strict=True)
+    ]
+    nothing = (views[0][0], torch.zeros(SIZE, SIZE, 4).double())
+    there = gather(5, views, 3, torch.zeros(1, dtype=torch.float64))
+    back = gather(5, [*views[::-1], nothing], 3, torch.zeros(1, dtype=torch.float64))
+    torch.testing.assert_close(there[0], back[0])
+    torch.testing.assert_close(there[1], back[1])
+
+
+def test_a_gaussians_feature_is_that_of_the_pixels_that_show_it():
+    generator = torch.Generator().manual_seed(3)
+    features = torch.rand(5, 3, generator=generator, dtype=torch.float64)
+    for index in range(4):
+        views = []
+        for camera in cameras():
+            alone = torch.zeros(5, 1, dtype=torch.float64)
+            alone[index] = 1
+            weight = composite(camera, alone)
+            everything = composite(camera, torch.ones(5, 1, dtype=torch.float64))
+            only = (weight > 0.5 * everything) & (weight > 1e-6)  # little else shows here
+            pixels = torch.cat([features[index].expand(SIZE, SIZE, 3), torch.ones(SIZE, SIZE, 1)], dim=-1)
+            views.append((lambda carried, camera=camera: composite(camera, carried), only * pixels))
+        found, mass = gather(5, views, 3, features)
+        assert mass[index] > 0
+        torch.testing.assert_close(found[index], features[index])
+
+
+def test_pixels_that_are_not_finite_do_not_count():
+    target = torch.ones(4, 4, 2)
+    target[0, 0, 1] = torch.nan
+    pixels = pixel_features(target, None, None, (4, 4))
+    assert pixels.isfinite().all() and (pixels[0, 0] == 0).all() and pixels[..., -1].sum() == 15
+
+
+def test_pixels_that_a_gaussian_fills_are_its_weights():
+    camera = cameras()[0]
+    weight = torch.rand(SIZE, SIZE, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    filled = filled_pixels(lambda carried: composite(camera, carried), weight, 5)
+    for index in range(5):
+        alone = torch.zeros(5, 1, dtype=torch.float64)
+        alone[index] = 1
+        expected = (composite(camera, alone)[..., 0] * weight).sum()
+        torch.testing.assert_close(filled[index], expected)

@@ -1,0 +1,98 @@
+"""Photos are found where people put them; those of one camera share it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.scene.pairing import pairs_to_match, similar_pairs
+from lang3dxl_ns.scene.photo_folder import find_photos, shared_cameras
+
+
+def put(path, size=(8, 6), body=None, focal=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exif = Image.Exif()
+    if body:
+        exif[ExifTags.Base.Model] = body
+    if focal:
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLength] = focal
+    Image.new("RGB", size).save(path, exif=exif)
+
+
+@pytest.mark.parametrize(
+    ("files", "folder", "names"),
+    [
+        (["b.jpg", "a.JPG", "notes.txt"], ".", ["a.JPG", "b.jpg"]),
+        (["images/a.jpg", "images/more/b.png", "loose.jpg"], "images", ["a.jpg", "more/b.png"]),
+        (["day/a.jpg", "night/a.jpg"], ".", ["day/a.jpg", "night/a.jpg"]),
+        (["a.jpg", "masks/a.png", "outputs/x/r.png", ".trash/b.jpg"], ".", ["a.jpg"]),
+        (["sparse/0/images.bin"], ".", []),
+    ],
+    ids=["flat", "images", "sub-folders", "no masks", "none"],
+)
+def test_photos_are_found(tmp_path, files, folder, names):
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    found = find_photos(tmp_path)
+    assert found.folder == tmp_path / folder
+    assert list(found.names) == names
+
+
+def test_a_missing_folder_is_an_error(tmp_path):
+    with pytest.raises(UserError, match="not a folder"):
+        find_photos(tmp_path / "nowhere")
+
+
+def groups(tmp_path):
+    return sorted(map(sorted, shared_cameras(find_photos(tmp_path))))
+
+
+def test_photos_of_one_size_without_exif_share_a_camera(tmp_path):
+    for name in "abc":
+        put(tmp_path / f"{name}.jpg")
+    assert groups(tmp_path) == [["a.jpg", "b.jpg", "c.jpg"]]
+
+
+def test_photos_of_several_sizes_without_exif_have_a_camera_each(tmp_path):
+    for i, name in enumerate("abc"):
+        put(tmp_path / f"{name}.jpg", size=(8, 6 + i // 2))
+    assert groups(tmp_path) == [["a.jpg"], ["b.jpg"], ["c.jpg"]]
+
+
+def test_exif_tells_cameras_and_zooms_apart(tmp_path):
+    put(tmp_path / "a.jpg", body="X", focal=35.0)
+    put(tmp_path / "b.jpg", body="X", focal=35.0)
+    put(tmp_path / "zoomed.jpg", body="X", focal=70.0)
+    put(tmp_path / "other.jpg", body="Y", focal=35.0)
+    put(tmp_path / "turned.jpg", size=(6, 8), body="X", focal=35.0)
+    assert groups(tmp_path) == [["a.jpg", "b.jpg"], ["other.jpg"], ["turned.jpg"], ["zoomed.jpg"]]
+
+
+def test_few_photos_are_matched_all_with_all():
+    assert pairs_to_match(["a", "b", "c"], None) == [("a", "b"), ("a", "c"), ("b", "c")]
+
+
+def test_similar_photos_find_each_other():
+    """Photos of four places, whose descriptors are drawn around those of their place."""
+    rng = np.random.default_rng(0)
+    places = rng.integers(0, 255, (4, 60, 128))
+    names = [f"{i:02d}" for i in rng.permutation(24)]
+    described = {
+        name: (places[int(name) % 4] + rng.normal(0, 20, (60, 128))).clip(0, 255).astype(np.uint8)
+        for name in names
+    }
+    pairs = similar_pairs(sorted(names), described.__getitem__, 5, lambda: None)
+    assert {(int(a) - int(b)) % 4 for a, b in pairs} == {0}
+    assert len(pairs) == 4 * 15
+
+
+def test_large_collections_are_matched_with_neighbors_alone():
+    rng = np.random.default_rng(0)
+    names = [f"{i:03d}" for i in range(260)]
+    described = {name: rng.integers(0, 255, (20, 128), dtype=np.uint8) for name in names}
+    pairs = pairs_to_match(names, described.__getitem__)
+    assert len(set(pairs)) == len(pairs) < 260 * 60
+    assert set(pairwise(names)) <= set(pairs)

@@ -1,0 +1,201 @@
+"""From photos to a COLMAP model: poses are right, what is left out is named, a stopped one goes on."""
+
+import shutil
+
+import numpy as np  # before pycolmap
+import pycolmap
+import pytest
+import scenes
+from PIL import Image
+from scenes import speckled, write_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.scene import reconstruct as module
+from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.photo_folder import find_photos
+from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Photos of a speckled box, with the model that they were made from in given/."""
+    folder = tmp_path_factory.mktemp("photos") / "scene"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes, "texture", speckled)
+        write_scene(folder, photos=7, size=(240, 180))
+    shutil.move(folder / "sparse", folder / "given")
+    return folder
+
+
+@pytest.fixture
+def photos(scene, tmp_path):
+    """A copy of the photos alone."""
+    shutil.copytree(scene / "images", tmp_path / "data" / "images")
+    return tmp_path / "data"
+
+
+def pose_errors(model, given):
+    """Degrees between rotations, and distances between positions in the given model's units, once aligned."""
+    found, true = read_reconstruction(model).photos, read_reconstruction(given).photos
+    names = sorted(set(found) & set(true))
+    align = pycolmap.estimate_sim3d(*(np.array([m[n].centre for n in names]) for m in (found, true)))
+    turn = align.rotation.matrix()
+    degrees, distances = [], []
+    for name in names:
+        ours, theirs = found[name], true[name]
+        between = ours.camera_from_world[:, :3] @ turn.T @ theirs.camera_from_world[:, :3].T
+        degrees.append(np.degrees(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1))))
+        distances.append(np.linalg.norm(align * ours.centre - theirs.centre))
+    return np.array(degrees), np.array(distances)
+
+
+@pytest.fixture(scope="module")
+def reconstructed(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reconstructed") / "data"
+    shutil.copytree(scene / "images", folder / "images")
+    data, model = reconstruct_scene(folder)
+    return data, model, scene / "given" / "0"
+
+
+def test_poses_are_those_that_the_photos_were_taken_from(reconstructed):
+    data, model, given = reconstructed
+    assert model == data / "sparse" / "0"
+    assert len(read_reconstruction(model).photos) == 7
+    degrees, distances = pose_errors(model, given)
+    assert degrees.max() < 2.5
+    assert distances.max() < 0.15  # of about 4 to the box
+
+
+def test_all_photos_share_the_camera(reconstructed):
+    _, model, _ = reconstructed
+    assert pycolmap.Reconstruction(model).num_cameras() == 1
+
+
+def test_a_model_that_is_there_is_left_as_it_is(photos):
+    (photos / "sparse" / "0").mkdir(parents=True)
+    (photos / "sparse" / "0" / "images.bin").write_bytes(b"precious")
+    with pytest.raises(UserError, match="already exists"):
+        reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    assert (photos / "sparse" / "0" / "images.bin").read_bytes() == b"precious"
+
+
+def test_where_sparse_is_taken_the_model_goes_to_the_cache(photos):
+    (photos / "sparse").mkdir()
+    (photos / "sparse" / "notes.txt").write_text("mine")
+    _, model = reconstruct_scene(photos)
+    assert model == photos / "lang3dxl_cache" / "reconstruction" / "sparse" / "0"
+    assert [path.name for path in (photos / "sparse").iterdir()] == ["notes.txt"]
+
+
+def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch):
+    extracted = []
+    extract, match = pycolmap.extract_features, pycolmap.match_image_pairs
+
+    def noted(database, folder, names, **options):
+        extracted.extend(names)
+        extract(database, folder, names, **options)
+
+    def stopped(*arguments):
+        match(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pycolmap, "extract_features", noted)
+    monkeypatch.setattr(pycolmap, "match_image_pairs", stopped)
+    monkeypatch.setattr(module, "_CHUNK_PAIRS", 10)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_scene(photos)
+    assert not (photos / "sparse").exists()
+
+    matched = []
+    monkeypatch.setattr(
+        pycolmap,
+        "match_image_pairs",
+        lambda database, options, pairing: (
+            matched.extend(pairing.match_list_path.read_text().splitlines()),
+            match(database, options, pairing),
+        ),
+    )
+    reconstruct_scene(photos)
+    assert sorted(extracted) == [f"photo_{i:03d}.jpg" for i in range(7)]  # each once
+    assert len(matched) == 7 * 6 // 2 - 10
+
+
+def test_other_photos_begin_anew(photos):
+    reconstruct_scene(photos)
+    shutil.rmtree(photos / "sparse")
+    (photos / "images" / "photo_006.jpg").unlink()
+    assert len(read_reconstruction(reconstruct_scene(photos)[1]).photos) == 6
+
+
+def test_photos_that_do_not_fit_are_named_with_the_reason(photos, capsys):
+    rng = np.random.default_rng(0)
+    folder = photos / "images"
+    Image.fromarray(rng.integers(0, 255, (180, 240, 3), np.uint8)).save(folder / "noise.jpg")
+    Image.new("RGB", (240, 180), "gray").save(folder / "blank.jpg")
+    (folder / "broken.jpg").write_bytes(b"no photo")
+    (folder / "phone.heic").write_bytes(b"no photo")
+    shutil.copy(folder / "photo_000.jpg", folder / "twin.jpg")
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    assert report.registered == 7
+    assert report.photos == 12
+    reasons = report.left_out
+    assert set(reasons) == {"noise.jpg", "blank.jpg", "broken.jpg", "phone.heic", "twin.jpg"}
+    assert "matches no other" in reasons["noise.jpg"]
+    assert "hardly any detail" in reasons["blank.jpg"]
+    assert "damaged" in reasons["broken.jpg"]
+    assert "convert it to JPEG" in reasons["phone.heic"]
+    assert reasons["twin.jpg"] == "the same file as photo_000.jpg"
+    assert any("noise.jpg" in line for line in report.lines())
+
+
+def test_of_two_buildings_the_larger_is_used_and_the_other_told(photos, tmp_path):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes, "texture", lambda points: speckled(points + 100))
+        write_scene(tmp_path / "other", photos=4, size=(240, 180))
+    for path in (tmp_path / "other" / "images").iterdir():
+        shutil.copy(path, photos / "images" / f"other_{path.name}")
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    assert report.registered == 7
+    assert report.other_models == (4,)
+    assert report.left_out["other_photo_000.jpg"] == "in a separate model of 4 photos"
+    assert len(read_reconstruction(photos / "sparse" / "1").photos) == 4
+
+
+def picture(folder, count, paint):
+    folder.mkdir()
+    for i in range(count):
+        Image.fromarray(paint(i)).save(folder / f"{i}.png")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("count", "paint", "message"),
+    [
+        (0, None, "neither photos nor a COLMAP model"),
+        (1, lambda i: np.full((60, 80, 3), i, np.uint8), "one photo"),
+        (4, lambda i: np.full((60, 80, 3), 9, np.uint8), "the same file as 0.png"),
+        (3, lambda i: np.full((60, 80, 3), i, np.uint8), "hardly any detail"),
+        (
+            3,
+            lambda i: np.random.default_rng(i).integers(0, 255, (120, 160, 3), np.uint8),
+            "show the same thing",
+        ),
+    ],
+    ids=["none", "one", "the same", "blank", "no overlap"],
+)
+def test_what_makes_no_scene_is_told_in_words(tmp_path, count, paint, message):
+    with pytest.raises(UserError, match=message):
+        reconstruct_scene(picture(tmp_path / "data", count, paint))
+    assert not (tmp_path / "data" / "sparse").exists()
+
+
+def test_a_still_camera_is_told_from_a_walk(photos, tmp_path):
+    """The same view with another noise each time: plenty of matches, and no depth."""
+    view = np.asarray(Image.open(photos / "images" / "photo_003.jpg")).astype(int)
+
+    def paint(i):
+        noise = np.random.default_rng(i).integers(-3, 4, view.shape)
+        return (view + noise).clip(0, 255).astype(np.uint8)
+
+    with pytest.raises(UserError, match="from one place"):
+        reconstruct_scene(picture(tmp_path / "still", 4, paint))
