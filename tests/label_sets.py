@@ -12,9 +12,9 @@ from PIL import Image
 def write_holyscenes(folder, category, number, mask, quality=75):
     """A mask black on white, as JPEG, and a copy of its photo."""
     (folder / category).mkdir(parents=True, exist_ok=True)
-    grey = np.where(mask, np.uint8(0), np.uint8(255))
-    Image.fromarray(grey).save(folder / category / f"{number}-gt.jpg", quality=quality)
-    Image.fromarray(grey).save(folder / category / f"{number}-img.jpg")
+    gray = np.where(mask, np.uint8(0), np.uint8(255))
+    Image.fromarray(gray).save(folder / category / f"{number}-gt.jpg", quality=quality)
+    Image.fromarray(gray).save(folder / category / f"{number}-img.jpg")
 
 
 def write_plain(folder, prompt, photo, mask):

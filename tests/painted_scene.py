@@ -76,7 +76,7 @@ def activated(gaussians: dict[str, Tensor]) -> Gaussians:
 
 
 def render(camera: Camera, carried: Tensor) -> View:
-    """Grey for walls, brighter for every further word."""
+    """Gray for walls, brighter for every further word."""
     g = painted_gaussians()
     colors = (g["words"][:, None] / 3.0).expand(-1, 3)
     drawn = rasterize(activated(g), camera, colors, features=carried, render_depth=True)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np  # before pycolmap: the other way round, Pillow's PNG writer aborts the process
 from PIL import Image
 
-CENTRE = np.array([0.0, 0.0, 0.5])
+CENTER = np.array([0.0, 0.0, 0.5])
 HALF_SIZES = np.array([1.2, 0.6, 0.5])  # world units; the box stands on the ground, z is up
-FACES = np.array([[0.9, 0.5, 0.3], [0.4, 0.6, 0.9], [0.5, 0.8, 0.4]])  # colour by the face's normal axis
+FACES = np.array([[0.9, 0.5, 0.3], [0.4, 0.6, 0.9], [0.5, 0.8, 0.4]])  # color by the face's normal axis
 
 
 def write_scene(
@@ -80,29 +80,29 @@ def _camera(pycolmap, camera_id, size, distortion, rng):
     """A camera that sees the whole box; with a generator, one of its own. Pixels are not square and the
     principal point is off the middle, so that no axis can stand in for the other."""
     width, height = size
-    focal, centre = 1.1 * max(size), np.array([width, height]) * [0.48, 0.53]
+    focal, center = 1.1 * max(size), np.array([width, height]) * [0.48, 0.53]
     if rng is not None:
         width, height = np.round(np.array(size) * rng.uniform(0.7, 1.2)).astype(int)
         if camera_id % 3 == 0:
             width, height = height, width
         focal = rng.uniform(0.9, 1.4) * max(width, height)
-        centre = np.array([width, height]) * rng.uniform(0.45, 0.55, 2)
+        center = np.array([width, height]) * rng.uniform(0.45, 0.55, 2)
     return pycolmap.Camera(
         camera_id=camera_id,
         model="OPENCV" if distortion else "PINHOLE",
         width=int(width),
         height=int(height),
-        params=[focal, 1.07 * focal, *centre, *(distortion or ())],
+        params=[focal, 1.07 * focal, *center, *(distortion or ())],
     )
 
 
 def _pose(fraction: float, rng: np.random.Generator) -> np.ndarray:
     """[3, 4] camera from world, looking at the box from an arc of 100 degrees."""
     angle = np.deg2rad(100) * fraction
-    position = CENTRE + rng.uniform(3.5, 4.5) * np.array(
+    position = CENTER + rng.uniform(3.5, 4.5) * np.array(
         [np.sin(angle), -np.cos(angle), rng.uniform(0.1, 0.4)]
     )
-    forward = (CENTRE - position) / np.linalg.norm(CENTRE - position)
+    forward = (CENTER - position) / np.linalg.norm(CENTER - position)
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
@@ -115,7 +115,7 @@ def _surface_points(count: int, rng: np.random.Generator) -> np.ndarray:
     axis, side = np.array([[1, -1], [1, -1], [0, -1], [0, 1], [2, 1]]).T
     face = rng.integers(len(axis), size=count)
     points[np.arange(count), axis[face]] = side[face]
-    return CENTRE + HALF_SIZES * points
+    return CENTER + HALF_SIZES * points
 
 
 def _project(camera, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,22 +136,22 @@ def _render(camera, pose: np.ndarray) -> np.ndarray:
     reach = _hit_box(position, directions)
     hit = np.isfinite(reach)
     up = directions[:, 2] / np.linalg.norm(directions, axis=1)
-    colours = np.array([0.75, 0.8, 0.9]) + 0.3 * up[:, None] * [-1, -0.6, 0.2]  # the sky
-    colours[hit] = texture(position + reach[hit, None] * directions[hit])
-    return np.round(colours.clip(0, 1) * 255).astype(np.uint8).reshape(camera.height, camera.width, 3)
+    colors = np.array([0.75, 0.8, 0.9]) + 0.3 * up[:, None] * [-1, -0.6, 0.2]  # the sky
+    colors[hit] = texture(position + reach[hit, None] * directions[hit])
+    return np.round(colors.clip(0, 1) * 255).astype(np.uint8).reshape(camera.height, camera.width, 3)
 
 
 def _hit_box(position: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """[n] multiples of the directions after which the rays enter the box, infinite for those that miss it."""
     with np.errstate(divide="ignore"):
-        bounds = (CENTRE - position + HALF_SIZES * np.array([[[-1.0]], [[1.0]]])) / directions
+        bounds = (CENTER - position + HALF_SIZES * np.array([[[-1.0]], [[1.0]]])) / directions
     enter, leave = bounds.min(axis=0).max(axis=1), bounds.max(axis=0).min(axis=1)
     return np.where((enter <= leave * (1 + 1e-9)) & (enter > 0), enter, np.inf)
 
 
 def texture(points: np.ndarray) -> np.ndarray:
-    """[n, 3] colours in 0..1 of points on the box: a colour per face, soft bands and a grid of windows."""
-    local = (points - CENTRE) / HALF_SIZES
+    """[n, 3] colors in 0..1 of points on the box: a color per face, soft bands and a grid of windows."""
+    local = (points - CENTER) / HALF_SIZES
     face = FACES[np.abs(local).argmax(axis=1)]
     bands = 0.85 + 0.15 * np.sin(points * [7, 9, 11]).prod(axis=1)
     windows = (np.sin(points * [9, 9, 12] + 0.4) > 0.2).sum(axis=1) >= 2

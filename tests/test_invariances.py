@@ -27,7 +27,7 @@ WORLDS = [(1.0, 0.0), (1e3, 0.0), (1e-3, 0.0), (1.0, 1e5), (1e3, 1e5), (1e-3, 1e
 
 def render(scene: Scene, dtype: torch.dtype) -> torch.Tensor:
     leaves = {name: value.to(dtype) for name, value in scene.leaves.items()}
-    (fx, fy), (cx, cy) = scene.focal, scene.centre
+    (fx, fy), (cx, cy) = scene.focal, scene.center
     intrinsics = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=dtype)
     return rasterize(
         Gaussians(leaves["means"], leaves["quats"], leaves["log_scales"].exp(), leaves["logits"].sigmoid()),
@@ -65,7 +65,7 @@ def relevancies(scene: Scene, dtype: torch.dtype) -> torch.Tensor:
 def test_relevancy_is_the_same_in_every_world(scale, offset):
     found, expected = (relevancies(s, torch.float64) for s in (Scene().in_world(scale, offset), Scene()))
     assert float(expected.std()) > 0.05
-    # A code moves ten times as far as a colour, the field's slope and the temperature ten times each.
+    # A code moves ten times as far as a color, the field's slope and the temperature ten times each.
     assert float((found - expected).abs().max()) < 1e-10 * max(1, offset / scale)
 
 
@@ -85,10 +85,10 @@ def reconstruction(tmp_path_factory):
 def test_the_crops_are_the_same_in_every_world_with_the_range_scaled_along(reconstruction, scale, offset):
     photos = {name: in_world(photo, scale, offset) for name, photo in reconstruction.photos.items()}
     origin = in_world(_point_photo(reconstruction), scale, offset).points
-    moved = type(reconstruction)(photos, origin, reconstruction.colours)
+    moved = type(reconstruction)(photos, origin, reconstruction.colors)
     before, after = pixel_sizes(reconstruction)[0], pixel_sizes(moved)[0]
     for name, photo in photos.items():
-        # Metres from cameras that are 1e5 · 4.6 away: ten digits, in a world of 1e-3 seven.
+        # Meters from cameras that are 1e5 · 4.6 away: ten digits, in a world of 1e-3 seven.
         assert after[name] == pytest.approx(scale * before[name], rel=1e-14 * max(1e2, 1e2 * offset / scale))
         crops = [
             crop_sides(physical_scales(0.2 * unit, 2.0 * unit), sizes[name], photo.width)[0]

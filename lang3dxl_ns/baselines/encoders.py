@@ -52,17 +52,17 @@ def make_encoder(
     settings: SemanticFieldConfig,
     clip_dim: int,
     dense_dim: int,
-    centre: Float[Tensor, "3"],
+    center: Float[Tensor, "3"],
     radius: float,
 ) -> SemanticEncoder:
     """The feature decoder of this name; `settings`: of those that have a hash grid.
 
-    centre, radius: of the scene, world units.
+    center, radius: of the scene, world units.
     """
     if config.name == "feature3dgs":
         return Feature3DGS(clip_dim, dense_dim)
     if config.name == "fmgs":
-        return PlaceField(settings, clip_dim, dense_dim, centre, radius, config.alignment_weight)
+        return PlaceField(settings, clip_dim, dense_dim, center, radius, config.alignment_weight)
     if config.name == "langsplat":
         return LangSplat(clip_dim, config.autoencoder_steps)
     if config.name == "direct":

@@ -22,7 +22,7 @@ class PlaceField(SemanticEncoder):
     decoded, and whole features are rendered. Gaussians have no learned codes.
 
     Args:
-        centre, radius: of the scene, world units.
+        center, radius: of the scene, world units.
         alignment_weight: of the pixel alignment loss.
     """
 
@@ -31,7 +31,7 @@ class PlaceField(SemanticEncoder):
         config: SemanticFieldConfig,
         clip_dim: int,
         dense_dim: int,
-        centre: Float[Tensor, "3"],
+        center: Float[Tensor, "3"],
         radius: float,
         alignment_weight: float,
     ) -> None:
@@ -39,17 +39,17 @@ class PlaceField(SemanticEncoder):
         # A position has three coordinates, whatever the field's code size.
         self.field = SemanticField(replace(config, code_dim=3, bounding="sigmoid"), clip_dim, dense_dim)
         self.alignment_weight = alignment_weight
-        self.centre: Tensor
+        self.center: Tensor
         self.radius: Tensor
-        self.register_buffer("centre", centre.detach().clone())
-        self.register_buffer("radius", centre.new_tensor(radius))
+        self.register_buffer("center", center.detach().clone())
+        self.register_buffer("radius", center.new_tensor(radius))
 
     def initial_codes(self, count: int, generator: torch.Generator | None = None) -> None:
         return None
 
     def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"]:
         """Features at the Gaussians' positions; positions get no gradient."""
-        places = _STRETCH * (gaussians["means"].detach() - self.centre) / self.radius
+        places = _STRETCH * (gaussians["means"].detach() - self.center) / self.radius
         clip, dense = self.field(places)
         return clip if dense is None else torch.cat([clip, dense], dim=-1)
 
@@ -76,12 +76,12 @@ class PlaceField(SemanticEncoder):
 
 
 def pixel_alignment_loss(clip: Float[Tensor, "h w c"], dense: Float[Tensor, "h w d"]) -> Float[Tensor, ""]:
-    """Mean difference of neighbour similarity between CLIP and dense features; these get no gradient."""
-    return (neighbour_similarity(clip) - neighbour_similarity(dense.detach())).abs().mean()
+    """Mean difference of neighbor similarity between CLIP and dense features; these get no gradient."""
+    return (neighbor_similarity(clip) - neighbor_similarity(dense.detach())).abs().mean()
 
 
-def neighbour_similarity(features: Float[Tensor, "h w c"]) -> Float[Tensor, "h w 8"]:
-    """Cosine of every pixel with its eight neighbours; mirrored at the border."""
+def neighbor_similarity(features: Float[Tensor, "h w c"]) -> Float[Tensor, "h w 8"]:
+    """Cosine of every pixel with its eight neighbors; mirrored at the border."""
     height, width, _ = features.shape
     unit = F.normalize(features, dim=-1)
     padded = F.pad(unit.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="reflect")[0].permute(1, 2, 0)

@@ -69,7 +69,7 @@ class LangSplat(SemanticEncoder):
         features = _sample(targets(), generator).to(self.norm.device)
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
             torch.manual_seed(0)
-            encoder = _layers((self.clip_dim, *_ENCODER), normalise=True).to(features)
+            encoder = _layers((self.clip_dim, *_ENCODER), normalize=True).to(features)
         self.decoder.requires_grad_(True)
         parameters = [*encoder.parameters(), *self.decoder.parameters()]
         optimizer = torch.optim.Adam(parameters, lr=_RATE)
@@ -100,11 +100,11 @@ def _sample(targets: Iterable[Tensor], generator: torch.Generator) -> Float[Tens
     return torch.cat(rows)
 
 
-def _layers(widths: tuple[int, ...], normalise: bool = False) -> nn.Sequential:
-    """Linear layers with ReLU between, preceded by batch normalisation if requested."""
+def _layers(widths: tuple[int, ...], normalize: bool = False) -> nn.Sequential:
+    """Linear layers with ReLU between, preceded by batch normalization if requested."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         if layers:
-            layers += [nn.BatchNorm1d(inputs), nn.ReLU()] if normalise else [nn.ReLU()]
+            layers += [nn.BatchNorm1d(inputs), nn.ReLU()] if normalize else [nn.ReLU()]
         layers.append(nn.Linear(inputs, outputs))
     return nn.Sequential(*layers)

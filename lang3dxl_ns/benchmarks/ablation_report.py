@@ -121,7 +121,7 @@ def markdown(data: Mapping[str, Any]) -> str:
 {data["machine"]}
 
 mAP: mean over the categories of the average precision of relevancy maps, at half the picture's size. Test
-views are novel cameras with exact labels; "seen" are labelled training photos. CLIP L1 uses the same
+views are novel cameras with exact labels; "seen" are labeled training photos. CLIP L1 uses the same
 downsampling kernel for all rows. Times are wall-clock with a GPU, processor time (all threads) without;
 "train" excludes preparation of targets, "answer" is one view with all prompts. Bold: no other row
 of any length is as fast and better. "Published" are Lang3D-XL's figures for HolyScenes: other photos,

@@ -1,4 +1,4 @@
-"""Baseline rasteriser in plain torch: dense, tile by tile, differentiated by autograd."""
+"""Baseline rasterizer in plain torch: dense, tile by tile, differentiated by autograd."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DENSE_BYTES_PER_PAIR = 55
 
 
 def render_dense(problem: Problem) -> tuple[Float[Tensor, "h w 6"], Float[Tensor, "h w 1"]]:
-    """A short rasteriser in plain torch: every Gaussian of a tile at every pixel of it.
+    """A short rasterizer in plain torch: every Gaussian of a tile at every pixel of it.
 
     Follows gsplat's rendering rules but shares no code with `rasterize`, so it is also the float64 reference.
     """
@@ -43,17 +43,17 @@ def _dense_tiles(
 ) -> Iterator[tuple[Int[Tensor, " m"], Float[Tensor, "p m"], tuple[int, int]]]:
     """For every tile, row by row: its Gaussians front to back, their weights in each pixel, its size."""
     camera = problem.camera
-    order, centres, conics, opacities, reach = _splats(problem)
+    order, centers, conics, opacities, reach = _splats(problem)
     with torch.no_grad():
-        low, high = centres - reach, centres + reach
+        low, high = centers - reach, centers + reach
     for top in range(0, camera.height, DENSE_TILE):
         for left in range(0, camera.width, DENSE_TILE):
             right, bottom = min(left + DENSE_TILE, camera.width), min(top + DENSE_TILE, camera.height)
             inside = (high > high.new_tensor([left, top])) & (low < low.new_tensor([right, bottom]))
             index = inside.all(1).nonzero().squeeze(1)
-            grid = torch.cartesian_prod(torch.arange(top, bottom), torch.arange(left, right)).to(centres)
+            grid = torch.cartesian_prod(torch.arange(top, bottom), torch.arange(left, right)).to(centers)
             y, x = grid.unbind(1)
-            u, v = centres.index_select(0, index).unbind(1)
+            u, v = centers.index_select(0, index).unbind(1)
             a, b, c = conics.index_select(0, index).unbind(1)
             dx, dy = x[:, None] + 0.5 - u, y[:, None] + 0.5 - v
             falloff = torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
@@ -65,7 +65,7 @@ def _dense_tiles(
 
 
 def _splats(problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Of all Gaussians in front of the camera, front to back: index, centre, conic, opacity, extents."""
+    """Of all Gaussians in front of the camera, front to back: index, center, conic, opacity, extents."""
     gaussians, camera = problem.gaussians, problem.camera
     rotation, offset = camera.view_matrix[:3, :3], camera.view_matrix[:3, 3]
     points = gaussians.means @ rotation.T + offset
@@ -73,11 +73,11 @@ def _splats(problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         order = ((points[:, 2] > 0.01) & (gaussians.opacities >= 1 / 255)).nonzero().squeeze(1)
         order = order[points[order, 2].argsort(stable=True)]
     opacities, (x, y, z) = gaussians.opacities[order], points[order].unbind(1)
-    focal, centre = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
+    focal, center = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
     size = focal.new_tensor([camera.width, camera.height])
     slopes = torch.stack([x / z, y / z], dim=1)
     margin = 0.15 * size  # gsplat's: 0.3 of half the image, beyond which the affine approximation fails
-    held = slopes.clamp((-centre - margin) / focal, (size - centre + margin) / focal)
+    held = slopes.clamp((-center - margin) / focal, (size - center + margin) / focal)
     jacobian = torch.cat([torch.eye(2).to(held).expand(len(held), 2, 2), -held[:, :, None]], dim=2)
     jacobian = jacobian * (focal[:, None] / z[:, None, None])
     axes = jacobian @ rotation @ (_rotations(gaussians.quats[order]) * gaussians.scales[order, None])
@@ -86,7 +86,7 @@ def _splats(problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     conics = torch.stack([yy, -xy, xx], dim=1) / (xx * yy - xy * xy)[:, None]
     with torch.no_grad():
         reach = (2 * torch.log(255 * opacities)[:, None] * torch.stack([xx, yy], dim=1)).sqrt()
-    return order, slopes * focal + centre, conics, opacities, reach
+    return order, slopes * focal + center, conics, opacities, reach
 
 
 def _rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:

@@ -1,4 +1,4 @@
-"""`lang3dxl benchmark rasterizer`: time, memory and error beside a plain dense rasteriser in one process.
+"""`lang3dxl benchmark rasterizer`: time, memory and error beside a plain dense rasterizer in one process.
 
 Absolute times don't carry over to another machine; ratios between candidates that ran in turn do, so
 quote those.
@@ -25,7 +25,7 @@ from lang3dxl_ns.benchmarks.dense_rasterizer import (
 )
 from lang3dxl_ns.benchmarks.rasterizer_scenes import (
     CHANNELS,
-    COLOURS,
+    COLORS,
     Case,
     Problem,
     Recipe,
@@ -99,32 +99,32 @@ def error_against(
 
 
 def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
-    """Forward and backward of colours with and without features, in one pass and in two."""
-    gaussians, camera, background = problem.gaussians, problem.camera, problem.background[:COLOURS]
-    colours, features = (
+    """Forward and backward of colors with and without features, in one pass and in two."""
+    gaussians, camera, background = problem.gaussians, problem.camera, problem.background[:COLORS]
+    colors, features = (
         part.clone().requires_grad_()
-        for part in problem.channels.detach().split([COLOURS, CHANNELS - COLOURS], dim=1)
+        for part in problem.channels.detach().split([COLORS, CHANNELS - COLORS], dim=1)
     )
-    colour_gradient, feature_gradient = problem.image_gradient.split([COLOURS, CHANNELS - COLOURS], dim=2)
-    leaves = (*problem.leaves[:-1], colours, features)
+    color_gradient, feature_gradient = problem.image_gradient.split([COLORS, CHANNELS - COLORS], dim=2)
+    leaves = (*problem.leaves[:-1], colors, features)
 
     def one_pass(detach: bool) -> object:
-        result = rasterize(gaussians, camera, colours, background, features=features, detach_features=detach)
+        result = rasterize(gaussians, camera, colors, background, features=features, detach_features=detach)
         outputs: Any = (result.image, result.alpha, result.features)
         return torch.autograd.grad(
-            outputs, leaves, (colour_gradient, problem.alpha_gradient, feature_gradient)
+            outputs, leaves, (color_gradient, problem.alpha_gradient, feature_gradient)
         )
 
     def passes(second: Gaussians | None) -> object:
-        first = rasterize(gaussians, camera, colours, background)
-        outputs, upstream = [first.image, first.alpha], [colour_gradient, problem.alpha_gradient]
+        first = rasterize(gaussians, camera, colors, background)
+        outputs, upstream = [first.image, first.alpha], [color_gradient, problem.alpha_gradient]
         if second is not None:
             outputs.append(rasterize(second, camera, features).image)
             upstream.append(feature_gradient)
         return torch.autograd.grad(outputs, leaves, upstream, allow_unused=True)
 
     return {
-        "colours alone": lambda: passes(None),
+        "colors alone": lambda: passes(None),
         "one pass, features detached": lambda: one_pass(True),
         "one pass, features move the geometry": lambda: one_pass(False),
         "two passes, features detached": lambda: passes(gaussians.detach()),
@@ -147,7 +147,7 @@ def prepared_pass(
 
 @dataclass
 class RasterizerBenchmark:
-    """Measure time, memory and error of the rasteriser, beside a dense one and, on a GPU, gsplat."""
+    """Measure time, memory and error of the rasterizer, beside a dense one and, on a GPU, gsplat."""
 
     out: Path
     """Folder for rasterizer.md, rasterizer.json and rasterizer.png."""
@@ -211,7 +211,7 @@ def _measure(plan: RasterizerBenchmark) -> dict[str, Any]:
     results: dict[str, list] = {"cases": [], "passes": []}
     with progress_bar() as bar:
         weights = [3e9 + case.gaussians * case.width * case.height for case in cases]  # roughly the time
-        task = bar.add_task("rasteriser", total=sum(weights) + 3e9 * len(diagonal))
+        task = bar.add_task("rasterizer", total=sum(weights) + 3e9 * len(diagonal))
         for case, weight in zip(cases, weights, strict=True):
             results["cases"].append(_measure_case(case, plan))
             bar.advance(task, weight)
@@ -268,12 +268,12 @@ def _markdown(results: dict[str, Any]) -> str:
     header += [f"**{name} ÷ {OURS}** (f / f+b)" for name in others]
     errors = "recipe, Gaussians, image, candidate, image max, image mean, pixels off, gradients, peak MiB"
     passes = ["recipe", "Gaussians", "image", *results["passes"][0]["ms"]]
-    return f"""# Rasteriser: time, error, memory
+    return f"""# Rasterizer: time, error, memory
 
 `{results["command"]}`
 {results["machine"]}. Points: {results["points"]}.
 
-{CHANNELS} channels (colours and features) over a background; gradients of image and alpha for all Gaussian
+{CHANNELS} channels (colors and features) over a background; gradients of image and alpha for all Gaussian
 parameters and channels; projection included. Medians of interleaved runs; f: forward, f+b: forward and
 backward. **Quote the ratios**: times don't carry over to another machine.
 {TORCH}: the rasterizer in torch operations, for other devices and where numba is missing.
@@ -291,9 +291,9 @@ backward.
 
 {markdown_table(errors.split(", "), (row for case in results["cases"] for row in _error_rows(case)))}
 
-## Features beside the colours
+## Features beside the colors
 
-{COLOURS} colours, {CHANNELS - COLOURS} features; forward and backward: ms, and the multiple of colours alone.
+{COLORS} colors, {CHANNELS - COLORS} features; forward and backward: ms, and the multiple of colors alone.
 
 {markdown_table(passes, [_pass_row(row) for row in results["passes"]])}
 
@@ -332,7 +332,7 @@ def _error_rows(case: dict[str, Any]) -> Iterable[list[str]]:
 
 
 def _pass_row(row: dict[str, Any]) -> list[str]:
-    alone = row["ms"]["colours alone"]
+    alone = row["ms"]["colors alone"]
     return [*_case_cells(row), *(f"{ms:,.0f} (×{ms / alone:.2f})" for ms in row["ms"].values())]
 
 
@@ -345,7 +345,7 @@ def _plot(results: dict[str, Any]) -> bytes:
     cases = results["cases"]
     methods = list(cases[0]["forward_ms"])
     sizes = sorted({(case["width"], case["height"]) for case in cases})
-    colours = dict(zip(sizes, ("#7fb3d5", "#2471a3", "#0b2545", "#6c3483"), strict=False))
+    colors = dict(zip(sizes, ("#7fb3d5", "#2471a3", "#0b2545", "#6c3483"), strict=False))
     styles = dict(zip(methods, ("o-", "s--", "^:", "v-."), strict=False))
     recipes = {"A": "A: random small Gaussians", "B": "B: as in training"}
     drawn = [recipe for recipe in recipes if any(case["recipe"] == recipe for case in cases)]
@@ -359,7 +359,7 @@ def _plot(results: dict[str, Any]) -> bytes:
             for method in methods:
                 both = [case["forward_backward_ms"].get(method, float("nan")) for case in line]
                 count = [case["gaussians"] for case in line]
-                panel.plot(count, both, styles[method], color=colours[size], markersize=4.5, linewidth=1.6)
+                panel.plot(count, both, styles[method], color=colors[size], markersize=4.5, linewidth=1.6)
         panel.set(xscale="log", yscale="log", xlabel="Gaussians", title=recipes[recipe])
         counts = sorted({case["gaussians"] for case in cases})
         panel.set_xticks(counts, [f"{count:,}" for count in counts])
@@ -368,7 +368,7 @@ def _plot(results: dict[str, Any]) -> bytes:
         panel.grid(which="major", alpha=0.25)
         panel.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("forward + backward, ms")
-    keys = [Line2D([], [], color=colours[size], linewidth=3, label=f"{size[0]}×{size[1]}") for size in sizes]
+    keys = [Line2D([], [], color=colors[size], linewidth=3, label=f"{size[0]}×{size[1]}") for size in sizes]
     keys += [
         Line2D([], [], color="0.35", marker=styles[m][0], linestyle=styles[m][1:], label=m) for m in methods
     ]

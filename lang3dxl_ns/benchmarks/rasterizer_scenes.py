@@ -1,4 +1,4 @@
-"""Scenes of the rasteriser benchmark: Gaussians by two recipes over a real or synthetic point cloud."""
+"""Scenes of the rasterizer benchmark: Gaussians by two recipes over a real or synthetic point cloud."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lang3dxl_ns.rendering import Gaussians
 from lang3dxl_ns.scene.camera import Camera
 
 Recipe = Literal["A", "B"]
-CHANNELS, COLOURS = 6, 3
+CHANNELS, COLORS = 6, 3
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def make_problem(
     """The same problem for the same case and seed, on any device and in any number type.
 
     Recipe A: random scales U(1e-4, 0.02), opacities U(0, 1). Recipe B, as in training: scales of the mean
-    distance to the three nearest neighbours times a log-normal factor per axis, opacities sigmoid(N(0, 2)).
+    distance to the three nearest neighbors times a log-normal factor per axis, opacities sigmoid(N(0, 2)).
     """
     generator = torch.Generator().manual_seed(seed)
     points, camera = synthetic_cloud(case.gaussians, generator) if scene is None else load_cloud(scene)
@@ -66,7 +66,7 @@ def make_problem(
         scales = torch.rand(n, 3, generator=generator) * (0.02 - 1e-4) + 1e-4
         opacities = torch.rand(n, generator=generator)
     else:
-        scales = _neighbour_distance(means)[:, None] * torch.randn(n, 3, generator=generator).mul(0.5).exp()
+        scales = _neighbor_distance(means)[:, None] * torch.randn(n, 3, generator=generator).mul(0.5).exp()
         opacities = torch.sigmoid(2 * torch.randn(n, generator=generator))
     quats = torch.randn(n, 4, generator=generator)
     channels = torch.rand(n, CHANNELS, generator=generator)
@@ -143,7 +143,7 @@ def _camera_towards_origin(position: Float[Tensor, " 3"]) -> Camera:
     return Camera(view, torch.tensor([[480.0, 0, 324], [0, 480.0, 210], [0, 0, 1]]), 648, 420)
 
 
-def _neighbour_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+def _neighbor_distance(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     """Mean distance to the three nearest other points."""
     from scipy.spatial import KDTree
 

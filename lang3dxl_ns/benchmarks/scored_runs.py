@@ -33,7 +33,7 @@ _LIBRARIES = ("lang3dxl_ns.plugin.trainer", "lang3dxl_ns.methods")
 """Imports of a run's process, preloaded because they take ten seconds."""
 _TIMED_PHOTOS = 3
 _UNWANTED = ("num_rays_per_sec", "fps")
-_BESIDE = ("map", "raw_map", "localisation_accuracy", "cc_psnr", "clip_l1", "clip_cosine")
+_BESIDE = ("map", "raw_map", "localization_accuracy", "cc_psnr", "clip_l1", "clip_cosine")
 """Figures beyond those of the held-out photos, besides every category's average precision."""
 
 
@@ -227,7 +227,7 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
 
 
 def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
-    """Figures of the scene's test views, `test_…`, and of the labelled training photos, `seen_…`, if there
+    """Figures of the scene's test views, `test_…`, and of the labeled training photos, `seen_…`, if there
     are any; both are far more numerous than the held-out photos."""
     from lang3dxl_ns.evaluation.aggregate import PREFIXES, average
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
 
-PARTS = ("data", "render", "appearance", "decode", "downsample", "losses", "backward", "optimiser")
+PARTS = ("data", "render", "appearance", "decode", "downsample", "losses", "backward", "optimizer")
 """Parts of a step; appearance is within the rendering."""
 
 
@@ -98,7 +98,7 @@ def _time_parts(trainer: Any) -> None:
 
     trainer.train_iteration = timed("step", trainer.train_iteration)
     trainer.optimizers.optimizer_scaler_step_some = timed(
-        "optimiser", trainer.optimizers.optimizer_scaler_step_some
+        "optimizer", trainer.optimizers.optimizer_scaler_step_some
     )
     scaled = trainer.grad_scaler.scale
 

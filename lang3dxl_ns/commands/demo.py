@@ -64,7 +64,7 @@ class Demo:
     quick: bool = False
     """Two minutes instead of ten: fewer photos and iterations, less accurate words."""
     clip: str = "builtin"
-    """CLIP: "builtin", a Hugging Face name, a folder, or "none" for colours only."""
+    """CLIP: "builtin", a Hugging Face name, a folder, or "none" for colors only."""
     dense: str = "builtin"
     """Dense encoder: the same choices."""
     ns_train: str = ""
@@ -202,7 +202,7 @@ half the photo's size, as published, and not masked. Test views are novel camera
 
 WHO = {"field": "", "teacher": "teacher_", "limit": "limit_", "chance": "chance_"}
 """Sources of the reported average precision, and the prefix of their figures."""
-COLORS = {"psnr": "PSNR (dB)", "cc_psnr": "PSNR with matched colours (dB)", "ssim": "SSIM"}
+COLORS = {"psnr": "PSNR (dB)", "cc_psnr": "PSNR with matched colors (dB)", "ssim": "SSIM"}
 FEATURES = {
     "clip_l1": "CLIP feature, L1",
     "clip_psnr": "CLIP feature, PSNR (dB)",
@@ -214,7 +214,7 @@ FEATURES = {
 
 def _split(found: dict[str, Any]) -> str:
     """The tables of a split."""
-    words = "Colours only: no semantics were trained."
+    words = "Colors only: no semantics were trained."
     who = [name for name in WHO if name in found]
     if who:
         rows = [

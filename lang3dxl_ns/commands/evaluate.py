@@ -45,7 +45,7 @@ class EvaluateMaps:
     layout: Layout | Literal["auto"] = "auto"
     """Layout of the ground truth; "auto" detects it."""
     photos: Path | None = None
-    """Text file with the names of the photos to score, one per line (default: all labelled photos)."""
+    """Text file with the names of the photos to score, one per line (default: all labeled photos)."""
     masks: Path | None = None
     """Folder of foreground masks, white = keep: predictions become 0 elsewhere."""
     temperature: float = 1.0
@@ -79,7 +79,7 @@ class EvaluateRun:
     load_config: Path
     """config.yml of the run."""
     split: Literal["held-out", "seen", "test"] = "held-out"
-    """Photos held out of training, labelled training photos, or the scene's test views."""
+    """Photos held out of training, labeled training photos, or the scene's test views."""
     ground_truth: Path | None = None
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
     layout: Layout | Literal["auto"] = "auto"
@@ -142,7 +142,7 @@ class EvaluatePool:
 
 @dataclass(kw_only=True)
 class EvaluateSplit:
-    """Choose labelled photos to hold out of training, up to five per category, the same at every call.
+    """Choose labeled photos to hold out of training, up to five per category, the same at every call.
 
     Pass the list to `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`.
     """

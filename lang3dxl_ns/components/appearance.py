@@ -1,8 +1,8 @@
-"""Appearance field: photo-dependent colour shifts of the Gaussians, steered by a vector per photo.
+"""Appearance field: photo-dependent color shifts of the Gaussians, steered by a vector per photo.
 
-One photo is taken at noon, the next at dusk. A small network takes a Gaussian's position, its base colour and
-the photo's vector, and predicts its colour shift in that photo (SWAG, Dahmani et al. 2024, as used in
-Lang3D-XL). Only colours, and optionally opacities, depend on the photo: semantics never do.
+One photo is taken at noon, the next at dusk. A small network takes a Gaussian's position, its base color and
+the photo's vector, and predicts its color shift in that photo (SWAG, Dahmani et al. 2024, as used in
+Lang3D-XL). Only colors, and optionally opacities, depend on the photo: semantics never do.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class AppearanceConfig:
 
 
 class AppearanceField(nn.Module):
-    """Colours of Gaussians under one photo's look.
+    """Colors of Gaussians under one photo's look.
 
     Untrained, it changes nothing. Vectors belong to photos by name: a checkpoint's vectors stay with their
     photos whichever photos the present run has, and new photos get fresh vectors.
@@ -75,8 +75,8 @@ class AppearanceField(nn.Module):
     Args:
         config: the settings.
         names: of the training photos.
-        centre: of the scene, world units.
-        radius: distance from the centre that contains most of the scene, world units.
+        center: of the scene, world units.
+        radius: distance from the center that contains most of the scene, world units.
         generator: source of the initial weights and vectors.
     """
 
@@ -84,7 +84,7 @@ class AppearanceField(nn.Module):
         self,
         config: AppearanceConfig,
         names: Sequence[str],
-        centre: Float[Tensor, "3"],
+        center: Float[Tensor, "3"],
         radius: float,
         *,
         generator: torch.Generator | None = None,
@@ -104,14 +104,14 @@ class AppearanceField(nn.Module):
         vectors = FIRST_DEVIATION * torch.randn(len(names), config.vector_dim, generator=generator)
         self.vectors = nn.Parameter(vectors)
 
-        self.centre: Tensor
+        self.center: Tensor
         self.radius: Tensor
         self.positions: Tensor
         self.directions: Tensor
         self.learned: Tensor
-        self.register_buffer("centre", centre.detach().clone())
+        self.register_buffer("center", center.detach().clone())
         # A scene without extent has no length of its own: use 1.
-        self.register_buffer("radius", centre.new_tensor(radius or 1.0))
+        self.register_buffer("radius", center.new_tensor(radius or 1.0))
         self.register_buffer("positions", torch.zeros(len(names), 3))
         self.register_buffer("directions", torch.zeros(len(names), 3))
         self.register_buffer("learned", torch.zeros(len(names), dtype=torch.bool))
@@ -120,33 +120,33 @@ class AppearanceField(nn.Module):
     def forward(
         self,
         gaussians: Gaussians,
-        colours: Float[Tensor, "n 3"],
+        colors: Float[Tensor, "n 3"],
         vector: Float[Tensor, " v"],
         visible: Int[Tensor, " m"],
         seed: int | None = None,
     ) -> tuple[Float[Tensor, "n 3"], Gaussians]:
-        """Colours, and with `opacity_shift` the Gaussians' opacities, under a photo's vector.
+        """Colors, and with `opacity_shift` the Gaussians' opacities, under a photo's vector.
 
-        The Gaussians' positions get no gradient from it. Colours are at least 0, opacities in 0…1.
+        The Gaussians' positions get no gradient from it. Colors are at least 0, opacities in 0…1.
 
         Args:
             gaussians: in the world frame; returned unchanged without `opacity_shift`.
-            colours: before the shift, at least 0.
+            colors: before the shift, at least 0.
             vector: of the photo.
             visible: rows of the Gaussians to change; the others stay as they are.
             seed: of the opacity shift's noise in training; None for no noise.
         """
-        base = colours[visible]
+        base = colors[visible]
         features = torch.cat((self.grid(self._unit_cube(gaussians.means[visible])), base), 1)
         hidden = F.relu(self.from_gaussian(features) + self.from_photo(vector))
         shift = self.output(F.relu(self.hidden(hidden)))
-        colours = colours.index_copy(0, visible, (base + shift[:, :3]).clamp_min(0.0))
+        colors = colors.index_copy(0, visible, (base + shift[:, :3]).clamp_min(0.0))
         if self.config.opacity_shift:
             before = gaussians.opacities
             drop = self._binary_concrete(shift[:, 3] + FIRST_LOGIT, visible, len(before), seed)
             opacities = before.index_copy(0, visible, (before[visible] - drop).clamp(0.0, 1.0))
             gaussians = replace(gaussians, opacities=opacities)
-        return colours, gaussians
+        return colors, gaussians
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Parameters shared by all photos; `vectors` are per photo."""
@@ -189,7 +189,7 @@ class AppearanceField(nn.Module):
     def _unit_cube(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Positions as grid coordinates in [0, 1]: space contracted to a ball (Mip-NeRF 360, Barron et al.
         2022); the scene fills the inner half, everything out to the sky the rest."""
-        x = (means.detach() - self.centre) / self.radius
+        x = (means.detach() - self.center) / self.radius
         largest = x.abs().amax(1, keepdim=True).clamp_min(1.0)
         # In units of the largest component: the squares of far positions would overflow.
         distance = largest * (x / largest).norm(dim=1, keepdim=True).clamp_min(1 / largest)

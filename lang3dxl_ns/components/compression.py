@@ -1,6 +1,6 @@
 """Compression of per-Gaussian features to a few numbers each, decoded by a semantic field.
 
-A direct regression, without rendering. Each Gaussian is decoded before compositing, so codes of neighbours
+A direct regression, without rendering. Each Gaussian is decoded before compositing, so codes of neighbors
 never blend into a third one with another meaning.
 """
 

@@ -1,12 +1,12 @@
 """Attenuated downsampler: from a decoded feature map to the grid of the CLIP targets.
 
-A CLIP target is a mean over crops of several sizes, so each cell covers a wide neighbourhood. The
+A CLIP target is a mean over crops of several sizes, so each cell covers a wide neighborhood. The
 downsampler blurs the decoded map likewise before the two are compared: a fixed kernel with the footprint of
 the crops, times learned per-pixel weights that choose what counts inside the window. It is used in training
 only; queries read the decoded map itself.
 
 Every kernel here is a sum of boxes, hence separable: sum_j A_j X B_jᵀ, where the small matrices A_j and B_j
-contain window, resize and centring along each axis.
+contain window, resize and centering along each axis.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class DownsamplerConfig:
 
     kernel: KernelName = "pyramid"
     """Fixed part of the weights. pyramid: nested squares from the smallest crop to the largest, growing by
-    √2, favouring small ones (the published system's kernel). footprint: the exact crops of every scale and
+    √2, favoring small ones (the published system's kernel). footprint: the exact crops of every scale and
     the resize of their grids, equally weighted. box: the cell alone, as in the paper's formula; much too
     narrow for targets that are a mean over scales."""
     hidden: int = 16
@@ -63,7 +63,7 @@ class SeparableKernel(NamedTuple):
 class AttenuatedDownsampler(nn.Module):
     """Kernel- and attention-weighted mean of a feature map around every cell of a target grid (Lang3D-XL §3).
 
-    out(o) = Σ_i K(o, i) m_i exp(w_i) f_i / Σ_i K(o, i) m_i exp(w_i), with the kernel K centred on the cell,
+    out(o) = Σ_i K(o, i) m_i exp(w_i) f_i / Σ_i K(o, i) m_i exp(w_i), with the kernel K centered on the cell,
     the mask m, and logits w from three 3×3 convolutions over f. Parts of a window outside the map are left
     out of both sums. The last convolution starts at zero: training starts from the plain kernel mean.
     """
@@ -241,9 +241,9 @@ def upsample_target(target: Float[Tensor, "hd wd c"], size: tuple[int, int]) -> 
 
 
 def _nested_rows(size: int, cells: int, sides: Sequence[float]) -> Float[Tensor, "j n a"]:
-    """Windows of the given sides (pixels) around the centre of every cell of an axis."""
-    centres = (torch.arange(cells, dtype=torch.float64) + 0.5) * (size / cells)
-    return torch.stack([_window_means(size, centres, side) for side in sides])
+    """Windows of the given sides (pixels) around the center of every cell of an axis."""
+    centers = (torch.arange(cells, dtype=torch.float64) + 0.5) * (size / cells)
+    return torch.stack([_window_means(size, centers, side) for side in sides])
 
 
 def _footprint_rows(
@@ -251,7 +251,7 @@ def _footprint_rows(
 ) -> Float[Tensor, "j n a"]:
     """Crops of every scale along an axis, and the bilinear resize of their grid to the target's.
 
-    Crops of one scale overlap by about half; their centres are the middles of equal cells.
+    Crops of one scale overlap by about half; their centers are the middles of equal cells.
     """
     length, cells = size[axis], grid[axis]
     # A map's height is the photo's, scaled and rounded down, so the photo may be up to a pixel higher.
@@ -260,28 +260,28 @@ def _footprint_rows(
     for index, side in enumerate(side * size[1] for side in sides):
         shift = side / 2
         count = cells if index == 0 else max(1, math.floor(photo_length / shift + 1e-6))
-        centres = (torch.arange(count, dtype=torch.float64) + 0.5) * (length / count)
-        rows.append(_bilinear_rows(count, cells) @ _window_means(length, centres, side))
+        centers = (torch.arange(count, dtype=torch.float64) + 0.5) * (length / count)
+        rows.append(_bilinear_rows(count, cells) @ _window_means(length, centers, side))
     return torch.stack(rows)
 
 
 def _bilinear_rows(source: int, target: int) -> Float[Tensor, "target source"]:
-    """Bilinear resize of an axis, cell centres at (i + 0.5) / n (align_corners=False)."""
+    """Bilinear resize of an axis, cell centers at (i + 0.5) / n (align_corners=False)."""
     position = (torch.arange(target, dtype=torch.float64) + 0.5) * (source / target) - 0.5
     distance = position.clamp(0, source - 1)[:, None] - torch.arange(source, dtype=torch.float64)
     return (1 - distance.abs()).clamp(min=0)
 
 
-def _window_means(size: int, centres: Float[Tensor, " n"], side: float) -> Float[Tensor, "n a"]:
+def _window_means(size: int, centers: Float[Tensor, " n"], side: float) -> Float[Tensor, "n a"]:
     """Weights of an axis' pixels in windows of the given side, as shares of the whole window.
 
-    A pixel counts by the part of it that the window covers, sampled at that part's centre by interpolating
-    between neighbouring pixels. So whole pixels are averaged, a window narrower than a pixel interpolates,
+    A pixel counts by the part of it that the window covers, sampled at that part's center by interpolating
+    between neighboring pixels. So whole pixels are averaged, a window narrower than a pixel interpolates,
     and a ramp keeps its position exactly wherever the window is inside the map.
     """
     pixel = torch.arange(size, dtype=torch.float64)
-    start = torch.maximum(centres[:, None] - side / 2, pixel)
-    end = torch.minimum(centres[:, None] + side / 2, pixel + 1)
+    start = torch.maximum(centers[:, None] - side / 2, pixel)
+    end = torch.minimum(centers[:, None] + side / 2, pixel + 1)
     covered = (end - start).clamp(min=0) / side
     offset = (start + end) / 2 - (pixel + 0.5)
     weights = covered * (1 - offset.abs())
@@ -294,7 +294,7 @@ def _window_means(size: int, centres: Float[Tensor, " n"], side: float) -> Float
 
 
 def _weight_network(channels: int, hidden: int, generator: torch.Generator | None) -> nn.Sequential:
-    """Three 3×3 convolutions to one logit; initialised from the given generator alone."""
+    """Three 3×3 convolutions to one logit; initialized from the given generator alone."""
     widths = (channels, hidden, hidden, 1)
     first, second, last = (
         nn.utils.skip_init(nn.Conv2d, a, b, kernel_size=3, padding=1) for a, b in pairwise(widths)

@@ -81,14 +81,14 @@ class SemanticEncoder(nn.Module, ABC):
     """Number of steps of `learn_gaussians`."""
 
     def picture(self, carried: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch 3"]:
-        """The first three channels as colours in [0, 1]."""
-        colours = carried[..., :3].sigmoid()
-        missing = 3 - colours.shape[-1]
-        return torch.cat([colours, *[colours[..., :1]] * missing], dim=-1)
+        """The first three channels as colors in [0, 1]."""
+        colors = carried[..., :3].sigmoid()
+        missing = 3 - colors.shape[-1]
+        return torch.cat([colors, *[colors[..., :1]] * missing], dim=-1)
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Optimiser groups by name."""
+        """Optimizer groups by name."""
 
     def own_losses(
         self, clip: Float[Tensor, "h w clip"], dense: Float[Tensor, "h w dense"] | None

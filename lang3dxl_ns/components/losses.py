@@ -28,18 +28,18 @@ def rgb_loss(
     ssim_weight: float = 0.5,
     mask_ssim: bool = False,
 ) -> Float[Tensor, ""]:
-    """(1 − w)·L1 + w·(1 − SSIM), colours in [0, 1]; SSIM's window is 11 pixels with σ 1.5.
+    """(1 − w)·L1 + w·(1 − SSIM), colors in [0, 1]; SSIM's window is 11 pixels with σ 1.5.
 
     L1 is a mean over the mask. SSIM sees the whole images, as in the published system, or with `mask_ssim`
     both images multiplied by the mask. An image narrower than the window is extended by its border.
     """
-    colour = _weighted_mean((prediction - target).abs(), mask)
+    color = _weighted_mean((prediction - target).abs(), mask)
     if mask is None:
-        return torch.lerp(colour, 1 - _ssim(prediction, target), ssim_weight)
+        return torch.lerp(color, 1 - _ssim(prediction, target), ssim_weight)
     if mask_ssim:
         prediction, target = prediction * mask[..., None], target * mask[..., None]
     structure = torch.where(mask.any(), 1 - _ssim(prediction, target), 0.0)
-    return torch.lerp(colour, structure, ssim_weight)
+    return torch.lerp(color, structure, ssim_weight)
 
 
 @in_full_precision
@@ -48,7 +48,7 @@ def clip_loss(
     target: Float[Tensor, "hd wd c"],
     weight: Bool[Tensor, "hd wd"] | Float[Tensor, "hd wd"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean absolute difference between downsampled features and the CLIP target, not normalised."""
+    """Mean absolute difference between downsampled features and the CLIP target, not normalized."""
     return _weighted_mean((prediction - target).abs(), weight)
 
 

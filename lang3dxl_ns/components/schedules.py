@@ -1,7 +1,7 @@
 """Learning-rate and loss-weight schedules: pure functions of the step or of x, the run's fraction in [0, 1].
 
 Outside its range a schedule keeps its nearest end value. All return Python floats: a NumPy scalar would end
-up in optimiser state and checkpoints, where a safe loader rejects it.
+up in optimizer state and checkpoints, where a safe loader rejects it.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class FieldSettings:
 
 PRESETS: dict[Preset, FieldSettings] = {
     # One lookup of 16 × 32 features replaces the method's four indexed passes of 16 × 8 in a fraction of the
-    # time. The table size is a compromise between capacity for a large scene and the optimiser's memory.
+    # time. The table size is a compromise between capacity for a large scene and the optimizer's memory.
     "default": FieldSettings(
         code_dim=3,
         code_std=0.01,
@@ -150,7 +150,7 @@ class SemanticFieldConfig:
     """Vertices per axis of the coarsest level."""
     max_resolution: int | None = None
     """Vertices per axis of the finest level. Capped low, because Adam with epsilon 1e-15 moves every touched
-    entry equally far: fine levels would grow as large as coarse ones, and neighbouring codes would decode to
+    entry equally far: fine levels would grow as large as coarse ones, and neighboring codes would decode to
     unrelated features."""
     coarse_to_fine: float | None = None
     """Fraction of the run over which levels open, coarsest first; 0 opens all from the start."""
@@ -276,7 +276,7 @@ class SemanticField(SemanticEncoder):
         return {"field_encoding": self.encoding_parameters(), "field_decoder": self.decoder_parameters()}
 
     def encoding_parameters(self) -> list[nn.Parameter]:
-        """Parameters of the hash grid: an optimiser group without weight decay."""
+        """Parameters of the hash grid: an optimizer group without weight decay."""
         return list(self.grid.parameters())
 
     def decoder_parameters(self) -> list[nn.Parameter]:

@@ -16,7 +16,7 @@ COLUMNS = 4
 
 @dataclass
 class PictureRow:
-    """One held-out photo and its renderings; colours in 0…1."""
+    """One held-out photo and its renderings; colors in 0…1."""
 
     name: str
     photo: Float[Array, "h w 3"]
@@ -41,7 +41,7 @@ def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
 
 
 def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
-    """Write a PNG with a row per photo: photo, rendering, codes as colour, and a heat map per prompt with
+    """Write a PNG with a row per photo: photo, rendering, codes as color, and a heat map per prompt with
     the ground truth outlined in white."""
     import matplotlib
 
@@ -68,8 +68,8 @@ def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
 def _draw_prompt(axis, prompt: str, row: PictureRow) -> None:
     height, width = row.truth[prompt].shape
     extent = (0, width, height, 0)
-    grey = row.rendering.mean(axis=2)
-    axis.imshow(grey, cmap="gray", extent=extent, vmin=0, vmax=1)
+    gray = row.rendering.mean(axis=2)
+    axis.imshow(gray, cmap="gray", extent=extent, vmin=0, vmax=1)
     score = row.relevancy[prompt]
     high = max(float(score.max()), 0.5 + 1e-6)
     opacity = 0.75 * np.clip((score - 0.5) / (high - 0.5), 0, 1) ** 0.5

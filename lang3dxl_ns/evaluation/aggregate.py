@@ -13,11 +13,11 @@ PREFIXES = ("", "raw_", "authors_", "teacher_", "limit_", "chance_")
 """Which maps: the field's, unblurred, processed as published, the 2D teacher's, the lifted labels', and maps
 without information."""
 TOTALS = {
-    "located": "localisation_accuracy",
+    "located": "localization_accuracy",
     "iou": "miou",
     "f1": "mean_f1",
     "balanced_accuracy": "mean_balanced_accuracy",
-    "smooth_located": "smooth_localisation_accuracy",
+    "smooth_located": "smooth_localization_accuracy",
     "smooth_iou": "smooth_miou",
 }
 """Measures whose total is the mean over all pairs of a photo and a category, as for LERF-OVS."""
@@ -29,7 +29,7 @@ def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str
     """Means over photos of every figure, and totals.
 
     `{prefix}map`: unweighted mean of average precision over the categories. `{prefix}miou`,
-    `{prefix}localisation_accuracy` etc.: means over all pairs of a photo and a category.
+    `{prefix}localization_accuracy` etc.: means over all pairs of a photo and a category.
     `ap_{category}_photos`: number of photos with that category. with_deviation: adds `…_std` of every mean.
     """
     means: dict[str, Any] = mean_over_photos(photos)

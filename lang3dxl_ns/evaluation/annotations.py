@@ -37,7 +37,7 @@ class Annotation(Protocol):
         """The file it is read from."""
 
     def size(self) -> tuple[int, int]:
-        """Height and width of the labelled photo."""
+        """Height and width of the labeled photo."""
 
     def truth(self, size: tuple[int, int]) -> Truth:
         """The annotation at `size` (height, width). Raises UserError for another aspect ratio."""
@@ -60,21 +60,21 @@ class MaskFile:
         return self._read().size[::-1]
 
     def truth(self, size: tuple[int, int]) -> Truth:
-        """Resized as grey values, then thresholded at half, so that JPEG noise does not matter."""
+        """Resized as gray values, then thresholded at half, so that JPEG noise does not matter."""
         image = self._read()
         check_shape(self.path, image.size[::-1], size)
-        grey = np.asarray(image.resize(size[::-1], Image.Resampling.BILINEAR))
-        return Truth(grey < 128 if self.dark else grey >= 128)
+        gray = np.asarray(image.resize(size[::-1], Image.Resampling.BILINEAR))
+        return Truth(gray < 128 if self.dark else gray >= 128)
 
     def _read(self) -> Image.Image:
-        image = read_grey(self.path)
+        image = read_gray(self.path)
         if not self.dark and image.getextrema()[1] == 1:
             raise UserError(f"ground truth {self.path} holds only 0 and 1, which look black: save 0 and 255")
         return image
 
 
-def read_grey(path: Path, what: str = "ground truth") -> Image.Image:
-    """A picture as grey values 0…255. Raises UserError where it can't be read."""
+def read_gray(path: Path, what: str = "ground truth") -> Image.Image:
+    """A picture as gray values 0…255. Raises UserError where it can't be read."""
     try:
         with open_picture(path) as image:
             return image.convert("L")

@@ -40,7 +40,7 @@ class GroundTruth:
             raise UserError(f"{self.folder} is not a folder: pass the one that holds the ground truth")
         self.layout: Layout = _layout(self.folder) if layout == "auto" else layout
         self._annotations = _READERS[self.layout](self.folder)
-        self._labelled = {photo for photos in self._annotations.values() for photo in photos}
+        self._labeled = {photo for photos in self._annotations.values() for photo in photos}
 
     @property
     def categories(self) -> list[str]:
@@ -48,9 +48,9 @@ class GroundTruth:
         return list(self._annotations)
 
     @property
-    def labelled(self) -> list[str]:
-        """All labelled photos, sorted, as named by the labels: without suffix."""
-        return sorted(self._labelled)
+    def labeled(self) -> list[str]:
+        """All labeled photos, sorted, as named by the labels: without suffix."""
+        return sorted(self._labeled)
 
     def photos(self, category: str) -> list[str]:
         """The photos with a label of the category, as named by the labels."""
@@ -60,10 +60,10 @@ class GroundTruth:
         """The labels' name for a photo (whose name may contain folders); None if it has no label."""
         path = PurePosixPath(photo)
         names = (path.with_suffix("").as_posix(), path.as_posix(), path.stem, path.name)
-        return next((name for name in names if name in self._labelled), None)
+        return next((name for name in names if name in self._labeled), None)
 
     def size(self, photo: str) -> tuple[int, int]:
-        """Height and width of a labelled photo."""
+        """Height and width of a labeled photo."""
         return next(iter(self._of(photo).values())).size()
 
     def scoring_size(self, height: int, width: int) -> tuple[int, int]:
@@ -119,7 +119,7 @@ def scoring_size(height: int, width: int) -> tuple[int, int]:
 
 
 def held_out_photos(truth: GroundTruth, per_category: int = 5) -> list[str]:
-    """Labelled photos to hold out of training, sorted: up to `per_category` that show each category,
+    """Labeled photos to hold out of training, sorted: up to `per_category` that show each category,
     preferring those already chosen for another (Lang3D-XL's rule; its own list is not published). The rest
     are spread evenly over the category's photos, so the same labels always give the same list."""
     chosen: set[str] = set()

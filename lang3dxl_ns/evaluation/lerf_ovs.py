@@ -38,11 +38,11 @@ class Outlines:
     boxes: tuple[tuple[float, float, float, float], ...]
 
     def size(self) -> tuple[int, int]:
-        """Height and width of the labelled photo, in pixels."""
+        """Height and width of the labeled photo, in pixels."""
         return self.height, self.width
 
     def truth(self, size: tuple[int, int]) -> Truth:
-        """Polygons filled at the labelled size, then resized and thresholded at half; boxes scaled."""
+        """Polygons filled at the labeled size, then resized and thresholded at half; boxes scaled."""
         check_shape(self.path, self.size(), size)
         image = Image.new("L", (self.width, self.height))
         draw = ImageDraw.Draw(image)

@@ -15,7 +15,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import slugs
 from lang3dxl_ns.common.reports import progress_bar
-from lang3dxl_ns.evaluation.annotations import PICTURES, check_shape, read_grey
+from lang3dxl_ns.evaluation.annotations import PICTURES, check_shape, read_gray
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest_level
 from lang3dxl_ns.preparation.foreground import find_mask
@@ -37,7 +37,7 @@ class PredictedMaps:
     def read(self, category: str, photo: str, size: tuple[int, int]) -> Float[Tensor, "h w"]:
         """A map at `size`. Raises UserError if it is missing, damaged or has another aspect ratio."""
         path = self._find(category, photo)
-        score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_grey(path, "map")) / 255
+        score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_gray(path, "map")) / 255
         if score.ndim == 3:
             score = strongest_level(score)
         height, width = score.shape
@@ -84,14 +84,14 @@ def score_predictions(
     masks: Path | None = None,
     temperature: float = 1.0,
 ) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
-    """Figures of every labelled photo, by name, and the scoring protocol.
+    """Figures of every labeled photo, by name, and the scoring protocol.
 
     photos: names of the photos (or labels) to score; by default all with a label. masks: folder of foreground
     masks, white = keep; predictions become 0 elsewhere. temperature: the one the maps were made with
     (see `MapScorer.variants`). Raises UserError for a missing map.
     """
     scorer, predicted = MapScorer(truth), PredictedMaps(maps, truth.categories)
-    keys = truth.labelled if photos is None else [_key(truth, photo) for photo in photos]
+    keys = truth.labeled if photos is None else [_key(truth, photo) for photo in photos]
     keeps = {key: None if masks is None else _read_mask(masks, key) for key in keys}
     figures: dict[str, dict[str, float]] = {}
     with progress_bar() as bar:
@@ -121,4 +121,4 @@ def _read_mask(folder: Path, photo: str) -> Bool[Tensor, "h w"] | None:
     path = find_mask(folder, f"{photo}.png")
     if path is None:
         raise UserError(f"{folder} holds no mask of the photo {photo}: add it, white = keep")
-    return torch.from_numpy(np.asarray(read_grey(path, "mask")) >= 128)
+    return torch.from_numpy(np.asarray(read_gray(path, "mask")) >= 128)

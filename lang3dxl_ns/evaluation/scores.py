@@ -1,4 +1,4 @@
-"""Scores of relevancy maps against masks and boxes: AP, IoU, F1, localisation, LangSplat's measures."""
+"""Scores of relevancy maps against masks and boxes: AP, IoU, F1, localization, LangSplat's measures."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def located(score: Float[Array, "h w"], truth: Truth) -> float:
 
 def smooth_mask(score: Float[Array, "h w"], mean: Float[Array, "h w"]) -> Bool[Array, "h w"]:
     """LangSplat's mask: the mean of the map and its mean-filtered copy, stretched to −1…1, above 0.4 by
-    majority of the neighbours (Qin et al. 2024). The threshold is fixed, not chosen by the truth."""
+    majority of the neighbors (Qin et al. 2024). The threshold is fixed, not chosen by the truth."""
     mixed = (score + mean) / 2
     lowest, highest = mixed.min(), mixed.max()
     stretched = 2 * (mixed - lowest) / max(highest - lowest, 1e-9) - 1
@@ -212,7 +212,7 @@ class MapScorer:
     def scores(
         self, photo: str, maps: Maps, prefix: str = "", truths: Mapping[str, Truth] | None = None
     ) -> dict[str, float]:
-        """`{prefix}{measure}_{category}` for every labelled category that the photo shows.
+        """`{prefix}{measure}_{category}` for every labeled category that the photo shows.
 
         truths: the photo's labels at the size of the maps; by default as the files have them.
         """

@@ -1,1 +1,1 @@
-"""Numerical stability: every component measured on a catalogue of extreme cases."""
+"""Numerical stability: every component measured on a catalog of extreme cases."""

@@ -20,9 +20,9 @@ from lang3dxl_ns.common.reports import (
     progress_bar,
     write_report,
 )
-from lang3dxl_ns.numerics.catalogue import all_cases
+from lang3dxl_ns.numerics.catalog import all_cases
 from lang3dxl_ns.numerics.measure import Case, Row, measure
-from lang3dxl_ns.numerics.optimisation import Run, runs
+from lang3dxl_ns.numerics.optimization import Run, runs
 
 HEADER = (
     "case",
@@ -57,22 +57,22 @@ class Numerics:
         torch.set_num_threads(1)  # the timer measures processor time
         try:
             rows = measure_all(list(all_cases(self.quick, device)), self.quick, device)
-            optimisations = runs(self.quick)
+            optimizations = runs(self.quick)
             machine = describe_machine(device)
         finally:
             torch.set_num_threads(threads)
         lines = [
             f"{row.component}, {row.case}, {row.mode}: {'; '.join(row.misses)}" for row in rows if row.misses
         ]
-        lines += [f"optimisation, {run.name}: {'; '.join(run.misses)}" for run in optimisations if run.misses]
+        lines += [f"optimization, {run.name}: {'; '.join(run.misses)}" for run in optimizations if run.misses]
         command = command_line("lang3dxl numerics", self)
         data = {"command": command, "machine": machine, "rows": [_plain(row) for row in rows]}
-        data["optimisations"] = [_plain(run) for run in optimisations]
-        write_report(self.out, "numerics", _markdown(rows, optimisations, command, machine), data)
+        data["optimizations"] = [_plain(run) for run in optimizations]
+        write_report(self.out, "numerics", _markdown(rows, optimizations, command, machine), data)
         write_atomically(self.out / "numerics.png", _plot(rows))
         for line in lines:
             print(f"MISS {line}")
-        total = len(rows) + len(optimisations)
+        total = len(rows) + len(optimizations)
         print(f"{total - len(lines)} of {total} rows pass; report: {self.out}")
         if lines:
             sys.exit(1)
@@ -106,9 +106,9 @@ def _plain(row: Row | Run) -> dict[str, Any]:
     return plain(asdict(row)) | {"misses": row.misses}
 
 
-def _markdown(rows: list[Row], optimisations: list[Run], command: str, machine: str) -> str:
-    total = len(rows) + len(optimisations)
-    passed = sum(not row.misses for row in rows) + sum(not run.misses for run in optimisations)
+def _markdown(rows: list[Row], optimizations: list[Run], command: str, machine: str) -> str:
+    total = len(rows) + len(optimizations)
+    passed = sum(not row.misses for row in rows) + sum(not run.misses for run in optimizations)
     components = list(dict.fromkeys(row.component for row in rows))
     tables = "\n\n".join(_section([row for row in rows if row.component == name]) for name in components)
     return f"""# Numerics: error against run time on stiff and extreme cases
@@ -117,12 +117,12 @@ def _markdown(rows: list[Row], optimisations: list[Run], command: str, machine: 
 {machine}.
 
 **{passed} of {total} rows pass.** Every component runs on its hard cases. The same inputs, rounded as the
-component sees them, go through a float64 reference written for clarity (rasteriser: every
+component sees them, go through a float64 reference written for clarity (rasterizer: every
 Gaussian against every pixel; hash grid: corner by corner; downsampler: window by window; physical scale:
 80 bits). Errors are relative to the reference's largest value (max) and root mean square (rms), the worst of
 all outputs and of the gradients of all inputs for a random upstream gradient. Where the reference is not
 finite (a NaN input's own row), the component may be anything; everywhere else "finite" means that output and
-gradient are. flipped: share of pixels in which rounding moved a pair across the rasteriser's thresholds of
+gradient are. flipped: share of pixels in which rounding moved a pair across the rasterizer's thresholds of
 1/255 and 1e-4; these count in the output's error, not in the gradient's. bf16, fp16: mixed precision
 (autocast). ms: one forward and backward. Bounds are in the order of the error columns.
 
@@ -132,7 +132,7 @@ gradient are. flipped: share of pixels in which rounding moved a pair across the
 
 {tables}
 
-{_optimisation_section(optimisations)}
+{_optimization_section(optimizations)}
 """
 
 
@@ -169,7 +169,7 @@ def _section(rows: list[Row]) -> str:
     return f"## {rows[0].component[0].upper()}{rows[0].component[1:]}\n\n{table}" + (listed and f"\n{listed}")
 
 
-def _optimisation_section(optimisations: list[Run]) -> str:
+def _optimization_section(optimizations: list[Run]) -> str:
     header = ["rates", "steps", "loss by fifths", "largest code by fifths", "finite", "s", "verdict"]
     table = [
         [
@@ -181,9 +181,9 @@ def _optimisation_section(optimisations: list[Run]) -> str:
             f"{run.seconds:.0f}",
             "pass" if not run.misses else f"**miss**: {'; '.join(run.misses)}",
         ]
-        for run in optimisations
+        for run in optimizations
     ]
-    return f"""## Optimisation of the field alone
+    return f"""## Optimization of the field alone
 
 Adam with epsilon 1e-15 at constant rates, on noisy targets. Parameters and moments must stay finite; at the
 usual rates the loss must not rise again, and no code may pass 25 (at 17 the sigmoid's slope is 0 in float32).
@@ -215,7 +215,7 @@ def _figure(value: float | None) -> str:
 
 
 def _plot(rows: list[Row]) -> bytes:
-    """PNG: error against time, for outputs and gradients; colours are components, markers are modes."""
+    """PNG: error against time, for outputs and gradients; colors are components, markers are modes."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -236,7 +236,7 @@ def _plot(rows: list[Row]) -> bytes:
         "#ff6fb5",
         "#5dade2",
     )
-    colours = {name: palette[i % len(palette)] for i, name in enumerate(components)}
+    colors = {name: palette[i % len(palette)] for i, name in enumerate(components)}
     markers = {"float32": "o", "float64": "s", "bf16": "^", "fp16": "v", "tf32": "D"}
     smallest = 1e-18
     errors: dict[str, Callable[[Row], float | None]] = {
@@ -247,14 +247,14 @@ def _plot(rows: list[Row]) -> bytes:
         for row in rows:
             value = error(row)
             if value is not None and math.isfinite(value):
-                style = {"color": colours[row.component], "marker": markers[row.mode]}
+                style = {"color": colors[row.component], "marker": markers[row.mode]}
                 panel.plot(row.ms, max(value, smallest), markersize=4.5, alpha=0.7, linestyle="none", **style)
         panel.set(xscale="log", yscale="log", xlabel="forward + backward, ms", title=title)
         panel.grid(which="major", alpha=0.25)
         panel.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("relative RMS error (0 drawn at 1e-18)")
     used = [mode for mode in markers if any(row.mode == mode for row in rows)]
-    keys = [Line2D([], [], color=colours[name], linewidth=3, label=name) for name in components]
+    keys = [Line2D([], [], color=colors[name], linewidth=3, label=name) for name in components]
     keys += [Line2D([], [], color="0.35", marker=markers[m], linestyle="none", label=m) for m in used]
     figure.legend(handles=keys, loc="outside lower center", ncols=6, frameon=False)
     file = io.BytesIO()

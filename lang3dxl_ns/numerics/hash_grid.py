@@ -22,7 +22,7 @@ LARGE = 512.0
 def cases(quick: bool, device: str) -> Iterator[Case]:
     """Coordinates, tables and number types."""
     bounds = {"float32": Bounds(2e-4, 5e-5, 1e-3, 2e-4), "float64": EXACT}
-    catalogue: dict[str, tuple[Callable[[], Tensor], str]] = {
+    catalog: dict[str, tuple[Callable[[], Tensor], str]] = {
         "uniform in [0, 1]": (_uniform, ""),
         "exactly 0 and 1": (lambda: _uniform().round(), ""),
         "cell borders": (_borders, ""),
@@ -30,7 +30,7 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
         "huge: ±1e4, 1e30, ∞": (_huge, "clamped to ±1024"),
         "NaN": (_with_nan, "NaN in its own row, nowhere else"),
     }
-    for name, (points, note) in catalogue.items():
+    for name, (points, note) in catalog.items():
         constants = frozenset({"table"}) if name == "NaN" else frozenset[str]()
         yield Case("hash grid", name, partial(_problem, points, constants=constants), bounds, note)
     yield Case("hash grid", "four dimensions", partial(_problem, lambda: _uniform(4)), bounds)

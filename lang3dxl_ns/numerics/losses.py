@@ -23,8 +23,8 @@ HALF_NOTE = "a prediction rounded to 16 bits may cross its target: the sign of t
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """Colour, CLIP, dense and region losses."""
-    yield from _colour_cases()
+    """Color, CLIP, dense and region losses."""
+    yield from _color_cases()
     yield from _feature_cases()
     yield from _region_cases(quick)
 
@@ -33,10 +33,10 @@ def _random(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-# --- colours ----------------------------------------------------------------------------------------------
+# --- colors ----------------------------------------------------------------------------------------------
 
 
-def _colour_cases() -> Iterator[Case]:
+def _color_cases() -> Iterator[Case]:
     image, other = _random(24, 30, 3), _random(24, 30, 3, seed=1)
     black = torch.zeros_like(image)
     one = torch.zeros(24, 30, dtype=torch.float64)
@@ -55,12 +55,12 @@ def _colour_cases() -> Iterator[Case]:
         "1×400": (_random(1, 400, 3), _random(1, 400, 3, seed=1), None),
     }
     for name, (prediction, target, mask) in pairs.items():
-        yield Case("loss: colour", name, _colour(prediction, target, mask), SSIM_BOUNDS, SSIM_NOTE)
-    narrow = _colour(image, other, None, narrow=True)
-    yield Case("loss: colour", "mixed precision, 16-bit image", narrow, HALF, HALF_NOTE)
+        yield Case("loss: color", name, _color(prediction, target, mask), SSIM_BOUNDS, SSIM_NOTE)
+    narrow = _color(image, other, None, narrow=True)
+    yield Case("loss: color", "mixed precision, 16-bit image", narrow, HALF, HALF_NOTE)
 
 
-def _colour(
+def _color(
     prediction: Tensor, target: Tensor, mask: Tensor | None, narrow: bool = False
 ) -> Callable[[], Problem]:
     def compute(leaves: Maps) -> Maps:
@@ -69,14 +69,14 @@ def _colour(
         return {"loss": rgb_loss(image, leaves["target"], used)}
 
     def reference(leaves: Maps) -> Maps:
-        return {"loss": colour_reference(leaves["prediction"], leaves["target"], mask)}
+        return {"loss": color_reference(leaves["prediction"], leaves["target"], mask)}
 
     leaves = {"prediction": prediction.clone(), "target": target.clone()}
     fixed = frozenset({"target"})
     return lambda: Problem(leaves, compute, reference, constants=fixed, output_scale=0.1, gradient_scale=1e-4)
 
 
-def colour_reference(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+def color_reference(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """½ L1 + ½ (1 − SSIM), window by window with two-pass variances."""
     if mask is not None and not mask.any():
         return 0 * prediction.sum()
@@ -158,8 +158,8 @@ def _resized(values: Tensor, grid: torch.Size) -> Tensor:
     for axis, cells in enumerate(grid):
         size = values.shape[axis]
         scale = size / cells
-        centres = (torch.arange(cells, dtype=torch.float64) + 0.5) * scale
-        distance = (torch.arange(size, dtype=torch.float64) + 0.5 - centres[:, None]).abs()
+        centers = (torch.arange(cells, dtype=torch.float64) + 0.5) * scale
+        distance = (torch.arange(size, dtype=torch.float64) + 0.5 - centers[:, None]).abs()
         matrix = (1 - distance / max(scale, 1.0)).clamp_min(0)
         matrix = (matrix / matrix.sum(1, keepdim=True)).to(values)
         values = torch.tensordot(matrix, values, ([1], [axis])).movedim(0, axis)
@@ -184,8 +184,8 @@ def _region_cases(quick: bool) -> Iterator[Case]:
     for name, label in labels.items():
         smooth = name == "usual"
         yield Case("loss: regions", name, _region(features, label, smooth), BOUNDS)
-        cancelling = {"float32": Bounds(1e-5, 1e-5, 1e-4, 1e-5), "float64": Bounds(1e-8, 1e-8, 1e-6, 1e-6)}
-        yield Case("loss: regions", f"{name}, mean 1e4, deviation 1e-3", _region(shifted, label), cancelling)
+        canceling = {"float32": Bounds(1e-5, 1e-5, 1e-4, 1e-5), "float64": Bounds(1e-8, 1e-8, 1e-6, 1e-6)}
+        yield Case("loss: regions", f"{name}, mean 1e4, deviation 1e-3", _region(shifted, label), canceling)
     large = torch.arange(side * side).view(side, side) * many // side**2
     yield Case("loss: regions", f"{many:,} regions", _region(_random(side, side, 4), large), BOUNDS)
     mixed = _region(30 * _random(64, 64, 8), torch.zeros(64, 64, dtype=torch.long), narrow=True)

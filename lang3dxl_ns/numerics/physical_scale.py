@@ -33,12 +33,12 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
     """Pixel sizes by every rule against 80-bit arithmetic; crops; and limits that raise an error."""
     photo = _photo()
     points = photo.points
-    behind = photo.centre - (points - photo.centre)
+    behind = photo.center - (points - photo.center)
     photos: dict[str, TrackedPhoto] = {
         "usual": photo,
         "no point": replace(photo, points=points[:0], pixels=photo.pixels[:0]),
         "one point": replace(photo, points=points[:1], pixels=photo.pixels[:1]),
-        "a point at the camera centre": replace(photo, points=photo.centre[None], pixels=photo.pixels[:1]),
+        "a point at the camera center": replace(photo, points=photo.center[None], pixels=photo.pixels[:1]),
         "some points behind the camera": replace(photo, points=np.concatenate([points, behind[:20]]),
                                                  pixels=np.concatenate([photo.pixels, photo.pixels[:20]])),
         "all points behind the camera": replace(photo, points=behind),
@@ -52,7 +52,7 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
         yield Case("physical scale", name, _sizes(one), BOUNDS)
     moved = {"scale 1e-3": (1e-3, 0.0), "scale 1e5": (1e5, 0.0), "offset 1e6 (UTM)": (1.0, 1e6)}
     for name, (scale, offset) in moved.items():
-        note = "a camera centre of 1e6 has ten digits behind the point" if offset else ""
+        note = "a camera center of 1e6 has ten digits behind the point" if offset else ""
         yield Case("physical scale", name, _sizes(in_world(photo, scale, offset)), OFFSET, note)
     yield Case("physical scale", "crops and scale list", _crops, BOUNDS)
     yield Case("physical scale", "scales from 1e-300 to 1e300", _extreme_scales, BOUNDS)

@@ -1,4 +1,4 @@
-"""Hard cases of the rasteriser: extreme Gaussians and cameras."""
+"""Hard cases of the rasterizer: extreme Gaussians and cameras."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ GSPLAT = {"float32": Bounds(0.1, 1e-2, 0.5, 0.1, flipped=1.0)}
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
     """All cases, by the torch backend, on the CPU by the compiled kernels, on a GPU by gsplat."""
-    yield from _cases("rasteriser, torch", "torch", MODES, quick)
+    yield from _cases("rasterizer, torch", "torch", MODES, quick)
     if device == "cpu" and numba_is_installed():
         yield from _cases("rasterizer, numba", "numba", MODES, quick)
     if device == "cuda":
-        yield from _cases("rasteriser, gsplat", "gsplat", GSPLAT, quick)
+        yield from _cases("rasterizer, gsplat", "gsplat", GSPLAT, quick)
 
 
 def _cases(component: str, backend: Backend, modes: Mapping[str, Bounds], quick: bool) -> Iterator[Case]:
-    for name, scene in _catalogue(quick).items():
+    for name, scene in _catalog(quick).items():
         yield Case(component, name, partial(_problem, scene, backend), modes, scene().note)
     single = modes["float32"]
     note = "autocast is off inside: positions don't survive 16 bits"
@@ -56,7 +56,7 @@ class Scene:
 
         self.width, self.height, self.near = width, height, NEAR
         self.focal = (0.9 * width, 0.9 * width)
-        self.centre = (0.52 * width, 0.47 * height)
+        self.center = (0.52 * width, 0.47 * height)
         self.outputs: tuple[str, ...] = ("image", "alpha", "depth")
         self.constants: frozenset[str] = frozenset()
         self.note = ""
@@ -78,16 +78,16 @@ class Scene:
             self.leaves[name][:first] = torch.as_tensor(value, dtype=torch.float64)
         return self
 
-    def seen_with(self, focal: tuple[float, float], centre: tuple[float, float] | None = None) -> Scene:
+    def seen_with(self, focal: tuple[float, float], center: tuple[float, float] | None = None) -> Scene:
         """Another lens; the Gaussians spread over its field of view."""
         spread = torch.tensor([self.focal[0] / focal[0], self.focal[1] / focal[1], 1.0])
-        centre = centre or self.centre
+        center = center or self.center
         self.leaves["means"] *= spread
         for axis in (0, 1):
-            slope = (self.centre[axis] - centre[axis]) / focal[axis]
+            slope = (self.center[axis] - center[axis]) / focal[axis]
             self.leaves["means"][:, axis] += slope * self.leaves["means"][:, 2]
         self.leaves["log_scales"] += math.log(min(spread[0], spread[1]))
-        self.focal, self.centre = focal, centre
+        self.focal, self.center = focal, center
         return self
 
     def in_world(self, scale: float = 1.0, offset: float = 0.0) -> Scene:
@@ -110,7 +110,7 @@ class Scene:
         return self
 
 
-def _catalogue(quick: bool) -> dict[str, Callable[[], Scene]]:
+def _catalog(quick: bool) -> dict[str, Callable[[], Scene]]:
     """Scenes by name."""
     many = 4_000 if quick else 20_000
     stack = 10_000 if quick else 100_000
@@ -178,7 +178,7 @@ def _at_depth(scene: Scene, depth: float) -> Scene:
 def _rounded_depths() -> Scene:
     scene = _at_depth(Scene(4000).set(logits=-4.0), 3.0).in_world(offset=1.0)
     scene.outputs = ("alpha",)
-    scene.note = "their order is decided by rounding, so colours may differ; alpha may not"
+    scene.note = "their order is decided by rounding, so colors may differ; alpha may not"
     return scene
 
 
@@ -206,7 +206,7 @@ def _problem(scene: Callable[[], Scene], backend: Backend) -> Problem:
     width, height = made.width, made.height
 
     def camera(leaves: Maps) -> Camera:
-        (fx, fy), (cx, cy) = made.focal, made.centre
+        (fx, fy), (cx, cy) = made.focal, made.center
         intrinsics = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float32)
         return Camera(leaves["view_matrix"], intrinsics.to(leaves["view_matrix"]), width, height)
 

@@ -1,4 +1,4 @@
-"""Run state in a checkpoint, beyond parameters and optimisers, for an exact resume."""
+"""Run state in a checkpoint, beyond parameters and optimizers, for an exact resume."""
 
 from __future__ import annotations
 

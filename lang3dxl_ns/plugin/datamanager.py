@@ -54,7 +54,7 @@ from lang3dxl_ns.scene.photo import Photo
 
 @dataclass
 class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
-    """Photos and their targets. `--pipeline.datamanager.clip none` trains colours only."""
+    """Photos and their targets. `--pipeline.datamanager.clip none` trains colors only."""
 
     _target: type = field(default_factory=lambda: Lang3DXLDataManager)
     dataparser: AnnotatedDataParserUnion = field(default_factory=PhotoCollectionDataParserConfig)
@@ -192,7 +192,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def targets(self) -> TargetReader | None:
-        """The prepared targets of all photos, or None if only colours are trained. Made on first use,
+        """The prepared targets of all photos, or None if only colors are trained. Made on first use,
         so that the viewer and exports never wait for them."""
         photos = list(self.photos.values())
         if self.config.clip == "none":

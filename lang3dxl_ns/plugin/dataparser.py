@@ -129,32 +129,32 @@ class PhotoCollectionDataParser(ColmapDataParser):
 
     @cached_property
     def _origin(self) -> np.ndarray:
-        """The origin subtracted from positions while they are in float64: the centre of the cameras.
+        """The origin subtracted from positions while they are in float64: the center of the cameras.
 
-        The parent casts to float32, which resolves map coordinates (millions of metres) only to half a metre.
+        The parent casts to float32, which resolves map coordinates (millions of meters) only to half a meter.
         """
         assert self.reconstruction is not None
         if self.config.center_method == "none":
             return np.zeros(3)
-        return np.mean([tracked.centre for tracked in self.reconstruction.photos.values()], axis=0)
+        return np.mean([tracked.center for tracked in self.reconstruction.photos.values()], axis=0)
 
     @property
     def _cameras_are_apart(self) -> bool:
         """Whether cameras are far enough apart to scale the scene by their distance."""
         assert self.reconstruction is not None
-        centres = np.array([tracked.centre for tracked in self.reconstruction.photos.values()])
-        distances = np.linalg.norm(self.reconstruction.points - centres.mean(axis=0), axis=1)
+        centers = np.array([tracked.center for tracked in self.reconstruction.photos.values()])
+        distances = np.linalg.norm(self.reconstruction.points - centers.mean(axis=0), axis=1)
         typical = np.median(distances) if len(distances) else 0.0
-        return bool(np.ptp(centres, axis=0).max() > 1e-6 * typical)
+        return bool(np.ptp(centers, axis=0).max() > 1e-6 * typical)
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: torch.Tensor, scale_factor: float) -> dict:
-        """The model's points in the scene's frame, with their colours."""
+        """The model's points in the scene's frame, with their colors."""
         assert self.reconstruction is not None
         transform = transform_matrix.double()
         points = torch.from_numpy(self.reconstruction.points - self._origin)
         return {
             "points3D_xyz": (scale_factor * (points @ transform[:, :3].T + transform[:, 3])).float(),
-            "points3D_rgb": torch.from_numpy(self.reconstruction.colours),
+            "points3D_rgb": torch.from_numpy(self.reconstruction.colors),
         }
 
     def _frame(self, tracked: TrackedPhoto) -> dict:

@@ -15,13 +15,13 @@ from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.scene.geometry import sphere_around
 
 FEWEST = 4
-"""Fewest positions, so that each has three neighbours."""
+"""Fewest positions, so that each has three neighbors."""
 
 
 def seed_positions(
     config: Lang3DXLModelConfig, seed_points: tuple[Tensor, Tensor] | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Initial positions of Gaussians and their colours (0…1): the scene's points, or random ones in a box.
+    """Initial positions of Gaussians and their colors (0…1): the scene's points, or random ones in a box.
 
     Raises UserError if the scene has too few points.
     """
@@ -38,21 +38,21 @@ def seed_positions(
 
 
 def initial_gaussians(
-    config: Lang3DXLModelConfig, means: Float[Tensor, "n 3"], colours: Float[Tensor, "n 3"]
+    config: Lang3DXLModelConfig, means: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]
 ) -> dict[str, Parameter]:
     """A Gaussian per position (at least `FEWEST`), as wide as the mean distance to its three nearest
-    neighbours, and the sky."""
+    neighbors, and the sky."""
     if config.sky_gaussians:
         sky = sphere_around(means, config.sky_gaussians)
         means = torch.cat([means, sky])
-        colours = torch.cat([colours, torch.full_like(sky, 0.5)])
+        colors = torch.cat([colors, torch.full_like(sky, 0.5)])
     n = len(means)
     return {
         "means": Parameter(means),
         "scales": Parameter(_spacing(means).log().repeat(1, 3)),
         # Uniform over rotations; with its own generator, so that preparation does not affect it.
         "quats": Parameter(F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)),
-        "features_dc": Parameter(RGB2SH(colours) if config.sh_degree > 0 else torch.logit(colours, eps=1e-4)),
+        "features_dc": Parameter(RGB2SH(colors) if config.sh_degree > 0 else torch.logit(colors, eps=1e-4)),
         "features_rest": Parameter(torch.zeros(n, num_sh_bases(config.sh_degree) - 1, 3)),
         "opacities": Parameter(torch.logit(0.1 * torch.ones(n, 1))),
     }

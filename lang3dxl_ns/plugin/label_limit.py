@@ -35,8 +35,8 @@ def label_limit(
             yield partial(model.composite, camera), _labels(masks, categories, size)
 
     lifted, _ = gather(model.num_points, probes(), 2 * len(categories), model.means.detach())
-    labels, labelled = lifted.chunk(2, dim=1)
-    shares = torch.where(labelled > 0, labels / labelled, 0.0)
+    labels, labeled = lifted.chunk(2, dim=1)
+    shares = torch.where(labeled > 0, labels / labeled, 0.0)
 
     def maps(camera: Cameras) -> Maps:
         found = model.composite(camera, shares)
@@ -46,11 +46,11 @@ def label_limit(
 
 
 def _labels(masks: Masks, categories: list[str], size: tuple[int, int]) -> Float[Tensor, "h w channels"]:
-    """A channel per category with its label, one per category that is 1 if it is labelled here, and a 1."""
-    labels, labelled = torch.zeros(2, len(categories), *size)
+    """A channel per category with its label, one per category that is 1 if it is labeled here, and a 1."""
+    labels, labeled = torch.zeros(2, len(categories), *size)
     for index, category in enumerate(categories):
         if category in masks:
             mask = torch.from_numpy(np.asarray(masks[category])).float()
             labels[index] = F.adaptive_avg_pool2d(mask[None], size)[0]
-            labelled[index] = 1
-    return torch.cat([labels, labelled, torch.ones(1, *size)]).permute(1, 2, 0)
+            labeled[index] = 1
+    return torch.cat([labels, labeled, torch.ones(1, *size)]).permute(1, 2, 0)

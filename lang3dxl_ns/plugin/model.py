@@ -38,11 +38,11 @@ from lang3dxl_ns.preparation.targets import FeatureStatistics
 from lang3dxl_ns.rendering import Gaussians, Rendering, rasterize, spherical_harmonics
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.scene.camera import Camera, in_view
-from lang3dxl_ns.scene.geometry import centre_and_radius
+from lang3dxl_ns.scene.geometry import center_and_radius
 
 
 class Lang3DXLModel(AnsweringModel):
-    """Gaussians with colours and semantic codes; without targets (clip = none) it has no semantic parts."""
+    """Gaussians with colors and semantic codes; without targets (clip = none) it has no semantic parts."""
 
     config: Lang3DXLModelConfig
     semantic_field: SemanticEncoder | None
@@ -58,10 +58,10 @@ class Lang3DXLModel(AnsweringModel):
         self.config.fit_to_run(self.config.total_steps)
         if not self._wants("view dependence", self.config.view_dependence):
             self.config.sh_degree = 0
-        means, colours = seed_positions(self.config, self.seed_points)
-        self.extent = centre_and_radius(means)
-        self.gauss_params = nn.ParameterDict(initial_gaussians(self.config, means, colours))
-        self._make_camera_optimizer(self._wants("camera optimiser", self.config.camera_optimisation, False))
+        means, colors = seed_positions(self.config, self.seed_points)
+        self.extent = center_and_radius(means)
+        self.gauss_params = nn.ParameterDict(initial_gaussians(self.config, means, colors))
+        self._make_camera_optimizer(self._wants("camera optimizer", self.config.camera_optimization, False))
         self.semantic_field = self.downsampler = None
         statistics: FeatureStatistics | None = self.kwargs["metadata"].get("feature_statistics")
         if statistics is not None:
@@ -162,7 +162,7 @@ class Lang3DXLModel(AnsweringModel):
         return {name: [self.gauss_params[name]] for name in names}
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Optimiser groups: one per Gaussian property, and those of the components present."""
+        """Optimizer groups: one per Gaussian property, and those of the components present."""
         groups = super().get_param_groups()
         if self.semantic_field is not None and self.downsampler is not None:
             groups |= self.semantic_field.parameter_groups()
@@ -280,13 +280,13 @@ class Lang3DXLModel(AnsweringModel):
         view, pose = self._view(camera)
         background = self._get_background_color()
         gaussians = self._activated(g)
-        colours, in_photo = self._colours(g, pose[:, 3]), gaussians
+        colors, in_photo = self._colors(g, pose[:, 3]), gaussians
         if self.appearance is not None:
             vector = self._light(camera, pose)
             visible = in_view(view, gaussians.means, gaussians.scales).nonzero().squeeze(1)
             seed = self.step if self.training else None
             with part("appearance"):
-                colours, in_photo = self.appearance(gaussians, colours, vector, visible, seed)
+                colors, in_photo = self.appearance(gaussians, colors, vector, visible, seed)
         settings: dict[str, Any] = {
             "antialiased": self.config.rasterize_mode == "antialiased",
             "absgrad": self.strategy.absgrad and self.training,
@@ -294,7 +294,7 @@ class Lang3DXLModel(AnsweringModel):
         rendering = rasterize(
             gaussians,
             view,
-            colours,
+            colors,
             background,
             features=features,
             detach_features=not self.config.feature_gradient_to_geometry,
@@ -303,7 +303,7 @@ class Lang3DXLModel(AnsweringModel):
         )
         if in_photo is not gaussians:
             # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
-            photo = rasterize(in_photo, view, colours, background, **settings)
+            photo = rasterize(in_photo, view, colors, background, **settings)
             rendering = replace(rendering, image=photo.image, info=photo.info)
         return rendering, background
 
@@ -319,14 +319,14 @@ class Lang3DXLModel(AnsweringModel):
             return self.appearance.vector(self.look)
         return self.appearance.vector_of_view(position, direction)
 
-    def _colours(self, g: Mapping[str, Tensor], camera_centre: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-        """Colours seen from a point. The degree of the harmonics rises by one every 1,000 iterations, or
-        every tenth of a run of under 10,000. At degree 0 colours are logits, as in splatfacto."""
+    def _colors(self, g: Mapping[str, Tensor], camera_center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
+        """Colors seen from a point. The degree of the harmonics rises by one every 1,000 iterations, or
+        every tenth of a run of under 10,000. At degree 0 colors are logits, as in splatfacto."""
         if self.config.sh_degree == 0:
             return torch.sigmoid(g["features_dc"])
         interval = max(min(self.config.sh_degree_interval, self.config.total_steps // 10), 1)
         degree = min(self.step // interval, self.config.sh_degree)
-        directions = g["means"].detach() - camera_centre
+        directions = g["means"].detach() - camera_center
         coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
         return (spherical_harmonics(degree, directions, coefficients) + 0.5).clamp_min(0.0)
 
@@ -335,7 +335,7 @@ class Lang3DXLModel(AnsweringModel):
     def get_loss_dict(
         self, outputs: dict, batch: dict, metrics_dict: dict | None = None
     ) -> dict[str, Tensor]:
-        """Colour loss and, if there are semantics, the semantic losses (already weighted)."""
+        """Color loss and, if there are semantics, the semantic losses (already weighted)."""
         mask = self._downscale_if_required(batch["mask"])[..., 0] if "mask" in batch else None
         with part("losses"):
             target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
@@ -403,12 +403,12 @@ class Lang3DXLModel(AnsweringModel):
     def get_image_metrics_and_images(
         self, outputs: dict, batch: dict
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Held-out photo: PSNR (`cc_psnr`: with matched colours), SSIM, and LPIPS if its weights are
+        """Held-out photo: PSNR (`cc_psnr`: with matched colors), SSIM, and LPIPS if its weights are
         available."""
         target = self.get_gt_img(batch["image"])
         predicted = outputs["rgb"]
         chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]
-        # Matched on the CPU, whose solver also handles pictures of a single colour.
+        # Matched on the CPU, whose solver also handles pictures of a single color.
         corrected = color_correct(predicted.cpu(), target.cpu())
         metrics = {
             "psnr": float(psnr(predicted, target)),
@@ -465,7 +465,7 @@ class Lang3DXLModel(AnsweringModel):
     def load_state_dict(self, state: Mapping[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, with or without semantics.
 
-        Parameters are resized in place: the optimisers hold them, and new ones would never be trained.
+        Parameters are resized in place: the optimizers hold them, and new ones would never be trained.
         """
         self._match_semantics(state)
         self._match_appearance(state)

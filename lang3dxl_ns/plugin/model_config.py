@@ -29,7 +29,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
     """Reduces decoded features to the grid of the CLIP target; training only."""
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
-    """Colours that depend on each photo's light."""
+    """Colors that depend on each photo's light."""
     clip_weight: float = 1.0
     """Weight of the CLIP loss (mean absolute difference)."""
     dense_weight: float | None = None
@@ -40,13 +40,13 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     """The code map is decoded at a random size in this range: pixels of its longer side, inclusive.
     None: 56 to 72 in short runs, 80 to 120 (the paper's) in long ones."""
     warm_up: float = 0.0
-    """Fraction of the run that trains colours only, before the semantic losses start."""
+    """Fraction of the run that trains colors only, before the semantic losses start."""
     feature_gradient_to_geometry: bool = False
     """Let the semantic losses also move Gaussians and opacities, as in the authors' code."""
     view_dependence: Literal["auto", "on", "off"] = "auto"
-    """Colours that depend on the viewing direction (spherical harmonics of `sh_degree`); off leaves one
-    colour and a quarter of the numbers per Gaussian. `auto`: by the scene's measured needs."""
-    camera_optimisation: Literal["auto", "on", "off"] = "auto"
+    """Colors that depend on the viewing direction (spherical harmonics of `sh_degree`); off leaves one
+    color and a quarter of the numbers per Gaussian. `auto`: by the scene's measured needs."""
+    camera_optimization: Literal["auto", "on", "off"] = "auto"
     """Refine the cameras during training. `auto`: if the COLMAP model's reprojection error is large."""
     sky_gaussians: int = 2_000
     """Gaussians on a sphere around the scene for the sky and the far distance, where a COLMAP
@@ -64,7 +64,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     num_downscales: int = 0
     """Photos already vary in size: no extra coarse-to-fine resolution."""
     ssim_lambda: float = 0.5
-    """Weight of 1 − SSIM relative to L1 in the colour loss."""
+    """Weight of 1 − SSIM relative to L1 in the color loss."""
     cull_alpha_thresh: float = 0.005
     """Gaussians below this opacity are pruned."""
     use_absgrad: bool = False

@@ -62,8 +62,8 @@ def reconstruction_of(splits: list[DataparserOutputs]) -> Reconstruction:
         for photo, pose in zip(outputs.metadata["photos"], outputs.cameras.camera_to_worlds, strict=True):
             tracked = _tracked(photo, pose.double().numpy(), scale)
             photos[photo.name] = replace(tracked, points=points_in_view(points, tracked))
-    colours = metadata["points3D_rgb"].numpy() if len(points) else np.zeros((0, 3))
-    return Reconstruction(photos=dict(sorted(photos.items())), points=points, colours=colours)
+    colors = metadata["points3D_rgb"].numpy() if len(points) else np.zeros((0, 3))
+    return Reconstruction(photos=dict(sorted(photos.items())), points=points, colors=colors)
 
 
 def _tracked(photo: Photo, world_from_camera: np.ndarray, scale: float) -> TrackedPhoto:

@@ -43,7 +43,7 @@ from lang3dxl_ns.scene.photo import Photo
 
 QUERY_VARIABLE = "LANG3DXL_QUERY"
 Split = Literal["held-out", "seen", "test"]
-_COLOURS_OF_LIGHT = ("psnr", "ssim", "lpips")
+_COLORS_OF_LIGHT = ("psnr", "ssim", "lpips")
 """Image metrics that are meaningless where views are lit differently from the photos."""
 
 
@@ -93,7 +93,7 @@ class EvaluatedPhoto:
 
 
 class Lang3DXLPipeline(VanillaPipeline):
-    """nerfstudio's pipeline; loads checkpoints strictly, evaluates colours, features and words."""
+    """nerfstudio's pipeline; loads checkpoints strictly, evaluates colors, features and words."""
 
     config: Lang3DXLPipelineConfig
     datamanager: Lang3DXLDataManager
@@ -142,7 +142,7 @@ class Lang3DXLPipeline(VanillaPipeline):
                     f"the label {key} in {truth.folder} fits both {named[key]} and {name}: name labels with "
                     f"their photos' folders"
                 )
-        absent = [photo for photo in truth.labelled if photo not in named]
+        absent = [photo for photo in truth.labeled if photo not in named]
         if not named:
             raise UserError(
                 f"no label in {truth.folder} belongs to a photo of the scene: labels are named like photos, "
@@ -165,7 +165,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         if scorer is not None:
             score = partial(self._score_words, scorer, self._label_limit(scorer, photos))
         views = self.datamanager.test_views if split == "test" else None
-        hidden = () if views is None or views.same_light else _COLOURS_OF_LIGHT
+        hidden = () if views is None or views.same_light else _COLORS_OF_LIGHT
         warm = False
         with progress_bar() as bar:
             for camera, batch in bar.track(photos, total=len(photos), description="evaluating"):
@@ -187,10 +187,10 @@ class Lang3DXLPipeline(VanillaPipeline):
         if self.scorer is None:
             raise UserError("seen photos can be evaluated only with ground truth and CLIP")
         seen = self.datamanager.train_dataset
-        labelled = [photo.name for photo in seen.photos if self.scorer.truth.key(photo.name) is not None]
-        if not labelled:
+        labeled = [photo.name for photo in seen.photos if self.scorer.truth.key(photo.name) is not None]
+        if not labeled:
             raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
-        return EvalPhotos(self.datamanager, seen, labelled)
+        return EvalPhotos(self.datamanager, seen, labeled)
 
     def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Cameras], Maps]:
         """Maps of the labels themselves, lifted from the photos to the Gaussians."""
@@ -294,7 +294,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         if words["prompts_without_photos"]:
             CONSOLE.log(
                 f"[yellow]no evaluated photo shows {', '.join(words['prompts_without_photos'])}; `lang3dxl "
-                f"evaluate run --split seen` scores the labelled training photos"
+                f"evaluate run --split seen` scores the labeled training photos"
             )
         return photos | words
 

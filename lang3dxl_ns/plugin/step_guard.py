@@ -1,4 +1,4 @@
-"""Step guard: skips optimiser steps whose loss or gradient is not finite."""
+"""Step guard: skips optimizer steps whose loss or gradient is not finite."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class StepGuard:
     ) -> bool:
         """Whether all losses and all gradients of the parameter groups are finite.
 
-        One reduction per gradient, one synchronisation in all. `scale`: of the gradients, under
+        One reduction per gradient, one synchronization in all. `scale`: of the gradients, under
         mixed precision. Raises UserError after too many broken steps in a row.
         """
         named = {f"loss {name}": value.detach().float() for name, value in losses.items()}

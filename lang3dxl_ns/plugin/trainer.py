@@ -220,11 +220,11 @@ class Lang3DXLTrainerConfig(TrainerConfig):
 
         settle(mine.appearance, earlier.appearance, "use", "appearance")
         settle(mine, earlier, "view_dependence", "view dependence")
-        settle(mine, earlier, "camera_optimisation", "camera optimiser")
+        settle(mine, earlier, "camera_optimization", "camera optimizer")
 
 
 class GuardedOptimizers(Optimizers):
-    """nerfstudio's optimisers with a guard before each step."""
+    """nerfstudio's optimizers with a guard before each step."""
 
     def __init__(self, config: dict, param_groups: dict, allowed: Callable[[GradScaler], bool]):
         super().__init__(config, param_groups)
@@ -241,7 +241,7 @@ class GuardedOptimizers(Optimizers):
         self.zero_grad_all()
 
     def live_parameters(self) -> dict[str, list[Tensor]]:
-        """The optimisers' present parameters (`parameters` are the initial ones, before densification)."""
+        """The optimizers' present parameters (`parameters` are the initial ones, before densification)."""
         return {
             name: [parameter for group in optimizer.param_groups for parameter in group["params"]]
             for name, optimizer in self.optimizers.items()
@@ -318,7 +318,7 @@ class Lang3DXLTrainer(Trainer):
         return self._start_step
 
     def setup_optimizers(self) -> Optimizers:
-        """The optimisers, with the guard before them."""
+        """The optimizers, with the guard before them."""
         self.guard = StepGuard(self.config.max_skipped_steps, lambda message: CONSOLE.log(escape(message)))
         groups = self.pipeline.get_param_groups()
         return GuardedOptimizers(self.config.optimizers.copy(), groups, self._step_is_sound)

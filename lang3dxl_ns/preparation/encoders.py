@@ -96,7 +96,7 @@ def spoken(option: str) -> str:
 
 
 class ImageTextEncoder:
-    """CLIP: images and texts in one space. Embeddings are projected, float32 and *not* normalised.
+    """CLIP: images and texts in one space. Embeddings are projected, float32 and *not* normalized.
 
     `dim`: channels; `crop_size`: side of the vision tower's input in pixels; `identity`: of the weights.
     """
@@ -157,7 +157,7 @@ class DenseEncoder:
 
     @torch.no_grad()
     def encode(self, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "t t d"]:
-        """Normalised patch tokens of the last layer, float32, for a photo (RGB in 0…1) squashed to a square.
+        """Normalized patch tokens of the last layer, float32, for a photo (RGB in 0…1) squashed to a square.
 
         Token (i, j) covers rows i/t…(i+1)/t and columns j/t…(j+1)/t of the photo.
         """

@@ -22,9 +22,9 @@ from lang3dxl_ns.scene.photometry import Photometry, measure_photometry
 
 LIGHT = 0.3
 """Spread of the photos' exposures, in natural logarithms of light: below half a stop, a camera's own metering
-explains it, and one colour per surface absorbs it."""
+explains it, and one color per surface absorbs it."""
 SHEEN = 0.4
-"""Share of the residual colours explained by the viewing direction: 0.1 to 0.3 on matte landmarks, where haze
+"""Share of the residual colors explained by the viewing direction: 0.1 to 0.3 on matte landmarks, where haze
 and noise mimic it, 0.5 and more on real ones."""
 REPROJECTION = 2.0
 """Pixels: COLMAP's bundle adjustment usually ends below one."""
@@ -77,7 +77,7 @@ def scene_needs(
         _foreground(photos),
         Need("regions", sources.regions, "a source of regions is given", None, None),
         Need("dense head", sources.dense, "a dense encoder is given; queries never use it", None, None),
-        _camera_optimiser(reconstruction),
+        _camera_optimizer(reconstruction),
     ]
 
 
@@ -88,7 +88,7 @@ def _appearance(photometry: Photometry | None) -> Need:
 
 
 def _view_dependence(photometry: Photometry | None) -> Need:
-    measured = "share of the tracks' colour residuals explained by the viewing direction"
+    measured = "share of the tracks' color residuals explained by the viewing direction"
     value = None if photometry is None else photometry.view_dependence
     return Need("view dependence", value is None or value > SHEEN, measured, value, SHEEN)
 
@@ -115,11 +115,11 @@ def _foreground(photos: Sequence[Photo], at_most: int = 20) -> Need:
     return Need("foreground", value is None or value > CUT, measured, value, CUT)
 
 
-def _camera_optimiser(reconstruction: Reconstruction) -> Need:
+def _camera_optimizer(reconstruction: Reconstruction) -> Need:
     measured = "reprojection error of the model (pixels, median over the photos)"
     errors = [error for photo in reconstruction.photos.values() if (error := _reprojection_error(photo))]
     value = float(np.median(errors)) if errors else None
-    return Need("camera optimiser", value is not None and value > REPROJECTION, measured, value, REPROJECTION)
+    return Need("camera optimizer", value is not None and value > REPROJECTION, measured, value, REPROJECTION)
 
 
 def _reprojection_error(photo: Any) -> float | None:

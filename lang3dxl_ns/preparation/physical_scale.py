@@ -1,6 +1,6 @@
 """Physical scale: world units per pixel of each photo, and crop sides in world units.
 
-Everything here is in units of the original COLMAP model. Poses that a trainer has recentred and rescaled
+Everything here is in units of the original COLMAP model. Poses that a trainer has recentered and rescaled
 don't belong here: the scale ranges would lose their meaning.
 """
 
@@ -155,7 +155,7 @@ def _subject_distance(photo: TrackedPhoto, rule: DistanceRule) -> float | None:
     In the camera's frame, since a per-axis median depends on the frame. Points behind the camera can't be
     seen: such tracks are wrong, and ignored.
     """
-    points = (photo.points - photo.centre) @ photo.camera_from_world[:, :3].T
+    points = (photo.points - photo.center) @ photo.camera_from_world[:, :3].T
     in_front = points[:, 2] > 0
     points = points[in_front]
     if rule == "mean-inner":

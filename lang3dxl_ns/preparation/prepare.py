@@ -30,7 +30,7 @@ from lang3dxl_ns.preparation.encoders import (
     load_image_text_encoder,
 )
 from lang3dxl_ns.preparation.physical_scale import crop_sides
-from lang3dxl_ns.preparation.pyramid import HALF, QUARTER, build_clip_target, crop_centres
+from lang3dxl_ns.preparation.pyramid import HALF, QUARTER, build_clip_target, crop_centers
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -289,7 +289,7 @@ def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: 
     for task in tasks:
         if task.clip and clip:
             rows, columns = (
-                len(crop_centres(n, min(task.sides), task.steps))
+                len(crop_centers(n, min(task.sides), task.steps))
                 for n in (task.photo.height, task.photo.width)
             )
             total += 2 * rows * columns * (clip.dim + 1)

@@ -17,11 +17,11 @@ from lang3dxl_ns.common.memory import with_less_memory
 class ClipTarget:
     """Image embeddings of a photo's crops, averaged over the scales, on the grid of the smallest scale.
 
-    Cell (i, j) of the Hd × Wd grid is centred at the photo's pixel ((j + 0.5) W / Wd, (i + 0.5) H / Hd).
+    Cell (i, j) of the Hd × Wd grid is centered at the photo's pixel ((j + 0.5) W / Wd, (i + 0.5) H / Hd).
     """
 
     features: Float[Tensor, "hd wd c"]
-    """Mean embedding, float32, as output by the encoder (not normalised)."""
+    """Mean embedding, float32, as output by the encoder (not normalized)."""
     valid: Float[Tensor, "hd wd"]
     """Mean share of the crops' area inside the photo, 0..1; the rest of a crop is black."""
     crop_sides: list[int]
@@ -36,15 +36,15 @@ class ClipTarget:
 
 
 HALF, QUARTER = 2, 4
-"""Crops per side: how many steps a crop's own side is, from one centre to the next."""
+"""Crops per side: how many steps a crop's own side is, from one center to the next."""
 
 
-def crop_centres(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]:
-    """Pixel positions of the crop centres along an axis of `length` pixels: the middles of n equal cells, as
+def crop_centers(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]:
+    """Pixel positions of the crop centers along an axis of `length` pixels: the middles of n equal cells, as
     a target is read, n such that they are about a crop over `steps` apart.
 
-    A crop covers `side // 2` pixels to either side of its centre and may reach out of the photo. Method:
-    Lang3D-XL, crop grid; there centres are exactly half a crop apart, up to half a cell beside their cells.
+    A crop covers `side // 2` pixels to either side of its center and may reach out of the photo. Method:
+    Lang3D-XL, crop grid; there centers are exactly half a crop apart, up to half a cell beside their cells.
     """
     count = max(length // max(2 * _half(side) // steps, 1), 1)
     return ((2 * torch.arange(count) + 1) * length + count - 1) // (2 * count)  # rounded
@@ -127,8 +127,8 @@ def _half(side: int) -> int:
 
 def _inside(length: int, side: int, steps: int) -> Float[Tensor, " n"]:
     """Fraction of each crop that lies inside the photo along one axis."""
-    half, centres = _half(side), crop_centres(length, side, steps)
-    return ((centres + half).clamp(max=length) - (centres - half).clamp(min=0)) / (2 * half)
+    half, centers = _half(side), crop_centers(length, side, steps)
+    return ((centers + half).clamp(max=length) - (centers - half).clamp(min=0)) / (2 * half)
 
 
 def _windows(
@@ -140,10 +140,10 @@ def _windows(
     padding: list[int] = []
     starts = []
     for length in (photo.shape[1], photo.shape[0]):  # F.pad counts from the last axis, the width
-        centres = crop_centres(length, side, steps).to(photo.device)
-        before = max(0, half - int(centres[0]))
-        padding += [before, max(0, int(centres[-1]) + half - length)]
-        starts.append(centres - half + before)
+        centers = crop_centers(length, side, steps).to(photo.device)
+        before = max(0, half - int(centers[0]))
+        padding += [before, max(0, int(centers[-1]) + half - length)]
+        starts.append(centers - half + before)
     padded = F.pad(photo.permute(2, 0, 1), padding)
     lefts, tops = starts
     return padded.unfold(1, 2 * half, 1).unfold(2, 2 * half, 1), tops, lefts

@@ -1,4 +1,4 @@
-"""Region label maps: segments of a photo whose features should agree, from SAM, colours, or a folder."""
+"""Region label maps: segments of a photo whose features should agree, from SAM, colors, or a folder."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def region_source(
 
 
 class FelzenszwalbRegions:
-    """Regions of similar colour (Felzenszwalb and Huttenlocher 2004): no weights, a fraction of a second."""
+    """Regions of similar color (Felzenszwalb and Huttenlocher 2004): no weights, a fraction of a second."""
 
     def settings(self, photo: Photo) -> dict[str, Any]:
         """As `RegionSource.settings`."""
@@ -160,7 +160,7 @@ def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
     if labels.ndim != 2 or not labels.size or labels.dtype.kind not in "iu":
         raise UserError(
             f"regions of {name}: {path} holds {labels.dtype} numbers of shape {labels.shape}, not one whole "
-            "number per pixel: save a grey 16-bit PNG, or a .npy of integers [height, width]"
+            "number per pixel: save a gray 16-bit PNG, or a .npy of integers [height, width]"
         )
     return torch.from_numpy(labels.astype(np.int64)) - first
 
@@ -172,7 +172,7 @@ def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
 
 
 def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Integers resized: every pixel takes the value under its centre."""
+    """Integers resized: every pixel takes the value under its center."""
     rows, columns = (
         ((torch.arange(n, device=values.device) + 0.5) * length / n).long()
         for n, length in zip(size, values.shape, strict=True)

@@ -153,9 +153,9 @@ class BoxesAndSam:
         inputs = self._detector_processor(images=_picture(image), text=caption, return_tensors="pt")
         output = self._detector(**inputs.to(self._detector.device))
         scores = output.logits[0].sigmoid().amax(dim=-1)
-        centres, sizes = output.pred_boxes[0][scores >= _BOX_THRESHOLD].cpu().chunk(2, dim=-1)
+        centers, sizes = output.pred_boxes[0][scores >= _BOX_THRESHOLD].cpu().chunk(2, dim=-1)
         height, width = image.shape[:2]
-        corners = torch.cat([centres - sizes / 2, centres + sizes / 2], dim=-1).clamp(0, 1)
+        corners = torch.cat([centers - sizes / 2, centers + sizes / 2], dim=-1).clamp(0, 1)
         return corners * torch.tensor([width, height, width, height])
 
 

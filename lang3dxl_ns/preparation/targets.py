@@ -23,7 +23,7 @@ class StoredClipTarget:
     """A photo's CLIP target, memory-mapped: float16, CPU."""
 
     features: Float[Tensor, "hd wd c"]
-    """Mean embedding over the scales, not normalised."""
+    """Mean embedding over the scales, not normalized."""
     valid: Float[Tensor, "hd wd"]
     """Mean share of the crops' area inside the photo, 0…1."""
     crop_fractions: list[float]

@@ -23,8 +23,8 @@ class Display:
     """Relevancy above which a pixel matches."""
     opacity: float = 0.7
     """Opacity of the heat map over the image, 0…1."""
-    colour_map: str = "turbo"
-    """Name of a matplotlib colour map."""
+    color_map: str = "turbo"
+    """Name of a matplotlib color map."""
 
 
 NOTHING = Queries(torch.zeros(0, 0), (), ())
@@ -43,7 +43,7 @@ class Asked:
     min_alpha: float = 0.3
     """Coverage below which a pixel shows nothing."""
     highest: float | None = None
-    """Relevancy for the colour map's last colour; None: the highest of each view."""
+    """Relevancy for the color map's last color; None: the highest of each view."""
     display: Display = field(default_factory=Display)
 
     @cached_property
@@ -78,5 +78,5 @@ def relevancy_outputs(
     """`overlay` and `relevancy_0` … from the relevancy maps of one or more prompts."""
     best = torch.stack(list(maps)).amax(0)
     d = display
-    pictures = {"overlay": overlay(image, best, d.threshold, d.opacity, d.colour_map, highest)}
+    pictures = {"overlay": overlay(image, best, d.threshold, d.opacity, d.color_map, highest)}
     return pictures | {f"relevancy_{i}": one[..., None] for i, one in enumerate(maps)}

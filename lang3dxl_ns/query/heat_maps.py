@@ -19,9 +19,9 @@ def heat(
     return ((relevancy - threshold) / max(top - threshold, 1e-6)).clamp(0, 1)
 
 
-def colour(values: Float[Tensor, "*shape"], colour_map: str = "turbo") -> Float[Tensor, "*shape 3"]:
-    """Values in 0…1 as colours of a matplotlib colour map. Raises UserError for an unknown one."""
-    table = _colours(colour_map).to(values)
+def color(values: Float[Tensor, "*shape"], color_map: str = "turbo") -> Float[Tensor, "*shape 3"]:
+    """Values in 0…1 as colors of a matplotlib color map. Raises UserError for an unknown one."""
+    table = _colors(color_map).to(values)
     return table[(values.clamp(0, 1) * (len(table) - 1)).round().long()]
 
 
@@ -30,20 +30,20 @@ def overlay(
     relevancy: Float[Tensor, "h w"],
     threshold: float = 0.5,
     opacity: float = 0.7,
-    colour_map: str = "turbo",
+    color_map: str = "turbo",
     highest: float | None = None,
 ) -> Float[Tensor, "h w 3"]:
     """The heat map over matching pixels, the image elsewhere."""
     strength = opacity * (relevancy > threshold).to(image)[..., None]
-    return torch.lerp(image, colour(heat(relevancy, threshold, highest), colour_map), strength)
+    return torch.lerp(image, color(heat(relevancy, threshold, highest), color_map), strength)
 
 
 @lru_cache
-def _colours(name: str) -> Float[Tensor, "256 3"]:
+def _colors(name: str) -> Float[Tensor, "256 3"]:
     from matplotlib import colormaps
 
     if name not in colormaps:
         raise UserError(
-            f"there is no colour map {name!r}: choose one of matplotlib's, such as turbo or viridis"
+            f"there is no color map {name!r}: choose one of matplotlib's, such as turbo or viridis"
         )
     return torch.tensor(colormaps[name](torch.linspace(0, 1, 256).numpy())[:, :3], dtype=torch.float32)

@@ -25,15 +25,15 @@ class Box:
     """Share of the total match weight that is connected to it, 0…1."""
 
     @property
-    def centre(self) -> tuple[float, ...]:
-        """The box's centre."""
+    def center(self) -> tuple[float, ...]:
+        """The box's center."""
         return tuple((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
 
 
 def world_points(
     camera: Camera, depth: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
 ) -> Float[Tensor, "n 3"]:
-    """World positions of the masked pixels' centres, from depth along the camera's axis."""
+    """World positions of the masked pixels' centers, from depth along the camera's axis."""
     rows, columns = mask.nonzero().T
     view, k = camera.view_matrix.to(depth), camera.intrinsics.to(depth)
     z = depth[rows, columns]
@@ -69,7 +69,7 @@ def _connected(cells: Int[Tensor, "n 3"]) -> Int[Tensor, " n"]:
     strides[2] = strides[1] * (cells[:, 1].max() + 2)
     keys, order = (cells * strides).sum(1).sort()
     sources, targets = [], []
-    for step in list(product((-1, 0, 1), repeat=3))[14:]:  # half of the neighbours: the rest is symmetric
+    for step in list(product((-1, 0, 1), repeat=3))[14:]:  # half of the neighbors: the rest is symmetric
         wanted = keys + (torch.tensor(step) * strides).sum()
         place = torch.searchsorted(keys, wanted).clamp_max(len(keys) - 1)
         touching = keys[place] == wanted

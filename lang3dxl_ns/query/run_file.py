@@ -69,7 +69,7 @@ class SceneFile:
     photos: list[ScenePhoto]
     """Training photos, then held-out ones."""
     clip: str | None
-    """Folder or name of the CLIP that made the targets; None for a run of colours only."""
+    """Folder or name of the CLIP that made the targets; None for a run of colors only."""
     clip_identity: str | None
     """Fingerprint of its weights."""
     scale: float

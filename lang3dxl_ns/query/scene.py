@@ -69,7 +69,7 @@ class View:
 
     camera: Camera
     image: Float[Tensor, "h w 3"]
-    """Colours, 0…1."""
+    """Colors, 0…1."""
     carried: Float[Tensor, "h w d"]
     """Values that Gaussians carried for the prompts, composited over black."""
     alpha: Float[Tensor, "h w"]

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from lang3dxl_ns.common.files import write_atomically
 
-_SH_OF_GREY = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 √π): colour = 0.5 + this × coefficient."""
+_SH_OF_GRAY = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 √π): color = 0.5 + this × coefficient."""
 
 
 def write_splats(
@@ -42,8 +42,8 @@ def write_splats(
 
 def _columns(g: Mapping[str, Tensor]) -> dict[str, Float[Tensor, " n"]]:
     means, rest = g["means"], g["features_rest"]
-    # Without harmonics the model stores logits of colours.
-    base = g["features_dc"] if rest.shape[1] else (g["features_dc"].sigmoid() - 0.5) / _SH_OF_GREY
+    # Without harmonics the model stores logits of colors.
+    base = g["features_dc"] if rest.shape[1] else (g["features_dc"].sigmoid() - 0.5) / _SH_OF_GRAY
     blocks = {
         ("x", "y", "z"): means,
         ("nx", "ny", "nz"): torch.zeros_like(means),

@@ -17,7 +17,7 @@ class Gaussians:
     """Gaussians in the world frame, with activated values (no logarithms, no logits)."""
 
     means: Float[Tensor, "n 3"]
-    """Centres, world units."""
+    """Centers, world units."""
     quats: Float[Tensor, "n 4"]
     """Rotations as quaternions (w, x, y, z) of any length; zero length means no rotation."""
     scales: Float[Tensor, "n 3"]
@@ -32,7 +32,7 @@ class Gaussians:
         )
 
     def moved(self, by: Float[Tensor, "3"]) -> Gaussians:
-        """The same Gaussians with shifted centres."""
+        """The same Gaussians with shifted centers."""
         return Gaussians(self.means + by, self.quats, self.scales, self.opacities)
 
 

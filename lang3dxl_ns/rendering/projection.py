@@ -24,7 +24,7 @@ class Splats:
     """Screen ellipses, one for every Gaussian; radius and opacity are 0 for those not visible."""
 
     means2d: Float[Tensor, "1 n 2"]
-    """Centres, pixels from the top-left corner. One tensor with gsplat's leading camera axis, because
+    """Centers, pixels from the top-left corner. One tensor with gsplat's leading camera axis, because
     densification reads the gradient from it."""
     conics: Float[Tensor, "n 3"]
     """Inverse covariances (xx, xy, yy), pixels⁻²."""
@@ -100,12 +100,12 @@ def _jacobian_row(
     slope: Float[Tensor, " n"],
     z: Float[Tensor, " n"],
     focal: Tensor,
-    centre: Tensor,
+    center: Tensor,
     size: int,
 ) -> Float[Tensor, "n 3"]:
     """Derivative of a pixel coordinate by the world position; `axis`, `forward`: camera axes in the world."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
-    slope = slope.clamp(-centre / focal - margin, (size - centre) / focal + margin)
+    slope = slope.clamp(-center / focal - margin, (size - center) / focal + margin)
     return (focal / z)[:, None] * (axis - slope[:, None] * forward)
 
 

@@ -43,14 +43,14 @@ def rasterize(
     Differentiable in the Gaussians, channels, features, background and the camera's view matrix.
 
     Args:
-        channels: values to composite over the background, such as activated colours.
+        channels: values to composite over the background, such as activated colors.
         background: one value per channel; black by default.
         features: composited likewise over black, not divided by alpha.
         detach_features: the features' gradient reaches only `features`, not geometry or opacity.
         render_depth: also render the expected depth, world units.
         antialiased: dim small Gaussians by what the screen-space blur adds to their area.
         absgrad: the backward pass sets `info["means2d"].absgrad` for gsplat's densification.
-        near: Gaussians with centres nearer than this are left out, world units.
+        near: Gaussians with centers nearer than this are left out, world units.
         eps2d: variance added on screen, pixels².
         backend: "auto" uses gsplat for tensors on a GPU; on the CPU numba, if it is installed and the
             environment variable LANG3DXL_CPU_KERNELS is not torch; otherwise torch (which works on any

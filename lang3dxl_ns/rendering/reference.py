@@ -55,7 +55,7 @@ def rasterize_reference(
 def project_reference(
     gaussians: Gaussians, camera: Camera
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
-    """Pixel centres, axes A with screen covariance A Aᵀ (pixels), and depths, by textbook formulas."""
+    """Pixel centers, axes A with screen covariance A Aᵀ (pixels), and depths, by textbook formulas."""
     q = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
     identity = torch.eye(3).to(q).expand(len(q), 3, 3)
     cross = torch.linalg.cross(q[:, None, 1:].expand(-1, 3, 3), identity).mT
@@ -67,12 +67,12 @@ def project_reference(
     homogeneous = points @ camera.intrinsics.T
     means2d = homogeneous[:, :2] / homogeneous[:, 2:]
 
-    focal, centre = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
+    focal, center = camera.intrinsics.diagonal()[:2], camera.intrinsics[:2, 2]
     size = torch.tensor([camera.width, camera.height]).to(points)
     margin = 0.3 * size / (2 * focal)
     depths = points[:, 2]
     slopes = points[:, :2] / depths[:, None]
-    slopes = slopes.clamp(-centre / focal - margin, (size - centre) / focal + margin)
+    slopes = slopes.clamp(-center / focal - margin, (size - center) / focal + margin)
     jacobian = torch.cat([torch.diag(focal).expand(len(q), 2, 2), -(focal * slopes)[:, :, None]], dim=2)
     to_screen = jacobian / depths[:, None, None] @ view_rotation
     return means2d, to_screen @ axes, depths

@@ -55,9 +55,9 @@ def spherical_harmonics(
     directions: Float[Tensor, "n 3"],
     coefficients: Float[Tensor, "n k 3"],
 ) -> Float[Tensor, "n 3"]:
-    """Evaluate one colour per Gaussian from its coefficients; the caller adds 0.5 and clamps.
+    """Evaluate one color per Gaussian from its coefficients; the caller adds 0.5 and clamps.
 
-    Directions (camera centre to Gaussian, world frame) may have any length. Bands above `degree` (0…3)
+    Directions (camera center to Gaussian, world frame) may have any length. Bands above `degree` (0…3)
     are ignored. Signs and order are those of Kerbl et al. 2023 (3D Gaussian Splatting).
 
     Raises:

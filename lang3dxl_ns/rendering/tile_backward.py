@@ -136,7 +136,7 @@ def _store_shape(
     basis: Float[Tensor, "6 pixels"],
     target: Float[Tensor, "m columns"],
 ) -> None:
-    """Moments of the slope around the Gaussian's centre, with the factors of the conic's gradient."""
+    """Moments of the slope around the Gaussian's center, with the factors of the conic's gradient."""
     total, sum_x, sum_y, sum_xx, sum_xy, sum_yy = torch.mm(basis, slope.t()).unbind(0)
     x, y = rows.offset_x.index_select(0, index), rows.offset_y.index_select(0, index)
     first_x, first_y = torch.addcmul(sum_x, total, x, value=-1), torch.addcmul(sum_y, total, y, value=-1)

@@ -53,7 +53,7 @@ class TileGrid:
         return self.tile_width * self.tile_height
 
     def basis(self, like: Tensor) -> Float[Tensor, "6 pixels"]:
-        """1, x, y, x², xy, y² at a tile's pixel centres, in pixels from the tile's centre."""
+        """1, x, y, x², xy, y² at a tile's pixel centers, in pixels from the tile's center."""
         x = torch.arange(self.tile_width, dtype=like.dtype, device=like.device) - (self.tile_width - 1) / 2
         y = torch.arange(self.tile_height, dtype=like.dtype, device=like.device) - (self.tile_height - 1) / 2
         x, y = x.repeat(self.tile_height), y.repeat_interleave(self.tile_width)
@@ -83,7 +83,7 @@ class Footprints:
     """The potentially visible Gaussians, front to back, each with its conic and its range of tiles.
 
     The quadratic form is kept as steepness·(dx + shear·dy)² + rise·dy²: unlike the conic itself this stays
-    accurate in float32 far from the centre of a needle.
+    accurate in float32 far from the center of a needle.
     """
 
     gaussians: Int[Tensor, " v"]
@@ -122,7 +122,7 @@ class Rows:
     coefficients: tuple[Tensor, ...]
     """Six columns: log2 of alpha as a polynomial over the tile's basis."""
     offset_x: Float[Tensor, " r+1"]
-    """Centre of the Gaussian from the centre of the tile, pixels."""
+    """Center of the Gaussian from the center of the tile, pixels."""
     offset_y: Float[Tensor, " r+1"]
     start: Int[Tensor, " tiles"]
     count: Int[Tensor, " tiles"]
@@ -176,10 +176,10 @@ def make_footprints(
     return footprints, grid
 
 
-def _pixel_range(centre: Tensor, reach: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """First and last pixel whose centre is within reach; if none is, the last is less than the first."""
-    first = (centre - reach - 0.5).ceil_().clamp_(0, size)
-    last = (centre + reach - 0.5).floor_().clamp_(-1, size - 1)
+def _pixel_range(center: Tensor, reach: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """First and last pixel whose center is within reach; if none is, the last is less than the first."""
+    first = (center - reach - 0.5).ceil_().clamp_(0, size)
+    last = (center + reach - 0.5).floor_().clamp_(-1, size - 1)
     return first, last
 
 
@@ -266,7 +266,7 @@ def _touches(
     rise: Tensor,
     log2_opacity: Tensor,
 ) -> Bool[Tensor, " r"]:
-    """Whether the Gaussian at (x, y) from the tile's centre reaches 1/255 on the tile's rectangle of pixels.
+    """Whether the Gaussian at (x, y) from the tile's center reaches 1/255 on the tile's rectangle of pixels.
 
     The minimum of a convex form over a rectangle that doesn't contain the form's minimum lies on one of the
     two edges facing it; on an edge it is the one-dimensional minimum, clamped.
@@ -298,7 +298,7 @@ def _padded(column: Tensor, index: Int[Tensor, " r"]) -> Tensor:
 def _coefficients(
     x: Tensor, y: Tensor, steepness: Tensor, shear: Tensor, rise: Tensor, log2_opacity: Tensor
 ) -> tuple[Tensor, ...]:
-    """log2 of alpha around the tile's centre, as a polynomial; the padding row gets alpha 0."""
+    """log2 of alpha around the tile's center, as a polynomial; the padding row gets alpha 0."""
     steepness, rise = steepness * LOG2_E, rise * LOG2_E
     slope = torch.addcmul(x, shear, y).mul_(steepness)
     lean = steepness * shear

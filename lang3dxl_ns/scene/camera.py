@@ -67,7 +67,7 @@ class Camera:
     view_matrix: Float[Tensor, "4 4"]
     """World to camera, rigid, world units."""
     intrinsics: Float[Tensor, "3 3"]
-    """Pixels; origin at the top-left corner of the top-left pixel, so pixel centres lie at +0.5."""
+    """Pixels; origin at the top-left corner of the top-left pixel, so pixel centers lie at +0.5."""
     width: int
     height: int
 
@@ -112,7 +112,7 @@ def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "
     points = means @ camera.view_matrix[:3, :3].T + camera.view_matrix[:3, 3]
     reach = 3.5 * scales.amax(dim=1)
     seen = points[:, 2] > 0
-    margin = 8  # pixels: the rasteriser blurs every splat by one or two
+    margin = 8  # pixels: the rasterizer blurs every splat by one or two
     for axis, size in ((0, camera.width), (1, camera.height)):
         focal, middle = camera.intrinsics[axis, axis], camera.intrinsics[axis, 2]
         for side, edge in ((-1, middle + margin), (1, size + margin - middle)):

@@ -50,7 +50,7 @@ class TrackedPhoto:
         return self.lens.height
 
     @property
-    def centre(self) -> Float[Array, "3"]:
+    def center(self) -> Float[Array, "3"]:
         """The camera's position in the world."""
         return -self.camera_from_world[:, :3].T @ self.camera_from_world[:, 3]
 
@@ -62,11 +62,11 @@ class TrackedPhoto:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A COLMAP model: its photos, sorted by name, and its points with their colours."""
+    """A COLMAP model: its photos, sorted by name, and its points with their colors."""
 
     photos: dict[str, TrackedPhoto]
     points: Float[Array, "m 3"]
-    colours: UInt8[Array, "m 3"]
+    colors: UInt8[Array, "m 3"]
 
 
 def read_reconstruction(model_dir: Path) -> Reconstruction:
@@ -92,7 +92,7 @@ def read_reconstruction(model_dir: Path) -> Reconstruction:
             for name in sorted(images)
         },
         points=np.array(list(positions.values()), dtype=np.float64).reshape(-1, 3),
-        colours=np.array([point.color for point in points.values()], dtype=np.uint8).reshape(-1, 3),
+        colors=np.array([point.color for point in points.values()], dtype=np.uint8).reshape(-1, 3),
     )
 
 

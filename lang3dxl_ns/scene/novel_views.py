@@ -31,7 +31,7 @@ class NovelViews:
     """Cameras in the COLMAP model's world, each with some of the surface points it sees. Names are
     `test_views/NNNN.jpg`, relative to the scene; the pictures are in `images/`."""
     same_light: bool
-    """Whether the photos were taken in the same light, so that colours can be compared."""
+    """Whether the photos were taken in the same light, so that colors can be compared."""
 
     def image(self, view: TrackedPhoto) -> Path:
         """The file of a view's picture."""

@@ -89,8 +89,8 @@ class Photo:
             return None
         mask = np.ones((self.height, self.width), dtype=bool)
         if self.mask_path is not None:
-            grey = _read_rgb(self.mask_path, self.name).convert("L")
-            mask = np.asarray(grey.resize((self.width, self.height), Image.Resampling.NEAREST)) >= 128
+            gray = _read_rgb(self.mask_path, self.name).convert("L")
+            mask = np.asarray(gray.resize((self.width, self.height), Image.Resampling.NEAREST)) >= 128
         if self.lens.distorts:
             mask = self._undistort(mask * np.uint8(255)) >= 128
         size = scaled_size(self.width, self.height, scale)
@@ -127,7 +127,7 @@ class Photo:
 
         height, width = image.shape[:2]
         lens = self.lens.resized(width, height)
-        # OpenCV's origin is the centre of the first pixel, hence -0.5.
+        # OpenCV's origin is the center of the first pixel, hence -0.5.
         pinhole = lens.matrix.numpy() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         coefficients = np.array(lens.distortion or (0.0,) * 4)
         module = cv2.fisheye if lens.fisheye else cv2
@@ -168,13 +168,13 @@ def _readable(path: Path, name: str) -> Iterator[None]:
 
 
 def _read_rgb(path: Path, name: str) -> Image.Image:
-    """The file as 8-bit RGB: grey, CMYK and palettes converted, 16 bits reduced, transparency dropped."""
+    """The file as 8-bit RGB: gray, CMYK and palettes converted, 16 bits reduced, transparency dropped."""
     with _readable(path, name), open_picture(path) as image:
         if image.mode == "F":
             raise ValueError("its pixels are floating-point numbers of unknown range")
-        if image.mode.startswith("I"):  # 16-bit grey, which convert() would clip at 255
-            grey = (np.asarray(image).clip(0, 65535) / 257).round().astype(np.uint8)
-            return Image.fromarray(grey).convert("RGB")
+        if image.mode.startswith("I"):  # 16-bit gray, which convert() would clip at 255
+            gray = (np.asarray(image).clip(0, 65535) / 257).round().astype(np.uint8)
+            return Image.fromarray(gray).convert("RGB")
         return image.convert("RGB")
 
 

@@ -13,7 +13,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
 
-_SIDE = 512  # pixels, longer side at which colours are read: one pixel then averages a patch of the surface
+_SIDE = 512  # pixels, longer side at which colors are read: one pixel then averages a patch of the surface
 _DARK, _BRIGHT = 0.03, 0.97  # beyond these, sensors do not record brightness faithfully
 _GAMMA = 2.2
 _FEWEST_POINTS = 20
@@ -21,7 +21,7 @@ _FEWEST_POINTS = 20
 
 @dataclass(frozen=True)
 class Photometry:
-    """How well photos agree on the colours of the same points, in natural logarithms of linear light."""
+    """How well photos agree on the colors of the same points, in natural logarithms of linear light."""
 
     spread: float
     """Standard deviation of the photos' exposures and tints (per channel): 0.7 is a stop. 0 if they agree."""
@@ -38,7 +38,7 @@ class Photometry:
 def measure_photometry(
     photos: Sequence[Photo], reconstruction: Reconstruction, at_most: int = 60
 ) -> Photometry | None:
-    """Fit log colour = point + photo (robust per photo) to at most `at_most` photos, evenly spaced.
+    """Fit log color = point + photo (robust per photo) to at most `at_most` photos, evenly spaced.
 
     None if fewer than three photos share enough tracked points. Unreadable photos are skipped.
     """
@@ -52,26 +52,26 @@ def measure_photometry(
         if len(tracked.pixels) != len(tracked.points):  # a scene without tracks
             continue
         try:
-            colours, usable = _log_colours(photo, tracked.pixels / [tracked.width, tracked.height])
+            colors, usable = _log_colors(photo, tracked.pixels / [tracked.width, tracked.height])
         except UserError:
             continue
         ids = np.array([point_of.setdefault(p.tobytes(), len(point_of)) for p in tracked.points])
-        rays = tracked.points - tracked.centre
+        rays = tracked.points - tracked.center
         rays = rays / np.linalg.norm(rays, axis=1, keepdims=True).clip(1e-12)
-        rows.append((ids[usable], colours[usable], rays[usable]))
+        rows.append((ids[usable], colors[usable], rays[usable]))
     if len(rows) < 3:
         return None
     point = np.concatenate([ids for ids, _, _ in rows])
     photo_index = np.repeat(np.arange(len(rows)), [len(ids) for ids, _, _ in rows])
-    colour = np.concatenate([colours for _, colours, _ in rows])
+    color = np.concatenate([colors for _, colors, _ in rows])
     ray = np.concatenate([rays for _, _, rays in rows])
     shared = np.bincount(point, minlength=len(point_of))[point] >= 2
     if shared.sum() < 2 * _FEWEST_POINTS:
         return None
-    return _fit(point[shared], photo_index[shared], colour[shared], ray[shared])
+    return _fit(point[shared], photo_index[shared], color[shared], ray[shared])
 
 
-def _log_colours(photo: Photo, places: Float[Array, "n 2"]) -> tuple[Float[Array, "n 3"], Array]:
+def _log_colors(photo: Photo, places: Float[Array, "n 2"]) -> tuple[Float[Array, "n 3"], Array]:
     """Log of linear RGB at `places` (fractions of width and height); where it is neither dark nor clipped."""
     pixels = photo.read_file(_SIDE).double().numpy() / 255
     height, width = pixels.shape[:2]
@@ -83,7 +83,7 @@ def _log_colours(photo: Photo, places: Float[Array, "n 2"]) -> tuple[Float[Array
 
 
 def _fit(
-    point: Int[Array, " m"], photo: Int[Array, " m"], colour: Float[Array, "m 3"], ray: Float[Array, "m 3"]
+    point: Int[Array, " m"], photo: Int[Array, " m"], color: Float[Array, "m 3"], ray: Float[Array, "m 3"]
 ) -> Photometry:
     """Alternate between the points' means and the photos' medians until both converge."""
     point = np.unique(point, return_inverse=True)[1]
@@ -96,14 +96,14 @@ def _fit(
     for index, group in enumerate(groups):
         observed[group] = index
     for _ in range(50):
-        mean = _point_means(point, colour - offset[observed], count)
-        new = np.stack([np.median(colour[group] - mean[point[group]], axis=0) for group in groups])
+        mean = _point_means(point, color - offset[observed], count)
+        new = np.stack([np.median(color[group] - mean[point[group]], axis=0) for group in groups])
         new -= new.mean(axis=0)
         change = np.abs(new - offset).max()
         offset = new
         if change < 1e-4:
             break
-    residual = colour - offset[observed] - _point_means(point, colour - offset[observed], count)[point]
+    residual = color - offset[observed] - _point_means(point, color - offset[observed], count)[point]
     return Photometry(
         spread=float(np.sqrt((offset**2).mean())),
         residual=float(1.4826 * np.median(np.abs(residual))),
@@ -126,11 +126,11 @@ def _explained_by_direction(
     for group in np.split(order, np.cumsum(np.bincount(point))[:-1]):
         if len(group) < fewest:
             continue
-        centred = ray[group] - ray[group].mean(axis=0)
-        grey = residual[group].mean(axis=1)
-        grey = grey - grey.mean()
-        rest = grey - centred @ np.linalg.lstsq(centred, grey, rcond=1e-3)[0]
+        centered = ray[group] - ray[group].mean(axis=0)
+        gray = residual[group].mean(axis=1)
+        gray = gray - gray.mean()
+        rest = gray - centered @ np.linalg.lstsq(centered, gray, rcond=1e-3)[0]
         n = len(group)
-        total += float(grey @ grey) / (n - 1)
-        explained += float(grey @ grey) / (n - 1) - float(rest @ rest) / (n - 4)
+        total += float(gray @ gray) / (n - 1)
+        explained += float(gray @ gray) / (n - 1) - float(rest @ rest) / (n - 4)
     return float(np.clip(explained / total, 0, 1)) if total > 0 else 0.0

@@ -63,7 +63,7 @@ def _sharpest(sharpness: Float[Array, " n"], stretches: int) -> Int[Array, " s"]
 
 
 def _sharpness(video: Path) -> Float[Array, " n"]:
-    """Variance of the Laplacian of every frame, downsized and grey."""
+    """Variance of the Laplacian of every frame, downsized and gray."""
     width, height = _LOOK
     command = ["ffmpeg", "-v", "error", "-i", str(video), "-an", "-vf", f"scale={width}:{height}"]
     command += ["-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "gray", "-"]

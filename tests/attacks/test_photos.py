@@ -13,7 +13,7 @@ from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS, NoPictureError, open_picture
-from lang3dxl_ns.evaluation.annotations import read_grey
+from lang3dxl_ns.evaluation.annotations import read_gray
 from lang3dxl_ns.plugin import photo_cache
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.preparation.foreground import with_foreground
@@ -56,7 +56,7 @@ def test_a_photo_in_another_format_than_those_named_is_left_out(folder, form, ca
 def test_ghostscript_is_never_asked(tmp_path, monkeypatch):
     (tmp_path / "a.jpg").write_bytes(EPS)
     monkeypatch.setattr("PIL.EpsImagePlugin.EpsImageFile.load", lambda *_: pytest.fail("EPS was opened"))
-    for read in (lambda path: read_grey(path), lambda path: _read_labels(path, "a")):
+    for read in (lambda path: read_gray(path), lambda path: _read_labels(path, "a")):
         with pytest.raises(UserError, match="not a picture in one of the formats"):
             read(tmp_path / "a.jpg")
 
@@ -173,7 +173,7 @@ def test_a_camera_of_billions_of_pixels_is_refused(folder):
 
 @pytest.fixture
 def training(tmp_path, tiny_clip, tiny_dense, monkeypatch):
-    """A run of colours that reads every photo anew, and its photos' folder; nobody waits."""
+    """A run of colors that reads every photo anew, and its photos' folder; nobody waits."""
     monkeypatch.setattr(photo_cache, "PATIENCE_S", (0.0, 0.0, 0.0))
     data = write_scene(tmp_path / "scene", photos=9, points=60)
     options = {"pipeline__datamanager__cache_gb": 0.0, "pipeline__datamanager__read_ahead": 0}
@@ -229,13 +229,13 @@ def test_a_photo_that_is_damaged_is_not_waited_for(training, monkeypatch):
 # ── masks ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def masks(folder, colours):
-    """The photos with masks of these colours; None: a damaged file."""
+def masks(folder, colors):
+    """The photos with masks of these colors; None: a damaged file."""
     (folder / "masks").mkdir()
-    for i, colour in enumerate(colours):
+    for i, color in enumerate(colors):
         path = folder / "masks" / f"photo_{i:03d}.png"
-        Image.new("L", (8, 6), colour or 0).save(path)
-        if colour is None:
+        Image.new("L", (8, 6), color or 0).save(path)
+        if color is None:
             path.write_bytes(path.read_bytes()[:40])
     return list(used(folder).values())
 

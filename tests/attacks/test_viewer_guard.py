@@ -152,7 +152,7 @@ def test_foreign_host_names_are_refused(local, host):
 
 
 @pytest.mark.parametrize("host", ["localhost:{}", "127.0.0.1:{}", "[::1]:{}", "localhost:8000"])
-def test_own_names_are_served_tunnelled_or_not(local, host):
+def test_own_names_are_served_tunneled_or_not(local, host):
     host = host.format(local.get_port())
     assert get(local, "/", host=host).status == 200
     assert get(local, "/", host=host, Origin=f"http://{host}").status == 200

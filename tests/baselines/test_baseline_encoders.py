@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
-from lang3dxl_ns.baselines.fmgs import neighbour_similarity, pixel_alignment_loss
+from lang3dxl_ns.baselines.fmgs import neighbor_similarity, pixel_alignment_loss
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
 NAMES = ("paper", "feature3dgs", "fmgs", "langsplat", "direct")
@@ -92,13 +92,13 @@ def test_alignment_is_nothing_where_clip_and_dense_features_have_the_same_edges(
     assert pixel_alignment_loss(clip, torch.eye(DENSE)[labels.flip(1)]) > 0.01
 
 
-def test_neighbours_are_the_eight_around():
+def test_neighbors_are_the_eight_around():
     features = torch.zeros(5, 5, 2)
     features[..., 0] = 1
     features[2, 2] = torch.tensor([0.0, 1.0])
-    similarity = neighbour_similarity(features)
+    similarity = neighbor_similarity(features)
     assert (similarity[2, 2] == 0).all()
-    assert (similarity == 0).sum() == 16  # the odd one, and once in each neighbour
+    assert (similarity == 0).sum() == 16  # the odd one, and once in each neighbor
     assert similarity.shape == (5, 5, 8)
 
 

@@ -1,4 +1,4 @@
-"""Laws of the rasteriser benchmark: its scenes, its independent baseline, its report."""
+"""Laws of the rasterizer benchmark: its scenes, its independent baseline, its report."""
 
 import dataclasses
 import json
@@ -39,14 +39,14 @@ def save_cloud(path: Path, count: int) -> Path:
 
 
 @pytest.mark.parametrize("case", SMALL)
-def test_the_dense_baseline_and_the_rasteriser_agree_in_float64(case):
+def test_the_dense_baseline_and_the_rasterizer_agree_in_float64(case):
     problem = make_problem(case, None, dtype=torch.float64)
     error = error_against(forward_backward(problem, OURS), forward_backward(problem, DENSE))
     assert error["image_max"] < 1e-9
     assert error["gradient"] < 1e-7
 
 
-def test_the_dense_baseline_over_a_background_of_one_colour_keeps_that_colour(float64_problem):
+def test_the_dense_baseline_over_a_background_of_one_color_keeps_that_color(float64_problem):
     problem = dataclasses.replace(
         float64_problem,
         channels=torch.full_like(float64_problem.channels, 0.3),

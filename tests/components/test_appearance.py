@@ -27,26 +27,26 @@ def make_field(names=NAMES, trained=False, scale=1.0, seed=0, **settings) -> App
 
 
 def make_cloud(n=40, seed=1):
-    """Gaussians in, around and far outside the scene, and their colours; away from all bounds."""
+    """Gaussians in, around and far outside the scene, and their colors; away from all bounds."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.randn(n, 3, generator=generator).double() * torch.logspace(-1, 2, n)[:, None]
-    colours, opacities = torch.rand(n, 3, generator=generator), torch.rand(n, generator=generator)
+    colors, opacities = torch.rand(n, 3, generator=generator), torch.rand(n, generator=generator)
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(n, 4)
-    return Gaussians(means, quats, torch.ones(n, 3), 0.3 + 0.4 * opacities.double()), 0.5 + colours.double()
+    return Gaussians(means, quats, torch.ones(n, 3), 0.3 + 0.4 * opacities.double()), 0.5 + colors.double()
 
 
 def shine(field, cloud, name="a.jpg", visible=None, seed=None):
-    """Colours and opacities under a photo's look."""
-    gaussians, colours = cloud
-    visible = torch.arange(len(colours)) if visible is None else torch.tensor(visible, dtype=torch.long)
-    colours, gaussians = field(gaussians, colours, field.vector(name), visible, seed)
-    return colours, gaussians.opacities
+    """Colors and opacities under a photo's look."""
+    gaussians, colors = cloud
+    visible = torch.arange(len(colors)) if visible is None else torch.tensor(visible, dtype=torch.long)
+    colors, gaussians = field(gaussians, colors, field.vector(name), visible, seed)
+    return colors, gaussians.opacities
 
 
 def test_untrained_field_changes_nothing():
-    field, (gaussians, colours) = make_field(), make_cloud()
-    shifted, same = field(gaussians, colours, field.vectors[0], torch.arange(len(colours)))
-    assert torch.equal(shifted, colours) and same is gaussians
+    field, (gaussians, colors) = make_field(), make_cloud()
+    shifted, same = field(gaussians, colors, field.vectors[0], torch.arange(len(colors)))
+    assert torch.equal(shifted, colors) and same is gaussians
 
 
 def test_two_lights_are_learned_with_eighty_views_of_each():
@@ -110,30 +110,30 @@ def test_no_gradient_reaches_the_places():
 
 
 def test_units_of_the_world_do_not_matter():
-    gaussians, colours = make_cloud()
+    gaussians, colors = make_cloud()
     small, large = make_field(trained=True), make_field(trained=True, scale=1000.0)
     magnified = replace(gaussians, means=1000 * gaussians.means, scales=1000 * gaussians.scales)
-    torch.testing.assert_close(shine(small, (gaussians, colours)), shine(large, (magnified, colours)))
+    torch.testing.assert_close(shine(small, (gaussians, colors)), shine(large, (magnified, colors)))
 
 
 def test_every_place_has_a_coordinate_of_its_own_inside_the_unit_cube():
     field = make_field()
     direction = torch.tensor([[0.36, 0.48, -0.8]]).double()
     distances = torch.tensor([0.0, 0.3, 0.999, 1.0, 1.001, 5.0, 20.0, 1e6]).double()[:, None]
-    coordinates = field._unit_cube(field.centre + distances * direction)
+    coordinates = field._unit_cube(field.center + distances * direction)
     assert (coordinates >= 0).all() and (coordinates <= 1).all()
     assert ((coordinates - 0.5).norm(dim=1).diff() > 0).all()
     # Inside the scene, lengths keep their ratios.
     assert float((coordinates[1] - 0.5).norm()) == pytest.approx(0.3 / 4)
 
 
-def test_colours_and_opacities_stay_in_their_range():
+def test_colors_and_opacities_stay_in_their_range():
     field, cloud = make_field(trained=True, opacity_shift=True), make_cloud()
     with torch.no_grad():
         field.output.bias.copy_(torch.tensor([-3.0, 0.0, 3.0, 9.0]))
     for seed in (None, 0):
-        colours, opacities = shine(field, cloud, seed=seed)
-        assert (colours >= 0).all() and (colours == 0).any()
+        colors, opacities = shine(field, cloud, seed=seed)
+        assert (colors >= 0).all() and (colors == 0).any()
         assert (opacities >= 0).all() and (opacities <= 1).all() and (opacities == 0).any()
 
 
@@ -159,11 +159,11 @@ def test_noise_is_drawn_for_every_gaussian_and_again_for_every_seed():
 
 @pytest.mark.parametrize("logit", [-2.0, 1.0])
 def test_chance_of_being_taken_out_is_the_sigmoid_of_the_output(logit):
-    field, (gaussians, colours) = make_field(opacity_shift=True), make_cloud(20_000)
+    field, (gaussians, colors) = make_field(opacity_shift=True), make_cloud(20_000)
     with torch.no_grad():
         field.output.bias[3] = logit + 4.0
     opaque = replace(gaussians, opacities=torch.ones_like(gaussians.opacities))
-    left = shine(field, (opaque, colours), seed=0)[1]
+    left = shine(field, (opaque, colors), seed=0)[1]
     assert float((left < 0.5).double().mean()) == pytest.approx(1 / (1 + math.exp(-logit)), abs=0.01)
 
 
@@ -194,7 +194,7 @@ def test_vectors_stay_with_their_names():
     assert third.names == [*NAMES, "new.jpg", "z.jpg"]
 
 
-def test_loading_keeps_the_parameter_that_the_optimiser_holds():
+def test_loading_keeps_the_parameter_that_the_optimizer_holds():
     first, second = make_field(), make_field(["new.jpg"])
     parameter = second.vectors
     second.load_state_dict(saved(first))

@@ -16,12 +16,12 @@ def field() -> SemanticField:
 
 
 def clusters(sizes, spread=0.05, seed=0):
-    """Features around as many centres, and the centre that each belongs to."""
+    """Features around as many centers, and the center that each belongs to."""
     generator = torch.Generator().manual_seed(seed)
-    centres = torch.randn(len(sizes), CHANNELS, generator=generator)
+    centers = torch.randn(len(sizes), CHANNELS, generator=generator)
     owner = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
     noise = spread * torch.randn(len(owner), CHANNELS, generator=generator)
-    return centres[owner] + noise, owner
+    return centers[owner] + noise, owner
 
 
 def compressed(features, mass, config=QUICK):
@@ -49,9 +49,9 @@ def test_a_class_of_half_a_percent_survives_beside_walls_of_great_mass():
     cosines = agreement(features, codes, trained)
     assert cosines[owner == 4].mean() > 0.9
     # And it is told from every other class.
-    centres = torch.stack([features[owner == i].mean(0) for i in range(5)])
+    centers = torch.stack([features[owner == i].mean(0) for i in range(5)])
     with torch.no_grad():
-        found = F.normalize(trained.decode_clip(codes[owner == 4]), dim=1) @ F.normalize(centres, dim=1).T
+        found = F.normalize(trained.decode_clip(codes[owner == 4]), dim=1) @ F.normalize(centers, dim=1).T
     assert (found.argmax(1) == 4).all()
 
 

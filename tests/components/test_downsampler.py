@@ -46,11 +46,11 @@ def downsampler(kernel="pyramid", hidden=0, bound=10.0, channels=4, trained=Fals
 # ------------------------------------------------------------------ reference, by loops over pixels
 
 
-def axis_window(size, centre, side):
-    """Average over [centre ± side/2], pixel piece by pixel piece, each sampled at its middle."""
+def axis_window(size, center, side):
+    """Average over [center ± side/2], pixel piece by pixel piece, each sampled at its middle."""
     weights = np.zeros(size)
     for pixel in range(size):
-        start, end = max(centre - side / 2, pixel), min(centre + side / 2, pixel + 1)
+        start, end = max(center - side / 2, pixel), min(center + side / 2, pixel + 1)
         if end > start:
             for p in range(size):
                 hat = np.interp((start + end) / 2, np.arange(size) + 0.5, np.eye(size)[p])
@@ -134,7 +134,7 @@ def test_a_constant_map_stays_constant_up_to_its_borders_and_under_any_mask(
 
 
 def ramp_and_error(name, size, grid, sides):
-    """Distance of each cell's mean pixel position from the cell's centre, as a fraction of the image."""
+    """Distance of each cell's mean pixel position from the cell's center, as a fraction of the image."""
     positions = [
         torch.cartesian_prod(*((torch.arange(n, dtype=torch.float64) + 0.5) / n for n in shape)).view(
             *shape, 2
@@ -163,7 +163,7 @@ def test_footprints_keep_a_ramp_where_crops_tile_the_image(rho):
 
 
 def test_footprints_of_crops_that_do_not_tile_the_image_lie_at_the_middles_of_its_cells():
-    """6 crops of 28 pixels in 99: the second is centred at 24.75, or a quarter."""
+    """6 crops of 28 pixels in 99: the second is centered at 24.75, or a quarter."""
     result = downsampler("footprint", channels=2)(seeded(99, 96, 2), (5, 6), [28 / 96])[0]
     photo = seeded(99, 96, 2)
     torch.testing.assert_close(result[2, 1], photo[36:63, 10:38].mean((0, 1)), atol=0.05, rtol=0)
@@ -205,9 +205,9 @@ def test_the_footprint_kernel_is_the_mean_over_scales_of_resized_grids_of_crop_m
 def test_the_pyramid_weighs_its_nested_squares_by_the_published_factor():
     kernel = separable_kernel("pyramid", (99, 99), (1, 1), (16 / 99, 64 / 99), torch.float64, CPU)
     weight = torch.einsum("jap,jaq->pq", kernel.rows, kernel.columns)
-    centre = 49
+    center = 49
     # Distances on the axis between the half sides 8, 11.3, 16, 22.6, 32 of the five squares.
-    ring = [float(weight[centre, centre + d]) for d in (0, 9, 13, 19, 27)]
+    ring = [float(weight[center, center + d]) for d in (0, 9, 13, 19, 27)]
     steps = [a - b for a, b in zip(ring, [*ring[1:], 0.0], strict=True)]
     np.testing.assert_allclose(np.array(steps) / steps[0], [(2 * math.sqrt(2)) ** -j for j in range(5)])
 

@@ -32,7 +32,7 @@ def ssim_by_definition(a, b):
     return (quality / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean()
 
 
-# ------------------------------------------------------------------ colours
+# ------------------------------------------------------------------ colors
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 0.5])
@@ -126,7 +126,7 @@ def test_clip_loss_is_a_weighted_mean_over_cells_and_channels():
 @pytest.mark.parametrize("compare_at", ["auto", "target"])
 @pytest.mark.parametrize(("size", "grid"), [((12, 16), (24, 24)), ((20, 30), (9, 9)), ((7, 9), (7, 9))])
 def test_dense_loss_keeps_a_ramp_within_a_tenth_of_a_cell_on_any_two_grids(size, grid, compare_at):
-    """Away from the border, where a resize lacks neighbours."""
+    """Away from the border, where a resize lacks neighbors."""
 
     def ramp(n, m):
         return ((torch.arange(m, dtype=torch.float64) + 0.5) / m).expand(n, m)[..., None]

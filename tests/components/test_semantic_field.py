@@ -290,7 +290,7 @@ def test_the_config_can_be_set_on_a_command_line():
     assert config == SemanticFieldConfig("short", levels=4, whiten=False)
 
 
-def test_short_preset_learns_a_labelled_scene_in_300_steps():
+def test_short_preset_learns_a_labeled_scene_in_300_steps():
     """Codes and field together: 400 codes move to where they decode to their class' features."""
     generator = torch.Generator().manual_seed(0)
     prototypes = 1 + 0.5 * torch.randn(12, 24, generator=generator)

@@ -76,7 +76,7 @@ def test_shares_follow_the_area():
     assert growing[0] < growing[1] < growing[2]
 
 
-def test_the_centre_counts_more_than_the_border():
+def test_the_center_counts_more_than_the_border():
     central = filled(WALL)
     central[:, 6:18, 6:18] = DOME
     border = filled(DOME)
@@ -142,9 +142,9 @@ def test_windows_leave_the_view_in_part_and_see_every_class(view):
     assert any(y < 0 or x < 0 for (y, x), _ in windows)
     assert min(side for _, side in windows) < 32
     assert max(side for _, side in windows) > 250
-    centres = [(y + side // 2, x + side // 2) for (y, x), side in windows]
+    centers = [(y + side // 2, x + side // 2) for (y, x), side in windows]
     assert (
-        np.mean([100 <= y < 200 and 300 <= x < 400 for y, x in centres]) > 0.15
+        np.mean([100 <= y < 200 and 300 <= x < 400 for y, x in centers]) > 0.15
     )  # a window is 6 % of the view
 
 

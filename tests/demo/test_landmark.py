@@ -225,8 +225,8 @@ def test_wild_views_differ_in_everything():
     landmark = Landmark.from_seed(2)
     views = [random_view(landmark, np.random.default_rng(i)) for i in range(60)]
     focal = [view.camera.focal for view in views]
-    distance = [np.linalg.norm(view.camera.position[:2] - landmark.centre[:2]) for view in views]
-    azimuth = [np.arctan2(*(view.camera.position - landmark.centre)[1::-1]) for view in views]
+    distance = [np.linalg.norm(view.camera.position[:2] - landmark.center[:2]) for view in views]
+    azimuth = [np.arctan2(*(view.camera.position - landmark.center)[1::-1]) for view in views]
     assert max(focal) > 3.5 * min(focal)
     assert max(distance) > 4 * min(distance)
     assert np.ptp(azimuth) > np.pi

@@ -35,9 +35,9 @@ def views(scene):
 
 def cast_again(scene, geometry):
     """What the generator renders for the camera in cameras.json."""
-    frame = json.loads((scene / "scene.json").read_text())["colmap_from_metres"]
+    frame = json.loads((scene / "scene.json").read_text())["colmap_from_meters"]
     turned, scale, shift = np.array(frame["rotation"]), frame["scale"], np.array(frame["translation"])
-    position = turned.T @ (geometry.centre - shift) / scale
+    position = turned.T @ (geometry.center - shift) / scale
     camera = Camera(position, geometry.camera_from_world[:, :3] @ turned, geometry.lens.fx / max(SIZE))
     return take_photo(Landmark.from_seed(SEED, "mosque"), plain_view(camera), *SIZE)
 
@@ -56,7 +56,7 @@ def test_labels_are_what_the_generator_casts_from_the_written_camera(scene, view
 
 
 def test_points_of_a_view_lie_on_what_it_sees(scene, views):
-    scale = json.loads((scene / "scene.json").read_text())["colmap_from_metres"]["scale"]
+    scale = json.loads((scene / "scene.json").read_text())["colmap_from_meters"]["scale"]
     for geometry in views.cameras:
         x, _, z = geometry.camera_from_world @ np.column_stack([geometry.points, np.ones(TEST_POINTS)]).T
         column, row = geometry.pixels.astype(int).T
@@ -67,10 +67,10 @@ def test_points_of_a_view_lie_on_what_it_sees(scene, views):
 def test_test_cameras_took_no_photo(scene, views):
     photos = read_reconstruction(scene / "sparse" / "0").photos.values()
     assert not any(name.startswith("test_views") for name in (photo.name for photo in photos))
-    scale = json.loads((scene / "scene.json").read_text())["colmap_from_metres"]["scale"]
+    scale = json.loads((scene / "scene.json").read_text())["colmap_from_meters"]["scale"]
     for geometry in views.cameras:
-        nearest = min(np.linalg.norm(photo.centre - geometry.centre) for photo in photos)
-        assert nearest / scale > 0.05  # metres
+        nearest = min(np.linalg.norm(photo.center - geometry.center) for photo in photos)
+        assert nearest / scale > 0.05  # meters
 
 
 @pytest.mark.parametrize("family", FAMILIES)

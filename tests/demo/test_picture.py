@@ -28,9 +28,9 @@ def test_a_prompt_is_painted_where_it_is_found(tmp_path):
         draw_picture([row("a", "domes", score=score)], tmp_path / "picture.png")
         image = np.asarray(Image.open(tmp_path / "picture.png").convert("RGB")).astype(int)
         panel = image[:, image.shape[1] * 3 // 4 :]
-        colour = panel[..., 0] - panel[..., 2]  # grey elsewhere
+        color = panel[..., 0] - panel[..., 2]  # gray elsewhere
         half = len(panel) // 2
-        return colour[:half].clip(0).sum(), colour[half:].clip(0).sum()
+        return color[:half].clip(0).sum(), color[half:].clip(0).sum()
 
     upper, lower = red(top=True)
     assert upper > 5 * lower

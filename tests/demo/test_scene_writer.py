@@ -72,7 +72,7 @@ def projected(photo):
 
 def test_tracks_respect_visibility(folder):
     """A photo's surface at a keypoint is at the point's depth, and not a passer-by."""
-    scale = json.loads((folder / "scene.json").read_text())["colmap_from_metres"]["scale"]
+    scale = json.loads((folder / "scene.json").read_text())["colmap_from_meters"]["scale"]
     agree, passing = [], []
     for name, photo in photos(folder).items():
         truth = shot(int(name[:4]))
@@ -87,7 +87,7 @@ def test_tracks_respect_visibility(folder):
 
 def test_some_points_are_wrong(folder):
     """False matches are tracked in two photos, true points in three or more, and most lie off the surface."""
-    scale = json.loads((folder / "scene.json").read_text())["colmap_from_metres"]["scale"]
+    scale = json.loads((folder / "scene.json").read_text())["colmap_from_meters"]["scale"]
     wrong = {}
     for name, photo in photos(folder).items():
         pixels, z = projected(photo)
@@ -166,7 +166,7 @@ def test_calm_photos_share_one_camera_and_exposure(tmp_path):
 
 
 def test_world_frame_is_arbitrary(folder):
-    similarity = json.loads((folder / "scene.json").read_text())["colmap_from_metres"]
+    similarity = json.loads((folder / "scene.json").read_text())["colmap_from_meters"]
     rotation = np.array(similarity["rotation"])
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(rotation) == pytest.approx(1)
@@ -174,7 +174,7 @@ def test_world_frame_is_arbitrary(folder):
     assert similarity["scale"] != 1
 
 
-def test_contact_sheet_shows_the_truth_in_colour(folder):
+def test_contact_sheet_shows_the_truth_in_color(folder):
     sheet = np.asarray(contact_sheet(folder)).astype(int)
     assert (folder / "contact_sheet.jpg").is_file()
     assert ((sheet[..., 2] - sheet[..., 0]) > 120).mean() > 0.002, "windows are painted blue"

@@ -28,7 +28,7 @@ from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
-    """Coloured noise in place of rendered landmarks, for speed."""
+    """Colored noise in place of rendered landmarks, for speed."""
     folder = tmp_path_factory.mktemp("cache")
     rng = np.random.default_rng(0)
     (folder / "train").mkdir()

@@ -13,7 +13,7 @@ from lang3dxl_ns.demo.clip_training.crops import draw_crops, join, label_shares,
 from lang3dxl_ns.demo.clip_training.photos import by_day, sky_mask, store_photos
 from lang3dxl_ns.demo.clip_training.small_clip import build_clip, build_tokenizer, load_clip, save_clip
 from lang3dxl_ns.demo.clip_training.train_clip import contrastive_loss, in_doubt
-from lang3dxl_ns.demo.clip_training.views import COLOUR, PART, LandmarkViews
+from lang3dxl_ns.demo.clip_training.views import COLOR, PART, LandmarkViews
 
 LABELS = {
     **{"window": 1, "facade": 2, "vegetation": 3, "street": 4, "car": 5, "balcony-fence": 6, "fence": 7},
@@ -51,7 +51,7 @@ def test_photos_are_split_and_their_labels_become_classes(folder, tmp_path):
 def test_the_second_view_is_brighter_and_shows_the_same(folder, tmp_path):
     taken, day = store_photos(folder, tmp_path / "cache", "train")[0].views
     assert (taken[PART:] == day[PART:]).all()
-    assert day[COLOUR].mean() > taken[COLOUR].mean() + 40
+    assert day[COLOR].mean() > taken[COLOR].mean() + 40
 
 
 def test_a_folder_without_classes_is_an_error(tmp_path):

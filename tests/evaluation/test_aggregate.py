@@ -20,7 +20,7 @@ def test_average_precision_is_averaged_over_categories_and_all_else_over_pairs()
     assert results["ap_domes"] == pytest.approx(0.3)
     assert results["map"] == pytest.approx((0.3 + 0.9) / 2)
     assert results["miou"] == pytest.approx((0.1 + 0.3 + 0.8) / 3)
-    assert results["localisation_accuracy"] == pytest.approx(2 / 3)
+    assert results["localization_accuracy"] == pytest.approx(2 / 3)
     assert (results["ap_domes_photos"], results["ap_windows_photos"]) == (2, 1)
     assert "teacher_map" not in results
 

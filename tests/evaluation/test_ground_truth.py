@@ -28,7 +28,7 @@ def test_the_same_object_in_every_layout_is_the_same_mask(tmp_path, mask):
         truth = GroundTruth(tmp_path / layout)
         assert truth.layout == layout
         assert truth.categories == ["dome"]
-        assert truth.photos("dome") == truth.labelled == ["0001"]
+        assert truth.photos("dome") == truth.labeled == ["0001"]
         assert truth.size("0001") == (40, 60)
         assert np.array_equal(truth.masks("0001.jpg", (40, 60))["dome"], mask), layout
         assert GroundTruth(tmp_path / layout, layout).categories == ["dome"]
@@ -148,4 +148,4 @@ def test_held_out_photos_are_shared_between_categories_sorted_and_show_something
     truth = GroundTruth(tmp_path)
     assert held_out_photos(truth) == ["0002", "0006", "0010", "0014", "0015", "0017", "0018", "0019"]
     assert held_out_photos(truth, 1) == ["0010", "0017"]
-    assert held_out_photos(truth, 100) == truth.labelled
+    assert held_out_photos(truth, 100) == truth.labeled

@@ -140,7 +140,7 @@ def test_langsplats_mask_by_hand():
     assert not smooth_mask(np.zeros((40, 40)), np.zeros((40, 40))).any()
 
 
-def test_the_majority_of_neighbours_removes_specks():
+def test_the_majority_of_neighbors_removes_specks():
     score = np.zeros((60, 60))
     score[20:40, 20:40] = 1
     score[5, 5] = 1

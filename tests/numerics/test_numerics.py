@@ -4,13 +4,13 @@ import json
 
 import pytest
 import torch
+from lang3dxl_ns.numerics.optimization import Run, runs
 
 from lang3dxl_ns import cli
-from lang3dxl_ns.numerics import catalogue, command
-from lang3dxl_ns.numerics.catalogue import GROUPS
+from lang3dxl_ns.numerics import catalog, command
+from lang3dxl_ns.numerics.catalog import GROUPS
 from lang3dxl_ns.numerics.command import measure_all
 from lang3dxl_ns.numerics.measure import Bounds, Case, Problem, measure
-from lang3dxl_ns.numerics.optimisation import Run, runs
 
 BOUNDS = {"float32": Bounds(), "bf16": Bounds(1e-2, 1e-2, 1e-2, 1e-2)}
 
@@ -75,7 +75,7 @@ def test_flipped_pixels_are_counted_and_left_out_of_the_gradient():
     assert any("flipped" in miss for miss in row.misses)
 
 
-def test_long_and_stiff_optimisations_stay_finite_and_do_not_drift():
+def test_long_and_stiff_optimizations_stay_finite_and_do_not_drift():
     assert [(run.name, run.misses) for run in runs(quick=True) if run.misses] == []
 
 
@@ -88,7 +88,7 @@ def test_long_and_stiff_optimisations_stay_finite_and_do_not_drift():
         ({"codes": [1.0, 5.0, 90.0]}, "largest code 90.0 > 25"),
     ],
 )
-def test_an_optimisation_that_drifts_misses(changes, miss):
+def test_an_optimization_that_drifts_misses(changes, miss):
     good = {"losses": [1.0, 0.6, 0.5], "codes": [1.0, 2.0, 3.0]}
     assert Run("a run", 30, True, **good).misses == []
     assert any(miss in found for found in Run("a run", 30, True, **good | changes).misses)
@@ -104,7 +104,7 @@ def test_a_miss_is_reported_in_words_and_makes_the_exit_code_1(tmp_path, monkeyp
     assert stop.value.code == 1
     said = capsys.readouterr().out
     assert "MISS squares, a case, float32: not finite" in said
-    assert "MISS optimisation, fast: not finite" in said
+    assert "MISS optimization, fast: not finite" in said
     rows = json.loads((tmp_path / "numerics.json").read_text())["rows"]
     assert [bool(row["misses"]) for row in rows] == [True, True, False, False]
     report = (tmp_path / "numerics.md").read_text()
@@ -113,9 +113,9 @@ def test_a_miss_is_reported_in_words_and_makes_the_exit_code_1(tmp_path, monkeyp
     assert (tmp_path / "numerics.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_catalogue_holds_every_group():
-    components = {case.component for case in catalogue.all_cases(quick=True, device="cpu")}
+def test_the_catalog_holds_every_group():
+    components = {case.component for case in catalog.all_cases(quick=True, device="cpu")}
     assert {"appearance", "relevancy"} <= components
-    assert {"rasteriser, torch", "hash grid", "decoder", "downsampler", "physical scale"} <= components
-    on_gpu = {case.component for case in catalogue.all_cases(quick=True, device="cuda")}
-    assert "rasteriser, gsplat" in on_gpu
+    assert {"rasterizer, torch", "hash grid", "decoder", "downsampler", "physical scale"} <= components
+    on_gpu = {case.component for case in catalog.all_cases(quick=True, device="cuda")}
+    assert "rasterizer, gsplat" in on_gpu

@@ -81,7 +81,7 @@ def test_first_iteration_moves_gaussians_as_without_appearance(train, scene):
         assert torch.equal(with_it[name], without[name]), name
 
 
-def test_a_look_changes_colours_and_nothing_else(train, scene):
+def test_a_look_changes_colors_and_nothing_else(train, scene):
     trainer = train(scene, iterations=8, **{SHIFT: True})
     model, camera = trainer.pipeline.model, eval_camera(trainer)
     with torch.no_grad():
@@ -187,7 +187,7 @@ def test_the_checkpoint_decides_what_is_auto(train, scene):
         train(scene, iterations=4, semantics=False, load_dir=without.checkpoint_dir, **{USE: "on"})
 
 
-def test_held_out_photos_are_measured_with_and_without_colour_correction(lit):
+def test_held_out_photos_are_measured_with_and_without_color_correction(lit):
     trainer = lit
     metrics = trainer.pipeline.get_average_eval_image_metrics(get_std=True)
     assert metrics["cc_psnr"] > metrics["psnr"]

@@ -14,7 +14,7 @@ from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
 @pytest.fixture(scope="module")
 def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
-    """The finished short run of an encoder by name, "none" for colours alone; each is made once."""
+    """The finished short run of an encoder by name, "none" for colors alone; each is made once."""
 
     @cache
     def made(name: str):
@@ -49,7 +49,7 @@ def test_an_encoder_trains_gives_features_of_the_targets_width_and_is_the_same_o
 
 
 @pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "direct"])
-def test_what_an_encoder_trains_moves_and_geometry_is_left_to_the_colours(run, name):
+def test_what_an_encoder_trains_moves_and_geometry_is_left_to_the_colors(run, name):
     alone = run("none").pipeline.model
     model = run(name).pipeline.model
     torch.testing.assert_close(model.means, alone.means)

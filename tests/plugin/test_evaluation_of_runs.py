@@ -56,7 +56,7 @@ def test_ns_eval_reports_pictures_features_words_and_cost(evaluate, scene, tmp_p
     }
     names |= {"teacher_ap_dome", "iou_dome", "render_seconds", "query_seconds"}
     assert names | {f"{name}_std" for name in names} <= set(results)
-    assert {"map", "raw_map", "authors_map", "teacher_map", "miou", "localisation_accuracy"} <= set(results)
+    assert {"map", "raw_map", "authors_map", "teacher_map", "miou", "localization_accuracy"} <= set(results)
     assert results["peak_memory_mb"] > 10
     assert results["ap_dome_photos"] == 2
     protocol = results["protocol"]
@@ -93,7 +93,7 @@ def test_labels_in_json_are_scored_at_the_photos_size_by_langsplats_measures(eva
     truth, box = tmp_path / "truth", box_object("dome", 5, 5, 30, 30)
     write_labels(truth, "photo_000", [box], width=width, height=height)
     results = evaluate(ground_truth=truth)
-    assert {"smooth_localisation_accuracy", "smooth_miou", "localisation_accuracy"} <= set(results)
+    assert {"smooth_localization_accuracy", "smooth_miou", "localization_accuracy"} <= set(results)
     assert results["protocol"]["layout"] == "lerf_ovs"
 
 

@@ -72,13 +72,13 @@ def test_cameras_are_those_that_were_trained_with(scene, trainer):
 
 
 def test_the_files_frame_leads_back_to_colmaps(scene, trainer):
-    """scale · (transform · COLMAP's camera centre) is the camera's centre in the model."""
+    """scale · (transform · COLMAP's camera center) is the camera's center in the model."""
     reconstruction = trainer.pipeline.datamanager.dataparser.reconstruction
     transform = torch.tensor(scene.file.transform, dtype=torch.float64)
     for photo in scene.file.photos:
         pose = torch.from_numpy(reconstruction.photos[photo.name].camera_from_world)
-        centre = -pose[:, :3].T @ pose[:, 3]
-        here = scene.file.scale * (transform[:, :3] @ centre + transform[:, 3])
+        center = -pose[:, :3].T @ pose[:, 3]
+        here = scene.file.scale * (transform[:, :3] @ center + transform[:, 3])
         expected = torch.tensor(photo.camera_to_world, dtype=torch.float64)[:, 3]
         torch.testing.assert_close(here, expected, atol=1e-5, rtol=1e-5)
 

@@ -59,7 +59,7 @@ def test_a_photo_as_a_test_view_is_placed_and_scored_as_the_photo(pipeline):
     assert results["limit_map"] > results["chance_map"] == pytest.approx(0.5, abs=0.02)
 
 
-def test_in_another_light_colours_are_compared_once_matched(pipeline, data):
+def test_in_another_light_colors_are_compared_once_matched(pipeline, data):
     path = data / FOLDER / "cameras.json"
     content = path.read_text()
     path.write_text(json.dumps(json.loads(content) | {"same_light": False}))

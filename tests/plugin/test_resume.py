@@ -11,7 +11,7 @@ EVERYTHING = {
     "pipeline__model__densify_grad_thresh": 1e-7,  # at every second step, with random splits
     "pipeline__model__densify_until": 0.75,
     "pipeline__model__appearance__use": "on",
-    "pipeline__model__camera_optimisation": "on",
+    "pipeline__model__camera_optimization": "on",
     "pipeline__model__view_dependence": "on",
     "pipeline__model__background_color": "random",
     "steps_per_eval_image": 0,

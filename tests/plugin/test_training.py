@@ -40,8 +40,8 @@ def test_without_clip_there_is_nothing_semantic(train, scene):
     assert not (scene / "none").exists()
 
 
-def test_semantics_leave_colours_and_geometry_as_they_are(train, scene):
-    """Joint training moves Gaussians exactly as colour-only training does."""
+def test_semantics_leave_colors_and_geometry_as_they_are(train, scene):
+    """Joint training moves Gaussians exactly as color-only training does."""
     joint, alone = (parameters(train(scene, iterations=12, semantics=s)) for s in (True, False))
     for name in ("means", "scales", "quats", "features_dc", "opacities"):
         torch.testing.assert_close(joint[f"gauss_params.{name}"], alone[f"gauss_params.{name}"])

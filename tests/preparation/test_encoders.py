@@ -68,7 +68,7 @@ def test_text_embeddings_are_those_of_transformers_own_pipeline_one_by_one(clip,
     assert (embeddings[0] - embeddings[1]).abs().max() > 1e-3
 
 
-def test_embeddings_are_not_normalised_and_can_meet_autograd(clip):
+def test_embeddings_are_not_normalized_and_can_meet_autograd(clip):
     crops = torch.rand(3, 3, 32, 32, generator=torch.manual_seed(1))
     embeddings = clip.encode_images(crops)
     assert (embeddings.norm(dim=-1) - 1).abs().min() > 0.05

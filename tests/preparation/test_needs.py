@@ -49,7 +49,7 @@ def test_the_wild_landmark_needs_light_and_scale_and_the_calm_one_no_light(landm
     assert not calm["appearance"].needed and calm["appearance"].value < 0.1
     for needs in (wild, calm):  # painted surfaces have no sheen
         assert not needs["view dependence"].needed
-        assert not needs["camera optimiser"].needed
+        assert not needs["camera optimizer"].needed
         assert needs["foreground"].needed and needs["foreground"].value > 0.1
 
 
@@ -129,7 +129,7 @@ def test_components_left_out_are_absent(train, scene):
         iterations=2,
         pipeline__model__appearance__use="off",
         pipeline__model__view_dependence="off",
-        pipeline__model__camera_optimisation="off",
+        pipeline__model__camera_optimization="off",
         pipeline__datamanager__dense="none",
         pipeline__datamanager__regions="none",
         pipeline__datamanager__foreground="none",
@@ -151,7 +151,7 @@ def test_needed_components_are_built_and_learn(train, scene):
         iterations=12,
         pipeline__model__appearance__use="on",
         pipeline__model__view_dependence="on",
-        pipeline__model__camera_optimisation="on",
+        pipeline__model__camera_optimization="on",
         pipeline__datamanager__regions="felzenszwalb",
         pipeline__model__encoder__name="paper",  # only codes that are trained with the scene use regions
     )
@@ -168,7 +168,7 @@ def test_a_checkpoint_brings_what_it_was_trained_with(train, scene):
         scene,
         iterations=3,
         pipeline__model__view_dependence="off",
-        pipeline__model__camera_optimisation="on",
+        pipeline__model__camera_optimization="on",
     )
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="test")
     assert pipeline.model.config.sh_degree == 0

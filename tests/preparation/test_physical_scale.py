@@ -139,7 +139,7 @@ def test_a_rescaled_world_scales_sizes_linearly(scene):
             for name, photo in reconstruction.photos.items()
         },
         7 * reconstruction.points,
-        reconstruction.colours,
+        reconstruction.colors,
     )
     sizes, scaled_sizes = pixel_sizes(reconstruction)[0], pixel_sizes(scaled)[0]
     assert list(scaled_sizes.values()) == pytest.approx([7 * size for size in sizes.values()])
@@ -224,14 +224,14 @@ def test_a_mixed_scene_reads_back(mixed_scene):
     assert [photo.name for photo in photos] == [f"photo_{i:03d}.jpg" for i in range(6)]
     assert len({(photo.width, photo.height, photo.lens.fx, photo.lens.cx) for photo in photos}) == 6
     assert {photo.width > photo.height for photo in photos} == {True, False}
-    assert len(reconstruction.points) == len(reconstruction.colours) > 100
+    assert len(reconstruction.points) == len(reconstruction.colors) > 100
     for photo in photos:
         x, y, z = photo.camera_from_world @ np.column_stack([photo.points, np.ones(len(photo.points))]).T
         lens = photo.lens
         projected = np.column_stack([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy])
         assert len(projected) > 20
         assert np.abs(projected - photo.pixels).max() < 1e-6
-        assert photo.camera_from_world @ [*photo.centre, 1] == pytest.approx(np.zeros(3), abs=1e-12)
+        assert photo.camera_from_world @ [*photo.center, 1] == pytest.approx(np.zeros(3), abs=1e-12)
         assert photo.lens.distortion == ()
 
 

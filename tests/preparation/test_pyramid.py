@@ -6,7 +6,7 @@ from PIL import Image
 
 from lang3dxl_ns.preparation.pyramid import (
     build_clip_target,
-    crop_centres,
+    crop_centers,
     iterate_crops,
     valid_fractions,
 )
@@ -18,7 +18,7 @@ def cut_crops(photo, side, size, steps=2):
     return next(iterate_crops(photo, side, size, valid.numel(), steps)), valid
 
 
-def mean_colour(crops):
+def mean_color(crops):
     return crops.mean(dim=(2, 3))
 
 
@@ -28,35 +28,35 @@ def random_photo(height, width, seed=0):
 
 @pytest.mark.parametrize(("side", "count"), [(32, 62), (100, 20), (1000, 2)])
 def test_grid_counts_are_the_published_ones(side, count):
-    assert len(crop_centres(1000, side)) == count
+    assert len(crop_centers(1000, side)) == count
 
 
 @pytest.mark.parametrize("steps", [2, 4])
 @pytest.mark.parametrize("length", [5, 31, 97, 532, 708, 1000])
 @pytest.mark.parametrize("side", [2, 3, 32, 33, 64, 101, 700])
-def test_centres_are_the_middles_of_equal_cells_a_part_of_a_crop_apart(length, side, steps):
-    centres = crop_centres(length, side, steps)
-    cells = (torch.arange(len(centres)) + 0.5) * length / len(centres)
-    assert (centres - cells).abs().max() <= 0.5
+def test_centers_are_the_middles_of_equal_cells_a_part_of_a_crop_apart(length, side, steps):
+    centers = crop_centers(length, side, steps)
+    cells = (torch.arange(len(centers)) + 0.5) * length / len(centers)
+    assert (centers - cells).abs().max() <= 0.5
     step = max(2 * (side // 2) // steps, 1)
     if length >= step:
-        assert step <= length / len(centres) < 2 * step
+        assert step <= length / len(centers) < 2 * step
 
 
 def test_an_axis_shorter_than_half_a_crop_has_its_middle():
-    assert crop_centres(21, 100).tolist() == [10]
+    assert crop_centers(21, 100).tolist() == [10]
 
 
 def test_a_side_below_two_pixels_is_refused():
     with pytest.raises(ValueError, match="at least 2 pixels"):
-        crop_centres(100, 1)
+        crop_centers(100, 1)
 
 
 @pytest.mark.parametrize("side", [32, 45])
-def test_the_middle_of_a_crop_is_its_centre(side):
+def test_the_middle_of_a_crop_is_its_center(side):
     photo, half = random_photo(83, 120), side // 2
     crops, valid = cut_crops(photo, side, 2 * half)
-    ys, xs = crop_centres(83, side), crop_centres(120, side)
+    ys, xs = crop_centers(83, side), crop_centers(120, side)
     assert valid.shape == (len(ys), len(xs))
     for crop, y, x in zip(crops, ys.repeat_interleave(len(xs)), xs.repeat(len(ys)), strict=True):
         assert torch.equal(crop[:, half, half], photo[y, x])
@@ -67,7 +67,7 @@ def test_crops_are_black_outside_and_the_valid_fraction_is_what_is_not(height, w
     white = torch.ones(height, width, 3)
     crops, valid = cut_crops(white, side, 2 * (side // 2))
     assert set(crops.unique().tolist()) <= {0.0, 1.0}
-    assert torch.allclose(mean_colour(crops)[:, 0].view_as(valid), valid)
+    assert torch.allclose(mean_color(crops)[:, 0].view_as(valid), valid)
     assert torch.equal(valid_fractions(height, width, side), valid)
     assert valid.min() < 1
 
@@ -85,7 +85,7 @@ def test_resized_crops_match_pillows_bicubic():
     for side, size in ((96, 32), (32, 64)):
         crops, valid = cut_crops(photo, side, size)
         index = int(valid.flatten().argmax())
-        rows, columns = crop_centres(128, side), crop_centres(128, side)
+        rows, columns = crop_centers(128, side), crop_centers(128, side)
         y, x, half = int(rows[index // len(columns)]), int(columns[index % len(columns)]), side // 2
         pixels = F.pad(photo, (0, 0, half, half, half, half))[y : y + side, x : x + side]
         image = Image.fromarray((pixels * 255).round().byte().numpy()).resize(
@@ -95,7 +95,7 @@ def test_resized_crops_match_pillows_bicubic():
         assert difference.abs().max() < 1.6  # Pillow rounds to 8 bits after each axis
 
 
-def test_fine_texture_turns_grey_when_shrunk():
+def test_fine_texture_turns_gray_when_shrunk():
     rows, columns = torch.meshgrid(torch.arange(256), torch.arange(256), indexing="ij")
     checkers = ((rows + columns) % 2).float()[..., None].expand(-1, -1, 3)
     crops, valid = cut_crops(checkers, 128, 32)
@@ -117,7 +117,7 @@ def slow_target(photo, sides, encode, size):
     grids = []
     for side in sides:
         half = side // 2
-        ys, xs = crop_centres(height, side).tolist(), crop_centres(width, side).tolist()
+        ys, xs = crop_centers(height, side).tolist(), crop_centers(width, side).tolist()
         grid = np.zeros((len(ys), len(xs), 4))
         for i, y in enumerate(ys):
             for j, x in enumerate(xs):
@@ -153,8 +153,8 @@ def slow_target(photo, sides, encode, size):
 @pytest.mark.parametrize("sides", [[32, 60, 110], [110, 33]])
 def test_the_target_equals_the_slow_loop(sides):
     photo = random_photo(70, 110)
-    target = build_clip_target(photo, sides, [float(side) for side in sides], mean_colour, 24, batch_size=5)
-    expected = slow_target(photo, sides, mean_colour, 24)
+    target = build_clip_target(photo, sides, [float(side) for side in sides], mean_color, 24, batch_size=5)
+    expected = slow_target(photo, sides, mean_color, 24)
     assert target.features.dtype == torch.float32
     assert torch.allclose(target.features, expected[..., :3], atol=1e-5)
     assert torch.allclose(target.valid, expected[..., 3], atol=1e-6)
@@ -162,7 +162,7 @@ def test_the_target_equals_the_slow_loop(sides):
 
 def test_a_constant_photo_differs_only_where_crops_leave_it():
     photo = torch.full((200, 300, 3), 0.6)
-    target = build_clip_target(photo, [32, 64], [1.0, 2.0], mean_colour, 32, batch_size=16)
+    target = build_clip_target(photo, [32, 64], [1.0, 2.0], mean_color, 32, batch_size=16)
     inside = target.valid > 1 - 1e-6
     assert 0.3 < inside.float().mean() < 1
     assert torch.allclose(target.features[inside], torch.tensor(0.6), atol=1e-5)
@@ -186,7 +186,7 @@ def test_every_scale_counts_the_same():
 def test_cells_lie_where_the_grid_says():
     height, width = 256, 384
     ramp = ((torch.arange(width) + 0.5) / width).expand(height, width)[..., None].expand(-1, -1, 3)
-    target = build_clip_target(ramp, [32, 64], [1.0, 2.0], mean_colour, 32, batch_size=64)
+    target = build_clip_target(ramp, [32, 64], [1.0, 2.0], mean_color, 32, batch_size=64)
     rows, columns = target.features.shape[:2]
     expected = (torch.arange(columns) + 0.5) / columns
     middle = target.features[rows // 2, 4:-4, 0]
@@ -197,7 +197,7 @@ def test_a_finer_grid_has_the_coarse_ones_crops_between_its_own():
     """The same picture of a ramp, four times as many cells, each at its place."""
     height, width = 128, 192
     ramp = ((torch.arange(width) + 0.5) / width).expand(height, width)[..., None].expand(-1, -1, 3)
-    target = build_clip_target(ramp, [32], [1.0], mean_colour, 32, batch_size=64, steps=4)
+    target = build_clip_target(ramp, [32], [1.0], mean_color, 32, batch_size=64, steps=4)
     rows, columns = target.features.shape[:2]
     assert (rows, columns) == (16, 24)
     expected = (torch.arange(columns) + 0.5) / columns
@@ -209,7 +209,7 @@ def test_the_encoder_never_sees_more_than_a_batch_and_needs_no_gradient():
 
     def encode(crops):
         seen.append(len(crops))
-        return mean_colour(crops)
+        return mean_color(crops)
 
     photo = random_photo(100, 100).requires_grad_()
     target = build_clip_target(photo, [32, 50], [1.0, 1.5], encode, 16, batch_size=9)
@@ -219,4 +219,4 @@ def test_the_encoder_never_sees_more_than_a_batch_and_needs_no_gradient():
 
 def test_sides_and_scales_must_go_together():
     with pytest.raises(ValueError, match="2 sides, 1 scales"):
-        build_clip_target(random_photo(64, 64), [32, 40], [1.0], mean_colour, 16, 4)
+        build_clip_target(random_photo(64, 64), [32, 40], [1.0], mean_color, 16, 4)

@@ -1,4 +1,4 @@
-"""Region label maps: from colours, from overlapping masks, from files."""
+"""Region label maps: from colors, from overlapping masks, from files."""
 
 from __future__ import annotations
 
@@ -79,10 +79,10 @@ def test_a_map_without_any_region_stays_so_and_many_regions_keep_their_numbers()
     assert torch.equal(stored_labels(many), many.int())
 
 
-# ------------------------------------------------------------------ from colours
+# ------------------------------------------------------------------ from colors
 
 
-def test_felzenszwalb_separates_colours_and_shrinks_the_photo_first():
+def test_felzenszwalb_separates_colors_and_shrinks_the_photo_first():
     image = torch.full((600, 900, 3), 0.2)
     image[:, 450:] = 0.9
     labels = FelzenszwalbRegions().labels(PHOTO, image)
@@ -166,7 +166,7 @@ def test_a_folders_settings_follow_the_file_and_are_none_without_one(tmp_path):
         ("a.npy", np.zeros((3, 4))),  # not whole numbers
         ("a.npy", np.zeros((4, 3, 4), int)),
         ("a.npy", np.array([{"pickled": 1}], dtype=object)),
-        ("a.png", np.zeros((3, 4, 3), np.uint8)),  # colours
+        ("a.png", np.zeros((3, 4, 3), np.uint8)),  # colors
         ("a.png", None),
     ],
 )

@@ -1,4 +1,4 @@
-"""Outputs for viewers and renders: relevancy, overlay, CLIP colours."""
+"""Outputs for viewers and renders: relevancy, overlay, CLIP colors."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ def test_relevancies_are_those_that_the_scene_finds(scene, view):
 
 
 def test_the_overlay_shows_the_best_of_the_prompts(scene, view):
-    display = Display(threshold=0.6, opacity=0.5, colour_map="viridis")
+    display = Display(threshold=0.6, opacity=0.5, color_map="viridis")
     found = outputs(scene, view, "dome; window", display=display, highest=0.9)
     best = torch.maximum(found["relevancy_0"], found["relevancy_1"])[..., 0]
     torch.testing.assert_close(
@@ -55,6 +55,6 @@ def test_where_nothing_is_seen_nothing_is_found(scene, view):
     assert not found["relevancy_0"].any() and torch.equal(found["overlay"], view.image)
 
 
-def test_a_colour_map_that_does_not_exist_is_named(scene, view):
-    with pytest.raises(UserError, match="no colour map"):
-        outputs(scene, view, "dome", display=Display(colour_map="rainbows"))
+def test_a_color_map_that_does_not_exist_is_named(scene, view):
+    with pytest.raises(UserError, match="no color map"):
+        outputs(scene, view, "dome", display=Display(color_map="rainbows"))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.heat_maps import colour, heat, overlay
+from lang3dxl_ns.query.heat_maps import color, heat, overlay
 
 RELEVANCY = torch.tensor([[0.0, 0.4, 0.5], [0.55, 0.6, 0.7]])
 IMAGE = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(0))
@@ -27,8 +27,8 @@ def test_only_what_matches_is_painted():
     assert torch.equal(overlay(IMAGE, RELEVANCY, opacity=0.0), IMAGE)
 
 
-def test_colours_are_matplotlibs():
-    grey = colour(torch.tensor([0.0, 1.0, 2.0]), "gray")
-    torch.testing.assert_close(grey, torch.tensor([[0.0] * 3, [1.0] * 3, [1.0] * 3]))
-    with pytest.raises(UserError, match="no colour map 'rainbows'"):
-        colour(RELEVANCY, "rainbows")
+def test_colors_are_matplotlibs():
+    gray = color(torch.tensor([0.0, 1.0, 2.0]), "gray")
+    torch.testing.assert_close(gray, torch.tensor([[0.0] * 3, [1.0] * 3, [1.0] * 3]))
+    with pytest.raises(UserError, match="no color map 'rainbows'"):
+        color(RELEVANCY, "rainbows")

@@ -33,7 +33,7 @@ def test_the_heavier_of_two_matches_wins_though_it_has_fewer_points():
     box = strongest_match(points, weights, gap=0.3)
     assert all(5.0 <= low < 5.1 for low in box.low) and all(5.9 < high <= 6.0 for high in box.high)
     assert box.share == pytest.approx(0.6, rel=1e-4)
-    assert box.centre == pytest.approx((5.5, 5.5, 5.5), abs=0.05)
+    assert box.center == pytest.approx((5.5, 5.5, 5.5), abs=0.05)
 
 
 def test_nothing_depends_on_where_the_world_begins():

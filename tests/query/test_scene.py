@@ -105,7 +105,7 @@ def test_find_names_the_view_that_shows_most_and_boxes_the_match(scene):
     assert all(v.rank >= w.rank for v, w in zip(found[0].viewpoints, found[0].viewpoints[1:], strict=False))
     pixel = DISTANCE / 96
     for box, (left, right, bottom, top) in ((found[0].box, DOME), (found[1].box, WINDOWS[1])):
-        if box.centre[0] < -1.3:  # which of the two equal windows wins is open
+        if box.center[0] < -1.3:  # which of the two equal windows wins is open
             left, right, bottom, top = WINDOWS[0]
         expected = torch.tensor([left, bottom, 0.0, right, top, 0.0])
         assert (torch.tensor([*box.low, *box.high]) - expected).abs().max() < 3 * pixel

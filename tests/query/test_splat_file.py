@@ -38,10 +38,10 @@ def test_every_property_is_in_its_place(gaussians, tmp_path):
     for channel in range(3 if coefficients else 0):
         first = rows[f"f_rest_{channel * coefficients}"]
         np.testing.assert_array_equal(first, gaussians["features_rest"][:, 0, channel])
-    colour = 0.5 + 0.28209479177387814 * rows["f_dc_0"]
+    color = 0.5 + 0.28209479177387814 * rows["f_dc_0"]
     base = gaussians["features_dc"][:, 0]
-    expected_colour = 0.5 + 0.28209479177387814 * base if coefficients else base.sigmoid()
-    np.testing.assert_allclose(colour, expected_colour, atol=1e-6)
+    expected_color = 0.5 + 0.28209479177387814 * base if coefficients else base.sigmoid()
+    np.testing.assert_allclose(color, expected_color, atol=1e-6)
 
 
 def test_only_the_matching_ones_or_all_with_their_scores(gaussians, tmp_path):

@@ -1,4 +1,4 @@
-"""Random scenes for the rendering tests, and comparison of two rasterisers on them."""
+"""Random scenes for the rendering tests, and comparison of two rasterizers on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tiled rasteriser against the dense reference, and the laws of compositing."""
+"""The tiled rasterizer against the dense reference, and the laws of compositing."""
 
 import os
 from pathlib import Path

@@ -90,7 +90,7 @@ def test_broken_gaussians_are_left_out_and_get_no_gradient(name, broken):
 
 @pytest.mark.parametrize("name", ["channels", "features"])
 @pytest.mark.parametrize("broken", [float("nan"), float("inf"), float("-inf")])
-def test_a_gaussian_of_broken_colours_is_left_out_alone(name, broken):
+def test_a_gaussian_of_broken_colors_is_left_out_alone(name, broken):
     """The picture is that of the others: no pixel of its tiles is spoiled."""
     cloud = make_cloud(40, 24, 20, size=0.3)
     without = cloud.leaves(torch.float32)
@@ -115,7 +115,7 @@ def test_a_broken_camera_is_an_error(part, broken):
         cloud.render(rasterize, cloud.leaves())
 
 
-def test_broken_colours_of_unseen_gaussians_do_no_harm():
+def test_broken_colors_of_unseen_gaussians_do_no_harm():
     cloud = make_cloud(60, 30, 20)
     cloud.tensors["means"][:10, 2] = -5
     cloud.tensors["channels"][:10] = float("nan")
@@ -123,8 +123,8 @@ def test_broken_colours_of_unseen_gaussians_do_no_harm():
     assert_all_finite(cloud.render(rasterize, leaves), leaves)
 
 
-def test_a_long_needle_is_as_exact_in_float32_far_from_its_centre():
-    # Centre 2900 px outside the image, standard deviation 3000 px along a slanted axis.
+def test_a_long_needle_is_as_exact_in_float32_far_from_its_center():
+    # Center 2900 px outside the image, standard deviation 3000 px along a slanted axis.
     camera = Camera(torch.eye(4), torch.tensor([[100.0, 0, 16], [0, 100.0, 16], [0, 0, 1]]), 32, 32)
     direction = torch.nn.functional.normalize(torch.tensor([0.9, 0.43, 0.0]), dim=0)
     half = torch.atan2(direction[1], direction[0]) / 2

@@ -12,7 +12,7 @@ def sample(count: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_colours_equal_those_of_gsplat(degree):
+def test_colors_equal_those_of_gsplat(degree):
     directions, coefficients = sample()
     expected = _spherical_harmonics(degree, directions, coefficients)
     torch.testing.assert_close(

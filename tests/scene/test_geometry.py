@@ -5,7 +5,7 @@ import torch
 
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.scene.camera import Camera, Lens, in_view
-from lang3dxl_ns.scene.geometry import centre_and_radius
+from lang3dxl_ns.scene.geometry import center_and_radius
 
 
 def wide_camera(seed: int) -> Camera:
@@ -26,7 +26,7 @@ def test_no_gaussian_that_shows_is_out_of_view(seed):
     quats = torch.randn(n, 4, generator=generator)
     camera = wide_camera(seed)
     seen = in_view(camera, means, scales)
-    # Only Gaussians out of view are coloured: nothing may show.
+    # Only Gaussians out of view are colored: nothing may show.
     drawn = Gaussians(means, quats, scales, torch.full((n,), 0.9))
     picture = rasterize(drawn, camera, (~seen)[:, None].float()).image
     assert float(picture.abs().max()) == 0
@@ -35,9 +35,9 @@ def test_no_gaussian_that_shows_is_out_of_view(seed):
 
 def test_radius_holds_nine_tenths_and_grows_with_the_world():
     points = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
-    centre, radius = centre_and_radius(points)
-    assert float(((points - centre).norm(dim=1) < radius).float().mean()) == pytest.approx(0.9, abs=0.01)
-    assert centre_and_radius(7 * points)[1] == pytest.approx(7 * radius)
+    center, radius = center_and_radius(points)
+    assert float(((points - center).norm(dim=1) < radius).float().mean()) == pytest.approx(0.9, abs=0.01)
+    assert center_and_radius(7 * points)[1] == pytest.approx(7 * radius)
 
 
 def test_a_resized_lens_sees_the_same_directions_at_the_resized_pixels():

@@ -26,19 +26,19 @@ def with_lens(photo, **changes):
 
 
 @pytest.fixture
-def colours():
+def colors():
     return RNG.integers(0, 256, (30, 40, 3), dtype=np.uint8)
 
 
 @pytest.fixture
-def photo(tmp_path, colours):
-    Image.fromarray(colours).save(tmp_path / "a.png")
+def photo(tmp_path, colors):
+    Image.fromarray(colors).save(tmp_path / "a.png")
     return make_photo(tmp_path / "a.png")
 
 
-def test_a_photo_reads_as_it_is_on_disk(photo, colours):
-    assert torch.equal(photo.read_uint8(), torch.from_numpy(colours))
-    assert torch.equal(photo.read(), torch.from_numpy(colours).float() / 255)
+def test_a_photo_reads_as_it_is_on_disk(photo, colors):
+    assert torch.equal(photo.read_uint8(), torch.from_numpy(colors))
+    assert torch.equal(photo.read(), torch.from_numpy(colors).float() / 255)
     assert photo.read_mask() is None
 
 
@@ -79,10 +79,10 @@ def test_shrinking_averages_instead_of_skipping(tmp_path):
     ],
 )
 def test_every_kind_of_picture_becomes_rgb(tmp_path, mode, ending):
-    grey = Image.new("RGB", (40, 30), (255, 255, 255))
-    grey.paste((0, 0, 0), (0, 0, 20, 30))
+    gray = Image.new("RGB", (40, 30), (255, 255, 255))
+    gray.paste((0, 0, 0), (0, 0, 20, 30))
     path = tmp_path / f"a.{ending}"
-    grey.convert(mode).save(path, **({"lossless": True} if ending == "webp" else {}))
+    gray.convert(mode).save(path, **({"lossless": True} if ending == "webp" else {}))
     pixels = make_photo(path).read()
     assert pixels.shape == (30, 40, 3)
     assert pixels[:, :20].max() < 0.01
@@ -186,7 +186,7 @@ def draw_spots(pixels, width, height):
 
 
 def locate(image, x, y, radius=9):
-    """Centre of gravity of the spot near (x, y)."""
+    """Center of gravity of the spot near (x, y)."""
     x0, y0 = round(x) - radius, round(y) - radius
     window = image[y0 : y0 + 2 * radius, x0 : x0 + 2 * radius].double()
     steps = torch.arange(2 * radius) + 0.5
@@ -257,7 +257,7 @@ def test_an_undistorted_scene_looks_like_the_pinholes(tmp_path):
 
 
 @pytest.mark.parametrize("bend", [None, (-0.4, 0.1, 0.02, -0.02)])
-def test_a_photo_shows_the_points_colours_where_the_pinhole_projects_them(tmp_path, bend):
+def test_a_photo_shows_the_points_colors_where_the_pinhole_projects_them(tmp_path, bend):
     size = (320, 240)
     scene = write_scene(tmp_path / "s", 3, size, points=2000, distortion=bend, image_ext="png")
     for geometry in read_reconstruction(scene / "sparse" / "0").photos.values():

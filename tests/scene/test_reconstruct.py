@@ -38,14 +38,14 @@ def pose_errors(model, given):
     """Degrees between rotations, and distances between positions in the given model's units, once aligned."""
     found, true = read_reconstruction(model).photos, read_reconstruction(given).photos
     names = sorted(set(found) & set(true))
-    align = pycolmap.estimate_sim3d(*(np.array([m[n].centre for n in names]) for m in (found, true)))
+    align = pycolmap.estimate_sim3d(*(np.array([m[n].center for n in names]) for m in (found, true)))
     turn = align.rotation.matrix()
     degrees, distances = [], []
     for name in names:
         ours, theirs = found[name], true[name]
         between = ours.camera_from_world[:, :3] @ turn.T @ theirs.camera_from_world[:, :3].T
         degrees.append(np.degrees(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1))))
-        distances.append(np.linalg.norm(align * ours.centre - theirs.centre))
+        distances.append(np.linalg.norm(align * ours.center - theirs.center))
     return np.array(degrees), np.array(distances)
 
 

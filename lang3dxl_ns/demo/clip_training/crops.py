@@ -12,7 +12,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.demo.clip_training.captions import CLASS, CLASSES, UNLABELED
-from lang3dxl_ns.demo.clip_training.views import COLOUR, ELEMENT, MATERIAL, PART, LandmarkViews
+from lang3dxl_ns.demo.clip_training.views import COLOR, ELEMENT, MATERIAL, PART, LandmarkViews
 from lang3dxl_ns.demo.landmark.labels import PARTS
 from lang3dxl_ns.demo.landmark.materials import MATERIALS
 
@@ -23,8 +23,8 @@ SAMPLES = 24
 OUTSIDE = 255
 """Part of a sample outside the view."""
 
-_CENTRED = 0.75  # share of crops around a pixel of a class drawn with these weights; the others are anywhere
-_CENTRE_WEIGHTS = {
+_CENTERED = 0.75  # share of crops around a pixel of a class drawn with these weights; the others are anywhere
+_CENTER_WEIGHTS = {
     **{"sky": 0.7, "ground": 0.7, "wall": 1.3, "roof": 0.9, "column": 0.7, "clutter": 0.7, "house": 0.5},
     **{"window": 1.6, "portal": 1.4, "dome": 1.4, "tower": 1.7, "spire": 1.5, "minaret": 1.5},
     **{"tree": 0.5, "person": 0.4, "car": 0.4, "lamp": 0.3},
@@ -113,17 +113,17 @@ def draw_windows(
     coarse = class_map(view[PART, ::stride, ::stride], view[ELEMENT, ::stride, ::stride])
     present = np.flatnonzero(np.bincount(coarse.ravel(), minlength=len(CLASSES)))
     present = present[present != UNLABELED]
-    weights = np.array([_CENTRE_WEIGHTS[CLASSES[k]] for k in present])
+    weights = np.array([_CENTER_WEIGHTS[CLASSES[k]] for k in present])
     windows = []
     for _ in range(count):
         side = round(float(np.exp(rng.uniform(*np.log(sides)))))
-        if rng.random() < _CENTRED:
+        if rng.random() < _CENTERED:
             class_ = rng.choice(present, p=weights / weights.sum())
             pixel = rng.choice(np.flatnonzero(coarse == class_))
-            centre = np.array(divmod(int(pixel), coarse.shape[1])) * stride + rng.normal(0, 0.1 * side, 2)
+            center = np.array(divmod(int(pixel), coarse.shape[1])) * stride + rng.normal(0, 0.1 * side, 2)
         else:
-            centre = rng.uniform((0, 0), (height, width))
-        y, x = (min(max(float(c), 0), length) for c, length in zip(centre, (height, width), strict=True))
+            center = rng.uniform((0, 0), (height, width))
+        y, x = (min(max(float(c), 0), length) for c, length in zip(center, (height, width), strict=True))
         windows.append(((round(y - side / 2), round(x - side / 2)), side))
     return windows
 
@@ -134,7 +134,7 @@ def cut(
     """The crop of `size` pixels at `corner` (y, x), as `side` pixels, and the labels of its samples."""
     height, width = view.shape[1:]
     top, left = corner
-    inside = view[COLOUR, max(top, 0) : top + size, max(left, 0) : left + size]
+    inside = view[COLOR, max(top, 0) : top + size, max(left, 0) : left + size]
     crop = np.zeros((1, 3, size, size), np.uint8)
     y, x = max(-top, 0), max(-left, 0)
     crop[0, :, y : y + inside.shape[1], x : x + inside.shape[2]] = inside
@@ -152,10 +152,10 @@ def cut(
 def soft_labels(crops: Crops) -> Float[Array, "n k"]:
     """What each crop shows, as shares of the classes that sum to 1.
 
-    Area weighted by a Gaussian around the centre (sigma a fifth of the side) and by saliency, sharpened by
+    Area weighted by a Gaussian around the center (sigma a fifth of the side) and by saliency, sharpened by
     squaring. Windows and portals on a tower, dome, spire or minaret also count a little for it.
     """
-    weights = _centre_weights()[None] * crops.inside
+    weights = _center_weights()[None] * crops.inside
     shares = _count(crops.classes, weights, len(CLASSES) + 1)[:, :-1]  # the last label is UNLABELED
     hosts = np.isin(crops.parts, [CLASS[name] for name in _HOSTS]) & (crops.elements > 0)
     parts = np.where(crops.inside, crops.parts, 0)
@@ -167,7 +167,7 @@ def soft_labels(crops: Crops) -> Float[Array, "n k"]:
 
 def label_shares(crops: Crops) -> Float[Array, "n l"]:
     """Area share of every label, UNLABELED last, in the part of each crop that is inside its view."""
-    weights = _centre_weights()[None] * crops.inside
+    weights = _center_weights()[None] * crops.inside
     return _count(crops.classes, weights, len(CLASSES) + 1) / weights.sum((1, 2)).clip(1e-9)[:, None]
 
 
@@ -211,13 +211,13 @@ def augment(
     x = x.clamp(0, 1) ** torch.exp(normal(0.15, 1, 1, 1))
     mean = x.mean((1, 2, 3), keepdim=True)
     x = mean + (x - mean) * torch.exp(normal(0.2, 1, 1, 1))
-    grey = torch.rand(len(images), 1, 1, 1, generator=generator) < 0.1
-    x = torch.where(grey, x.mean(1, keepdim=True), x)
+    gray = torch.rand(len(images), 1, 1, 1, generator=generator) < 0.1
+    x = torch.where(gray, x.mean(1, keepdim=True), x)
     x = x + normal(0.02, 1, 1, 1).abs() * normal(1.0, *x.shape[1:])
     return x.clamp(0, 1) * F.interpolate(inside[:, None].float(), x.shape[-2:])
 
 
-def _centre_weights() -> Float[Array, "g g"]:
+def _center_weights() -> Float[Array, "g g"]:
     offset = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     line = np.exp(-0.5 * (offset / 0.2) ** 2)
     return np.outer(line, line)

@@ -1,4 +1,4 @@
-"""Labelled street photos as training views: pixel classes, sky, and a daylight version."""
+"""Labeled street photos as training views: pixel classes, sky, and a daylight version."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.demo.clip_training.captions import CLASS, UNLABELED
-from lang3dxl_ns.demo.clip_training.views import COLOUR, PART, LandmarkViews
+from lang3dxl_ns.demo.clip_training.views import COLOR, PART, LandmarkViews
 
 # their label: our class
 _CLASS_OF = {
@@ -37,7 +37,7 @@ def store_photos(folder: Path, cache: Path, split: str) -> list[LandmarkViews]:
     """Every photo whose name begins with the split (or "train": all but "valid"), as two views: as taken, and
     by daylight. Written to the cache once, then memory-mapped.
 
-    Raises UserError if the folder does not hold labelled photos.
+    Raises UserError if the folder does not hold labeled photos.
     """
     try:
         labels: dict[str, int] = json.loads((folder / "classes.json").read_text())["classes"]
@@ -71,13 +71,13 @@ def _views(path: Path, label_path: Path, table: UInt8[Array, " 256"], seed: int)
     image = np.asarray(photo)
     stack = np.zeros((2, 6, *classes.shape), np.uint8)
     stack[:, PART] = classes
-    stack[0, COLOUR] = image.transpose(2, 0, 1)
-    stack[1, COLOUR] = by_day(image, sky, np.random.default_rng(seed)).transpose(2, 0, 1)
+    stack[0, COLOR] = image.transpose(2, 0, 1)
+    stack[1, COLOR] = by_day(image, sky, np.random.default_rng(seed)).transpose(2, 0, 1)
     return stack
 
 
 def sky_mask(classes: UInt8[Array, "h w"]) -> Bool[Array, "h w"]:
-    """The unlabelled pixels from the upper edge down to the first label of each column: the sky, which the
+    """The unlabeled pixels from the upper edge down to the first label of each column: the sky, which the
     annotators of buildings left out."""
     unlabeled = classes == UNLABELED
     first = np.where(unlabeled.all(0), 0, (~unlabeled).argmax(0))

@@ -96,9 +96,9 @@ def load_clip(folder: Path, layers: int) -> tuple[Any, Any]:
 
 @torch.no_grad()
 def start_from_principal_components(clip: Any, pixels: Float[Tensor, "n 3 s s"]) -> None:
-    """Make the patch embedding the whitened principal components of the patches of these (normalised) crops.
+    """Make the patch embedding the whitened principal components of the patches of these (normalized) crops.
 
-    With random filters, whose outputs all follow a patch's mean colour, a small transformer spends tens of
+    With random filters, whose outputs all follow a patch's mean color, a small transformer spends tens of
     thousands of crops before it sees anything else.
     """
     weight = clip.vision_model.embeddings.patch_embedding.weight
@@ -109,8 +109,8 @@ def start_from_principal_components(clip: Any, pixels: Float[Tensor, "n 3 s s"])
     weight.copy_((0.3 * components[:, largest] * scale).T.reshape(weight.shape))
 
 
-def normalise(pixels: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n 3 s s"]:
-    """Pixels in 0..1, normalised for the vision tower."""
+def normalize(pixels: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n 3 s s"]:
+    """Pixels in 0..1, normalized for the vision tower."""
     return (pixels - torch.tensor(_MEAN)[:, None, None]) / torch.tensor(_STD)[:, None, None]
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from lang3dxl_ns.demo.clip_training.captions import CLASS, UNLABELED
 from lang3dxl_ns.demo.clip_training.views import (
-    COLOUR,
+    COLOR,
     ELEMENT,
     HEIGHT,
     PART,
@@ -65,7 +65,7 @@ def _relevancy_maps(
     canonical: Float[Tensor, "p c"],
 ) -> Float[Array, "q y x"]:
     """Relevancy at half the view's size."""
-    photo = torch.from_numpy(view[COLOUR].transpose(1, 2, 0).astype(np.float32) / 255)
+    photo = torch.from_numpy(view[COLOR].transpose(1, 2, 0).astype(np.float32) / 255)
     target = build_clip_target(
         photo, sides, [float(s) for s in sides], encoder.encode_images, encoder.crop_size, 256
     )

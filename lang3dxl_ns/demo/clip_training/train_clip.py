@@ -53,7 +53,7 @@ from lang3dxl_ns.demo.clip_training.small_clip import (
     build_clip,
     build_tokenizer,
     load_clip,
-    normalise,
+    normalize,
     save_clip,
     start_from_principal_components,
 )
@@ -242,7 +242,7 @@ def _fit(run: Run, folder: ViewFolder, validation: list[Array]) -> None:
         crops = draw_crops(
             folder.landmarks, 4 * config.batch, 4, IMAGE_SIZE, np.random.default_rng(config.seed)
         )
-        start_from_principal_components(run.trainee.clip, normalise(crops.images.float() / 255))
+        start_from_principal_components(run.trainee.clip, normalize(crops.images.float() / 255))
     saved, mean_loss = time.monotonic(), None
     if config.start and not run.step:
         _report_scores(run, validation)
@@ -345,7 +345,7 @@ def _train_step(run: Run, folder: ViewFolder) -> float:
     classes = torch.tensor([caption.class_ for caption in captions])
     tokens = run.tokenizer([caption.text for caption in captions], padding=True, return_tensors="pt")
     generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    pixels = normalise(augment(crops.images, torch.from_numpy(crops.inside), generator))
+    pixels = normalize(augment(crops.images, torch.from_numpy(crops.inside), generator))
 
     images, texts, patches = run.trainee(pixels, dict(tokens))
     loss = contrastive_loss(images, texts, fit, classes, run.trainee.clip.logit_scale.exp(), doubt)

@@ -19,7 +19,7 @@ from torch import nn
 
 from lang3dxl_ns.demo.clip_training.captions import CLASSES
 from lang3dxl_ns.demo.clip_training.crops import augment, draw_crops, patch_labels
-from lang3dxl_ns.demo.clip_training.small_clip import PATCH, normalise
+from lang3dxl_ns.demo.clip_training.small_clip import PATCH, normalize
 from lang3dxl_ns.demo.clip_training.train_clip import patch_loss
 from lang3dxl_ns.demo.clip_training.views import ViewFolder
 
@@ -69,7 +69,7 @@ def train(config: DenseTraining) -> None:
         grid = int(rng.choice(_GRIDS))
         crops = draw_crops(landmarks, _PATCHES // grid**2, 1, grid * PATCH, rng, _SIDES)
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        pixels = normalise(augment(crops.images, torch.from_numpy(crops.inside), generator))
+        pixels = normalize(augment(crops.images, torch.from_numpy(crops.inside), generator))
         tokens = tower(pixel_values=pixels, interpolate_pos_encoding=True).last_hidden_state[:, 1:]
         loss = patch_loss(head(tokens), torch.from_numpy(patch_labels(crops, grid)).float())
         optimizer.param_groups[0]["lr"] = 5e-4 * min(1.0, (step + 1) / 60) * (1.02 - step / config.steps)

@@ -23,7 +23,7 @@ from lang3dxl_ns.demo.clip_training.captions import FAMILIES
 SPLITS = {"test": range(0, 1_000), "validation": range(5_000, 6_000), "train": range(10_000, 20_000)}
 """Landmark seeds of each split. Nothing is trained or tuned on the test seeds."""
 WIDTH, HEIGHT = 480, 360
-COLOUR, PART, ELEMENT, MATERIAL = slice(0, 3), 3, 4, 5
+COLOR, PART, ELEMENT, MATERIAL = slice(0, 3), 3, 4, 5
 """Channels of a stored view."""
 
 
@@ -64,7 +64,7 @@ def render_landmark(folder: Path, seed: int, views: int) -> Path:
     stack = np.empty((views, 6, HEIGHT, WIDTH), np.uint8)  # planes: crops of them are copied in rows
     for view in stack:
         shot = take_photo(landmark, random_view(landmark, rng, wild=True), WIDTH, HEIGHT)
-        view[COLOUR] = shot.image.transpose(2, 0, 1)
+        view[COLOR] = shot.image.transpose(2, 0, 1)
         view[PART], view[ELEMENT], view[MATERIAL] = shot.parts, shot.elements, shot.materials
     path = folder / f"{landmark.family}_{seed:05d}.npy"
     temporary = path.with_name(f"partial-{seed:05d}-{os.getpid()}.npy")

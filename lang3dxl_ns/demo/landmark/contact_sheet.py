@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.demo.landmark.labels import CATEGORIES
 
-COLOURS = {
+COLORS = {
     "towers": (255, 150, 20),
     "minarets": (60, 200, 70),
     "spires": (190, 50, 230),
@@ -56,17 +56,17 @@ def _most_telling(truth: Path) -> list[str]:
 
 def _painted(photo: Image.Image, truth: Path, name: str) -> Image.Image:
     pixels = np.asarray(photo, dtype=np.float32)
-    pixels = 0.55 * pixels.mean(axis=2, keepdims=True) + 0.45 * 255 * np.ones(3)  # faded: colours stand out
-    for category, colour in COLOURS.items():
+    pixels = 0.55 * pixels.mean(axis=2, keepdims=True) + 0.45 * 255 * np.ones(3)  # faded: colors stand out
+    for category, color in COLORS.items():
         path = truth / category / f"{name}-gt.jpg"
         if path.exists():
             mask = np.asarray(Image.open(path).convert("L")) < 128
-            pixels[mask] = 0.3 * pixels[mask] + 0.7 * np.array(colour)
+            pixels[mask] = 0.3 * pixels[mask] + 0.7 * np.array(color)
     return Image.fromarray(pixels.astype(np.uint8))
 
 
 def _fitted(photo: Image.Image) -> Image.Image:
-    """The photo fitted into a cell, on grey."""
+    """The photo fitted into a cell, on gray."""
     cell = Image.new("RGB", CELL, (235, 235, 235))
     scale = min(CELL[0] / photo.width, CELL[1] / photo.height)
     small = photo.resize((round(photo.width * scale), round(photo.height * scale)), Image.Resampling.LANCZOS)
@@ -78,6 +78,6 @@ def _draw_legend(draw: ImageDraw.ImageDraw, y: int) -> None:
     font = ImageFont.load_default(size=16)
     x = GAP
     for category in CATEGORIES:
-        draw.rectangle((x, y + 5, x + 16, y + 21), fill=COLOURS[category])
+        draw.rectangle((x, y + 5, x + 16, y + 21), fill=COLORS[category])
         draw.text((x + 22, y + 3), category, fill="black", font=font)
         x += 130

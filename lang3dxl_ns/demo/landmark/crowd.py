@@ -48,12 +48,12 @@ def write_crowd(folder: Path, photos: int, points: int, seed: int = 0) -> Path:
             name=name, keypoints=pixels[inside], camera_id=camera.camera_id, image_id=i + 1
         )
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    colours = rng.integers(40, 215, (points, 3), dtype=np.uint8)
+    colors = rng.integers(40, 215, (points, 3), dtype=np.uint8)
     for point in range(points):
         track = pycolmap.Track()
         for image_id, place in tracks.get(point, []):
             track.add_element(image_id, place)
-        model.add_point3D(ball[point], track, colours[point])
+        model.add_point3D(ball[point], track, colors[point])
     (folder / "sparse" / "0").mkdir(parents=True)
     model.write_binary(folder / "sparse" / "0")
     return folder
@@ -66,7 +66,7 @@ def _noise(rng: np.random.Generator, width: int, height: int) -> Image.Image:
 
 
 def _pose(angle: float, distance: float) -> Float[Array, "3 4"]:
-    """World-to-camera pose on a ring, looking at the centre."""
+    """World-to-camera pose on a ring, looking at the center."""
     position = distance * np.array([np.sin(angle), -np.cos(angle), 0.3])
     forward = -position / np.linalg.norm(position)
     right = np.cross(forward, [0.0, 0.0, 1.0])

@@ -23,18 +23,18 @@ FAMILIES = tuple(_GRAMMARS)
 
 @dataclass(frozen=True, eq=False)
 class Landmark:
-    """Shapes and materials in metres, z up, the ground at z = 0, the façade facing +x."""
+    """Shapes and materials in meters, z up, the ground at z = 0, the façade facing +x."""
 
     seed: int
     family: str
     shapes: tuple[Shape, ...]
     materials: tuple[Material, ...]
-    centre: Float[Array, "3"]
-    """Centre of the building's bounds."""
+    center: Float[Array, "3"]
+    """Center of the building's bounds."""
     radius: float
-    """Half the horizontal diagonal of the building's bounds, metres."""
+    """Half the horizontal diagonal of the building's bounds, meters."""
     height: float
-    """Of the building, metres."""
+    """Of the building, meters."""
     obstacles: Float[Array, "n 2 3"]
     """Bounds (lower and upper corner) of everything but the ground, to keep cameras and people out."""
 
@@ -52,22 +52,22 @@ class Landmark:
         builder = Builder(rng)
         _GRAMMARS[family](builder)
         low, high = _bounds(shape for shape in builder.shapes if PARTS[shape.part] in BUILDING_PARTS)
-        centre, radius = (low + high) / 2, math.hypot(*(high - low)[:2]) / 2
-        place_surroundings(builder, centre, radius)
+        center, radius = (low + high) / 2, math.hypot(*(high - low)[:2]) / 2
+        place_surroundings(builder, center, radius)
         standing = [_bounds([shape]) for shape in builder.shapes if PARTS[shape.part] != "ground"]
         return cls(
             seed=seed,
             family=family,
             shapes=tuple(builder.shapes),
             materials=tuple(builder.materials),
-            centre=centre,
+            center=center,
             radius=radius,
             height=float(high[2]),
             obstacles=np.array(standing),
         )
 
     def is_free(self, point, margin: float) -> bool:
-        """Whether nothing is within `margin` metres of a point (by bounding boxes)."""
+        """Whether nothing is within `margin` meters of a point (by bounding boxes)."""
         low, high = self.obstacles[:, 0], self.obstacles[:, 1]
         point = np.asarray(point)
         return not ((point > low - margin) & (point < high + margin)).all(axis=1).any()

@@ -8,7 +8,7 @@ import numpy as np
 
 from lang3dxl_ns.demo.landmark.shapes import floats
 
-# name: (colour, pattern, gloss). Colours are linear reflectances.
+# name: (color, pattern, gloss). Colors are linear reflectances.
 _KINDS: dict[str, tuple[tuple[float, float, float], str, float]] = {
     "limestone": ((0.62, 0.56, 0.45), "blocks", 0.0),
     "sandstone": ((0.58, 0.42, 0.28), "blocks", 0.0),
@@ -57,40 +57,40 @@ COVERING = ("slate", "clay tile", "glazed tile", "lead", "copper", "gold")
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A material of one landmark: `name` in MATERIALS, its colour, texture scale and texture seed."""
+    """A material of one landmark: `name` in MATERIALS, its color, texture scale and texture seed."""
 
     name: str
-    colour: tuple[float, float, float]
+    color: tuple[float, float, float]
     pattern: str
     scale: float
     seed: int
     gloss: float
 
     def reflectance(self, s: np.ndarray, t: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """Colours [n, 3] at texture coordinates; details finer than the footprint (metres) fade out."""
-        grey = _PATTERNS[self.pattern](s / self.scale, t / self.scale, footprint / self.scale, self.seed)
+        """Colors [n, 3] at texture coordinates; details finer than the footprint (meters) fade out."""
+        gray = _PATTERNS[self.pattern](s / self.scale, t / self.scale, footprint / self.scale, self.seed)
         weather = 1 + 0.25 * (_noise(s * 0.11, t * 0.05, self.seed + 7) - 0.5)
-        colours = floats(self.colour) * (grey * weather)[:, None]
+        colors = floats(self.color) * (gray * weather)[:, None]
         if self.pattern == "stained":
             cells = (np.floor(s / 0.45), np.floor(t / 0.45))
             tint = np.stack([_cell(*cells, self.seed + i) for i in range(3)], axis=1)
-            colours *= 0.3 + 1.7 * tint
-        return colours
+            colors *= 0.3 + 1.7 * tint
+        return colors
 
 
 def make_material(name: str, rng: np.random.Generator, tint: float = 0.04) -> Material:
     """A landmark's version of a material: brighter or darker, and warmer or colder by up to `tint`."""
-    colour, pattern, gloss = _KINDS[name]
+    color, pattern, gloss = _KINDS[name]
     if name == "glazed tile" and rng.random() < 0.4:
-        colour = [(0.08, 0.18, 0.45), (0.12, 0.38, 0.22), (0.45, 0.42, 0.36)][rng.integers(3)]
+        color = [(0.08, 0.18, 0.45), (0.12, 0.38, 0.22), (0.45, 0.42, 0.36)][rng.integers(3)]
     warmth = 1 + rng.uniform(-2 * tint, 2 * tint) * np.array([1, 0.2, -1])
-    shifted = np.array(colour) * rng.uniform(0.8, 1.2) * warmth
+    shifted = np.array(color) * rng.uniform(0.8, 1.2) * warmth
     r, g, b = np.clip(shifted, 0.015, 0.9).tolist()
     return Material(name, (r, g, b), pattern, float(rng.uniform(0.8, 1.35)), int(rng.integers(1000)), gloss)
 
 
-def coloured(name: str, rng: np.random.Generator) -> Material:
-    """Cloth or paint of a random colour."""
+def colored(name: str, rng: np.random.Generator) -> Material:
+    """Cloth or paint of a random color."""
     material = make_material(name, rng)
     r, g, b = rng.uniform(0.03, 0.75, 3).tolist()
     return Material(name, (r, g, b), material.pattern, material.scale, material.seed, material.gloss)
@@ -136,7 +136,7 @@ def _fade(size: float, footprint):
 
 
 def _courses(s, t, footprint, seed: int, width: float, height: float, joint: float, contrast: float):
-    """Masonry: courses of slightly different grey stones with dark joints."""
+    """Masonry: courses of slightly different gray stones with dark joints."""
     row = np.floor(t / height)
     x = s / width + 0.5 * np.mod(row, 2)
     column = np.floor(x)

@@ -19,9 +19,9 @@ DOORS = ("leaves", "panels", "tympanum", "open")
 class Openings(Shape):
     """Columns × rows of equal openings on the plane x = 0, facing +x; y across, z up from 0.
 
-    Each is `width` × `height` metres in the middle of a tile of the `field` (metres). The reveal steps inward
-    in `orders`, each `step` metres narrower and depth / orders deeper, as in portals. A band of the trim,
-    `surround` metres wide, runs around the opening; it belongs to the wall.
+    Each is `width` × `height` meters in the middle of a tile of the `field` (meters). The reveal steps inward
+    in `orders`, each `step` meters narrower and depth / orders deeper, as in portals. A band of the trim,
+    `surround` meters wide, runs around the opening; it belongs to the wall.
     """
 
     trim_material: int
@@ -96,14 +96,14 @@ class Openings(Shape):
         )
 
     def _tile(self, y, z):
-        """Coordinates in the opening's own tile: u from its centre line, v from its sill."""
+        """Coordinates in the opening's own tile: u from its center line, v from its sill."""
         w, h = self.field[0] / self.columns, self.field[1] / self.rows
         u = np.mod(y + self.field[0] / 2, w) - w / 2
         sill = 0.0 if self.rows == 1 else (h - self.height) / 2
         return u, np.mod(z, h) - sill
 
     def _inside(self, u, v):
-        """Signed distance to the outline, metres, positive inside the opening."""
+        """Signed distance to the outline, meters, positive inside the opening."""
         half, height = self.width / 2, self.height
         au = np.abs(u)
         if self.outline == "circle":

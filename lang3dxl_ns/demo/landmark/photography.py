@@ -72,7 +72,7 @@ class Shot:
     elements: UInt8[Array, "h w"]
     """Index into labels.ELEMENTS."""
     depth: Float[Array, "h w"]
-    """Metres along the camera's axis at the pixel's centre; infinite in the sky."""
+    """Meters along the camera's axis at the pixel's center; infinite in the sky."""
     materials: UInt8[Array, "h w"]
     """Index into MATERIALS."""
 
@@ -103,20 +103,20 @@ def plain_view(camera: Camera) -> View:
 def take_photo(landmark: Landmark, view: View, width: int, height: int, oversampling: int = 1) -> Shot:
     """The photo and its labels, at the given size in pixels.
 
-    Colours are means of oversampling² rays per pixel; labels and depth are those of the pixel's central ray.
+    Colors are means of oversampling² rays per pixel; labels and depth are those of the pixel's central ray.
     """
     shapes = landmark.shapes + _with_own_materials(view.passers_by, len(landmark.materials))
     materials = landmark.materials + view.passers_by_materials
     reach = max(landmark.radius, landmark.height / 2) * 1.15
-    shadows = ShadowMap.of(shapes, view.weather, landmark.centre, reach)
+    shadows = ShadowMap.of(shapes, view.weather, landmark.center, reach)
     truth = fine = trace(shapes, view.camera, view.weather, width, height)
     n = oversampling
     if n > 1:
         fine = trace(shapes, view.camera, view.weather, width * n, height * n)
-    colour = light(fine, materials, view.camera, view.weather, shadows)
+    color = light(fine, materials, view.camera, view.weather, shadows)
     kinds = np.array([MATERIALS.index(material.name) for material in materials], dtype=np.uint8)
     return Shot(
-        image=_develop(colour.reshape(height, n, width, n, 3).mean(axis=(1, 3)), view.lens),
+        image=_develop(color.reshape(height, n, width, n, 3).mean(axis=(1, 3)), view.lens),
         parts=truth.spread(truth.part),
         elements=truth.spread(truth.element),
         depth=np.where(truth.depth < MISS, truth.depth, np.float32(np.inf)),
@@ -135,7 +135,7 @@ def random_photo_size(rng: np.random.Generator, width: int, height: int) -> tupl
 _CALM_WEATHER = Weather(
     sun_azimuth=0.7,
     sun_elevation=0.85,
-    sun_colour=(1.0, 0.94, 0.84),
+    sun_color=(1.0, 0.94, 0.84),
     sky_light=(0.44, 0.48, 0.56),
     horizon=(0.74, 0.80, 0.88),
     zenith=(0.25, 0.42, 0.72),
@@ -176,7 +176,7 @@ def _propose_camera(landmark: Landmark, rng: np.random.Generator, wild: bool) ->
         distance = max(distance, landmark.radius * 1.2)
     if distance - 0.6 * landmark.radius < NARROWEST * landmark.radius * focal:  # about its walls' distance
         return None
-    x, y, _ = landmark.centre
+    x, y, _ = landmark.center
     position = np.array([x + math.cos(azimuth) * distance, y + math.sin(azimuth) * distance, eye])
     if not landmark.is_free(position, 2.0):
         return None
@@ -210,9 +210,9 @@ def _spot_in_front(landmark: Landmark, camera: Camera, rng: np.random.Generator)
 
 
 def _random_weather(rng: np.random.Generator) -> Weather:
-    def varied(colour, spread=0.12):
+    def varied(color, spread=0.12):
         r, g, b = (
-            np.array(colour) * rng.uniform(1 - spread, 1 + spread) * rng.uniform(0.97, 1.03, 3)
+            np.array(color) * rng.uniform(1 - spread, 1 + spread) * rng.uniform(0.97, 1.03, 3)
         ).tolist()
         return r, g, b
 
@@ -236,7 +236,7 @@ def _random_weather(rng: np.random.Generator) -> Weather:
     return Weather(
         sun_azimuth=rng.uniform(-1.9, 1.9),
         sun_elevation=elevation,
-        sun_colour=sun,
+        sun_color=sun,
         sky_light=light,
         horizon=horizon,
         zenith=zenith,
@@ -265,9 +265,9 @@ def _with_own_materials(shapes: tuple[Shape, ...], first: int) -> tuple[Shape, .
 _TONE = np.linspace(0, 1, 4096, dtype=np.float32)
 
 
-def _develop(colour: Float[Array, "h w 3"], lens: Lens) -> UInt8[Array, "h w 3"]:
+def _develop(color: Float[Array, "h w 3"], lens: Lens) -> UInt8[Array, "h w 3"]:
     """Exposure, white balance, film-like shoulder, gamma and noise."""
-    linear = colour * (lens.exposure * floats(lens.white_balance))
+    linear = color * (lens.exposure * floats(lens.white_balance))
     shoulder = np.minimum(_TONE * 2.0, 1.6)
     curve = (shoulder * (1 + shoulder / 2.56) / (1 + shoulder)) ** (1 / 2.1 * lens.gamma)
     image = curve[np.clip(linear * (4095 / 2.0), 0, 4095).astype(np.int32)]

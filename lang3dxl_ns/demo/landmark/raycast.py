@@ -15,9 +15,9 @@ from lang3dxl_ns.demo.landmark.shapes import MISS, NEAREST, Shape, Vector
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera with its principal point at the photo's centre.
+    """A pinhole camera with its principal point at the photo's center.
 
-    World in metres, z up; camera frame x right, y down, z forward (COLMAP's).
+    World in meters, z up; camera frame x right, y down, z forward (COLMAP's).
     """
 
     position: Float[Array, "3"]
@@ -46,7 +46,7 @@ class Camera:
             return np.stack([f * x / z + width / 2, f * y / z + height / 2, z], axis=1)
 
     def rays(self, width: int, height: int) -> tuple[Vector, Vector]:
-        """Origin and directions through the pixel centres; one unit along a ray is one metre of depth."""
+        """Origin and directions through the pixel centers; one unit along a ray is one meter of depth."""
         f = self.focal * max(width, height)
         right, down, forward = self.rotation.astype(np.float32)
         x = ((np.arange(width, dtype=np.float32) + 0.5 - width / 2) / f)[None, :]
@@ -66,15 +66,15 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class SunCamera:
-    """Parallel rays from the sun onto a square of `extent` metres around `centre`."""
+    """Parallel rays from the sun onto a square of `extent` meters around `center`."""
 
-    centre: Float[Array, "3"]
+    center: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
     extent: float
 
     def project(self, points: Float[Array, "n 3"], width: int, height: int) -> Float[Array, "n 3"]:
-        """Shadow map coordinates and distance from the sun's plane in metres."""
-        x, y, z = self.rotation.astype(np.float32) @ (points - self.centre).astype(np.float32).T
+        """Shadow map coordinates and distance from the sun's plane in meters."""
+        x, y, z = self.rotation.astype(np.float32) @ (points - self.center).astype(np.float32).T
         f = width / self.extent
         return np.stack([f * x + width / 2, f * y + height / 2, z + 2 * self.extent], axis=1)
 
@@ -82,7 +82,7 @@ class SunCamera:
         right, down, forward = self.rotation.astype(np.float32)
         x = ((np.arange(width, dtype=np.float32) + 0.5 - width / 2) * (self.extent / width))[None, :]
         y = ((np.arange(height, dtype=np.float32) + 0.5 - height / 2) * (self.extent / width))[:, None]
-        start = (self.centre - 2 * self.extent * self.rotation[2]).astype(np.float32)
+        start = (self.center - 2 * self.extent * self.rotation[2]).astype(np.float32)
         origin = tuple(right[i] * x + down[i] * y + start[i] for i in range(3))
         return (origin[0], origin[1], origin[2]), (forward[0], forward[1], forward[2])
 
@@ -95,7 +95,7 @@ class SunCamera:
 def cast(
     shapes: Sequence[Shape], camera: Camera | SunCamera, width: int, height: int
 ) -> tuple[Float[Array, "h w"], Int16[Array, "h w"]]:
-    """Depth (metres, MISS without a hit) and index of the nearest shape (-1 without a hit)."""
+    """Depth (meters, MISS without a hit) and index of the nearest shape (-1 without a hit)."""
     origin, direction = camera.rays(width, height)
     depth = np.full((height, width), MISS, dtype=np.float32)
     index = np.full((height, width), -1, dtype=np.int16)

@@ -167,10 +167,10 @@ def _take(order: _Order) -> TakenPhoto:
     np.save(order.folder / "depth" / f"{order.name}.npy", shot.depth.astype(np.float16))
     if (order.number - 1) % TRUTH_EVERY == 0:
         _write_truth(shot, save_photo, order)
-    points, colours = sample_points(
+    points, colors = sample_points(
         shot, view.camera, order.points, np.random.default_rng([order.seed, 4, order.number])
     )
-    return TakenPhoto(order.number, width, height, view.camera, points, colours)
+    return TakenPhoto(order.number, width, height, view.camera, points, colors)
 
 
 def _take_test_view(landmark: Landmark, camera: Camera, order: _Order) -> TakenPhoto:
@@ -229,7 +229,7 @@ def _write_description(folder: Path, landmark: Landmark, scene: DemoScene, simil
         "ground_truth_photos": {category: len(numbers) for category, numbers in truth.items() if numbers},
         "test_views": scene.test_views,
         "held_out": [f"{i + 1:04d}.jpg" for i in range(0, scene.photos, HELD_OUT_EVERY)],
-        "colmap_from_metres": {
+        "colmap_from_meters": {
             "scale": similarity.scale,
             "rotation": similarity.rotation.tolist(),
             "translation": similarity.translation.tolist(),

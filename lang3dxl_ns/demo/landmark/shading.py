@@ -19,12 +19,12 @@ SHADOW_MAP = 256
 
 @dataclass(frozen=True)
 class Weather:
-    """Sun, sky and air at one moment; colours are linear."""
+    """Sun, sky and air at one moment; colors are linear."""
 
     sun_azimuth: float
     """Radians; 0 is in front of the façade."""
     sun_elevation: float
-    sun_colour: tuple[float, float, float]
+    sun_color: tuple[float, float, float]
     sky_light: tuple[float, float, float]
     """Light from the whole sky on an upward-facing surface."""
     horizon: tuple[float, float, float]
@@ -33,7 +33,7 @@ class Weather:
     """0 clear … 1 overcast."""
     cloud_seed: int
     haze: float
-    """Distance in metres at which 63 % of the colour is haze."""
+    """Distance in meters at which 63 % of the color is haze."""
 
     @property
     def to_sun(self) -> Float[Array, "3"]:
@@ -52,16 +52,16 @@ class ShadowMap:
 
     @classmethod
     def of(
-        cls, shapes: Sequence[Shape], weather: Weather, centre: Float[Array, "3"], radius: float
+        cls, shapes: Sequence[Shape], weather: Weather, center: Float[Array, "3"], radius: float
     ) -> ShadowMap:
-        """Shadows within `radius` metres of the centre, and a little beyond."""
-        rotation = Camera.looking_at(centre + weather.to_sun, centre, 1.0).rotation
-        sun = SunCamera(centre, rotation, 2.6 * radius)
+        """Shadows within `radius` meters of the center, and a little beyond."""
+        rotation = Camera.looking_at(center + weather.to_sun, center, 1.0).rotation
+        sun = SunCamera(center, rotation, 2.6 * radius)
         casting = [shape for shape in shapes if shape.casts_shadow]
         return cls(sun, cast(casting, sun, SHADOW_MAP, SHADOW_MAP)[0])
 
     def sunlit(self, at: Float[Array, "n 3"], normal: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Share of sunlight that reaches points: the mean of four neighbours in the map, 1 outside it."""
+        """Share of sunlight that reaches points: the mean of four neighbors in the map, 1 outside it."""
         n, texel = SHADOW_MAP, self.sun.extent / SHADOW_MAP
         lit = np.ones(len(at), np.float32)
         x, y, z = self.sun.project(at + normal * texel, n, n).T
@@ -84,7 +84,7 @@ class Traced:
     """
 
     depth: Float[Array, "h w"]
-    """Metres along the camera's axis; MISS in the sky."""
+    """Meters along the camera's axis; MISS in the sky."""
     pixel: Int[Array, " n"]
     """Index into the flattened picture."""
     part: UInt8[Array, " n"]
@@ -103,7 +103,7 @@ class Traced:
 
 
 def trace(shapes: Sequence[Shape], camera: Camera, weather: Weather, width: int, height: int) -> Traced:
-    """Cast a ray through every pixel's centre. The sun decides which recesses are lit."""
+    """Cast a ray through every pixel's center. The sun decides which recesses are lit."""
     depth, index = cast(shapes, camera, width, height)
     order = np.argsort(index.ravel(), kind="stable")  # radix sort, for int16
     pixel = order[np.searchsorted(index.ravel()[order], 0) :]
@@ -143,12 +143,12 @@ def light(
     weather: Weather,
     shadows: ShadowMap,
 ) -> Float[Array, "h w 3"]:
-    """Linear colours of the hits."""
+    """Linear colors of the hits."""
     height, width = traced.depth.shape
     rays = _flat(camera, width, height)
-    colour = _sky(rays, weather)
-    colour[traced.pixel] = _lit(traced, materials, camera, weather, rays[traced.pixel], shadows)
-    return colour.reshape(height, width, 3)
+    color = _sky(rays, weather)
+    color[traced.pixel] = _lit(traced, materials, camera, weather, rays[traced.pixel], shadows)
+    return color.reshape(height, width, 3)
 
 
 def _flat(camera: Camera, width: int, height: int) -> Float[Array, "n 3"]:
@@ -166,11 +166,11 @@ def _lit(
     pixel_size = distance / (camera.focal * 640)  # texture detail as in a medium-sized photo
     footprint = pixel_size / np.maximum(facing, 0.15)
 
-    colour = np.empty((len(ray), 3), np.float32)
+    color = np.empty((len(ray), 3), np.float32)
     gloss = np.zeros(len(ray), np.float32)
     for i in np.unique(hits.material):
         own = np.flatnonzero(hits.material == i)
-        colour[own] = materials[i].reflectance(*hits.texture[:, own], footprint[own])
+        color[own] = materials[i].reflectance(*hits.texture[:, own], footprint[own])
         gloss[own] = materials[i].gloss
 
     to_sun = weather.to_sun
@@ -179,39 +179,39 @@ def _lit(
     sunlight[sunny] *= shadows.sunlit(at[sunny], hits.normal[sunny])
     up, height = hits.normal[:, 2], at[:, 2]
     skylight = (0.62 + 0.38 * up + 0.12 * hits.normal[:, 1]) * (1 - 0.25 * np.exp(-np.maximum(height, 0) / 2))
-    light = sunlight[:, None] * floats(weather.sun_colour) + skylight[:, None] * floats(weather.sky_light)
-    colour *= light * hits.shade[:, None]
+    light = sunlight[:, None] * floats(weather.sun_color) + skylight[:, None] * floats(weather.sky_light)
+    color *= light * hits.shade[:, None]
     shiny = np.flatnonzero(gloss)
     if len(shiny):
-        colour[shiny] += _glint(
+        color[shiny] += _glint(
             ray[shiny] / length[shiny, None],
             hits.normal[shiny],
             gloss[shiny],
-            colour[shiny],
+            color[shiny],
             sunlight[shiny],
             weather,
         )
     clear = np.exp(-distance * length / weather.haze)[:, None]
-    return colour * clear + floats(weather.horizon) * (1 - clear)
+    return color * clear + floats(weather.horizon) * (1 - clear)
 
 
-def _glint(view, normal, gloss, colour, sunlight, weather: Weather):
+def _glint(view, normal, gloss, color, sunlight, weather: Weather):
     """Highlight of the sun and reflection of the sky on glossy materials."""
     facing = (view * normal).sum(axis=1, keepdims=True)
     mirror = view - 2 * facing * normal
     highlight = np.clip(mirror @ weather.to_sun, 0, 1) ** 24 * (sunlight > 0)
     grazing = (1 - np.clip(-facing[:, 0], 0, 1)) ** 3
     sky = floats(weather.zenith) * (np.clip(mirror[:, 2], 0, 1) * (0.1 + 0.5 * grazing))[:, None]
-    own = colour * (1.2 * np.clip(mirror[:, 2], 0, 1))[:, None]  # metals reflect in their own colour
+    own = color * (1.2 * np.clip(mirror[:, 2], 0, 1))[:, None]  # metals reflect in their own color
     return gloss[:, None] * (
-        0.6 * highlight[:, None] * floats(weather.sun_colour) * (0.3 + colour) + 0.5 * sky + own * 0.4
+        0.6 * highlight[:, None] * floats(weather.sun_color) * (0.3 + color) + 0.5 * sky + own * 0.4
     )
 
 
 def _sky(rays, weather: Weather) -> Float[Array, "n 3"]:
     up = rays[:, 2] / np.sqrt((rays * rays).sum(axis=1))
     share = np.sqrt(np.clip(up, 0, 1))[:, None]
-    colour = floats(weather.horizon) * (1 - share) + floats(weather.zenith) * share
+    color = floats(weather.horizon) * (1 - share) + floats(weather.zenith) * share
     above = np.flatnonzero(up > 0.02)
     if weather.clouds > 0 and len(above):
         # Clouds lie on a plane overhead, so they shrink towards the horizon.
@@ -222,5 +222,5 @@ def _sky(rays, weather: Weather) -> Float[Array, "n 3"]:
         noise = fractal_noise(x * 1.5, y * 1.5, weather.cloud_seed, 5)
         cover = np.clip((noise - 0.75 + 0.45 * weather.clouds) * 4, 0, 1)[:, None]
         bright = floats(weather.horizon).max() * (1.05 - 0.25 * cover * weather.clouds)
-        colour[above] = colour[above] * (1 - cover) + bright * cover
-    return colour
+        color[above] = color[above] * (1 - cover) + bright * cover
+    return color

@@ -1,6 +1,6 @@
 """Ray-cast solids: boxes, convex polytopes, frusta and ellipsoids.
 
-Metres, z up. A vector is a tuple (x, y, z) of arrays that broadcast: the rays of a pinhole camera share an
+Meters, z up. A vector is a tuple (x, y, z) of arrays that broadcast: the rays of a pinhole camera share an
 origin, those of the sun a direction. A shape's `position` is its foot; `yaw` turns it about z.
 """
 
@@ -18,7 +18,7 @@ Vector = tuple[Any, Any, Any]
 """Three float32 arrays of one shape, or floats."""
 
 NEAREST = 0.05
-"""Metres: hits nearer than this along the ray are ignored."""
+"""Meters: hits nearer than this along the ray are ignored."""
 MISS = np.float32(1e9)
 
 
@@ -28,9 +28,9 @@ class Surface:
 
     normal: Vector
     s: np.ndarray
-    """Texture coordinate along the surface, horizontal; metres."""
+    """Texture coordinate along the surface, horizontal; meters."""
     t: np.ndarray
-    """Texture coordinate up the surface; metres."""
+    """Texture coordinate up the surface; meters."""
     shade: Any = 1.0
     """Factor on all light, for dim corners."""
     sunlit: Any = 1.0
@@ -96,7 +96,7 @@ class Shape(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Box(Shape):
-    """A box of `size` (x, y, z), positioned at the centre of its base."""
+    """A box of `size` (x, y, z), positioned at the center of its base."""
 
     size: tuple[float, float, float]
 
@@ -211,7 +211,7 @@ class Frustum(Shape):
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid(Shape):
-    """An ellipsoid centred on its position, open: without the part below z = `cut` and above z = `end`."""
+    """An ellipsoid centered on its position, open: without the part below z = `cut` and above z = `end`."""
 
     radii: tuple[float, float, float]
     cut: float

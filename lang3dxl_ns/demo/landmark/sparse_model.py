@@ -37,8 +37,8 @@ class TakenPhoto:
     height: int
     camera: Camera
     points: Float[Array, "n 3"]
-    """Candidate points, metres."""
-    colours: UInt8[Array, "n 3"]
+    """Candidate points, meters."""
+    colors: UInt8[Array, "n 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,8 @@ class Similarity:
     def camera_from_world(self, camera: Camera) -> Float[Array, "3 4"]:
         """The camera's pose in COLMAP's world."""
         rotation = camera.rotation @ self.rotation.T
-        centre = self.apply(camera.position[None])[0]
-        return np.column_stack([rotation, -rotation @ centre])
+        center = self.apply(camera.position[None])[0]
+        return np.column_stack([rotation, -rotation @ center])
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +72,8 @@ class Tracks:
     """Points with their keypoints, one row per observation."""
 
     points: Float[Array, "n 3"]
-    """Metres, the landmark's world."""
-    colours: UInt8[Array, "n 3"]
+    """Meters, the landmark's world."""
+    colors: UInt8[Array, "n 3"]
     point: Int[Array, " m"]
     photo: Int[Array, " m"]
     """Index into the photos."""
@@ -81,15 +81,15 @@ class Tracks:
 
 
 def sample_points(shot: Shot, camera: Camera, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """World points [n, 3] and colours [n, 3] at random pixels of permanent surfaces, at most `count`.
+    """World points [n, 3] and colors [n, 3] at random pixels of permanent surfaces, at most `count`.
 
     More where the picture has contrast, fewer on the ground. Pixels at silhouettes are excluded: their
     keypoints would slide along the edge.
     """
     height, width = shot.parts.shape
     lasting = ~np.isin(shot.parts, [PART["sky"], PART["person"], PART["car"]]) & _smooth(shot.depth)
-    grey = shot.image.astype(np.float32).mean(axis=2)
-    contrast = np.hypot(*np.gradient(grey))
+    gray = shot.image.astype(np.float32).mean(axis=2)
+    contrast = np.hypot(*np.gradient(gray))
     weight = lasting * (1 + contrast) * np.where(shot.parts == PART["ground"], 0.3, 1.0)
     total = weight.sum()
     if total == 0:
@@ -108,7 +108,7 @@ def sample_points(shot: Shot, camera: Camera, count: int, rng: np.random.Generat
 def find_tracks(photos: Sequence[TakenPhoto], depths: Sequence[Path], rng: np.random.Generator) -> Tracks:
     """Match every candidate in every photo that sees it; `depths` are the photos' depth maps (.npy)."""
     points = np.concatenate([photo.points for photo in photos])
-    colours = np.concatenate([photo.colours for photo in photos])
+    colors = np.concatenate([photo.colors for photo in photos])
     origin = np.repeat(np.arange(len(photos)), [len(photo.points) for photo in photos])
     rows = []
     for i, (photo, path) in enumerate(zip(photos, depths, strict=True)):
@@ -123,17 +123,17 @@ def find_tracks(photos: Sequence[TakenPhoto], depths: Sequence[Path], rng: np.ra
     long = np.bincount(point, minlength=len(points)) >= SHORTEST_TRACK
     kept = long[point]
     renumbered = np.cumsum(long) - 1
-    tracks = Tracks(points[long], colours[long], renumbered[point[kept]], photo_index[kept], pixel[kept])
+    tracks = Tracks(points[long], colors[long], renumbered[point[kept]], photo_index[kept], pixel[kept])
     return _with_mistakes(tracks, photos, rng)
 
 
 def _smooth(depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
-    """Where depth changes little to all four neighbours; false at the border."""
+    """Where depth changes little to all four neighbors; false at the border."""
     smooth = np.zeros(depth.shape, bool)
     finite = np.where(np.isfinite(depth), depth, 1e6)
     middle = finite[1:-1, 1:-1]
-    neighbours = finite[:-2, 1:-1], finite[2:, 1:-1], finite[1:-1, :-2], finite[1:-1, 2:]
-    smooth[1:-1, 1:-1] = np.all([np.abs(n - middle) < 0.02 * middle for n in neighbours], axis=0)
+    neighbors = finite[:-2, 1:-1], finite[2:, 1:-1], finite[1:-1, :-2], finite[1:-1, 2:]
+    smooth[1:-1, 1:-1] = np.all([np.abs(n - middle) < 0.02 * middle for n in neighbors], axis=0)
     return smooth
 
 
@@ -175,7 +175,7 @@ def _with_mistakes(tracks: Tracks, photos: Sequence[TakenPhoto], rng: np.random.
             pixel[second] = x, y
         else:  # no photo agrees: the point keeps its true position
             points[i] = tracks.points[i]
-    return Tracks(points, tracks.colours, point[keep], photo[keep], pixel[keep])
+    return Tracks(points, tracks.colors, point[keep], photo[keep], pixel[keep])
 
 
 def write_model(
@@ -214,13 +214,13 @@ def write_model(
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
         for keypoint, point in enumerate(tracks.point[own].tolist()):
             elements[point].append((photo.number, keypoint))
-    for xyz, colour, observations in zip(
-        similarity.apply(tracks.points), tracks.colours, elements, strict=True
+    for xyz, color, observations in zip(
+        similarity.apply(tracks.points), tracks.colors, elements, strict=True
     ):
         track = pycolmap.Track()
         for number, keypoint in observations:
             track.add_element(number, keypoint)
-        model.add_point3D(xyz, track, colour)
+        model.add_point3D(xyz, track, color)
     model.update_point_3d_errors()
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)

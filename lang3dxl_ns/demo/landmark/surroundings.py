@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 
 from lang3dxl_ns.demo.landmark.labels import PART
-from lang3dxl_ns.demo.landmark.materials import MASONRY, coloured, make_material
+from lang3dxl_ns.demo.landmark.materials import MASONRY, colored, make_material
 from lang3dxl_ns.demo.landmark.openings import Openings
 from lang3dxl_ns.demo.landmark.vocabulary import Builder, Point, ShapeList, ahead
 
 
-def place_surroundings(b: Builder, centre, radius: float):
+def place_surroundings(b: Builder, center, radius: float):
     """Add the ground and a ring of trees, houses and lamps to the builder's shapes."""
     rng = b.rng
     for role in ("grass", "gravel", "paving", "foliage", "bark", "iron"):
@@ -21,7 +21,7 @@ def place_surroundings(b: Builder, centre, radius: float):
     b.role["darker foliage"] = b.add_material(make_material("foliage", rng, tint=0.2))
     lawn = str(rng.choice(["grass", "gravel", "paving"]))
     b.box("ground", lawn, (0, 0, -1.0), (3000, 3000, 1))
-    x, y = float(centre[0]), float(centre[1])
+    x, y = float(center[0]), float(center[1])
     if b.chance(0.7):
         forecourt = str(rng.choice(["paving", "gravel"]))
         b.box("ground", forecourt, (x + radius * 0.5, y, 0), (radius * 2.6, radius * 1.7, 0.02))
@@ -125,7 +125,7 @@ def _lamp(b: Builder, foot: Point):
 def _person(b: ShapeList, foot: Point):
     rng = b.rng
     for role in ("coat", "trousers"):
-        b.role[role] = b.add_material(coloured("cloth", rng))
+        b.role[role] = b.add_material(colored("cloth", rng))
     b.role["skin"] = b.add_material(make_material("skin", rng, tint=0.15))
     x, y, z = foot
     size, yaw = b.between(0.88, 1.08), b.between(0, 2 * math.pi)
@@ -142,7 +142,7 @@ def _person(b: ShapeList, foot: Point):
 
 def _car(b: ShapeList, foot: Point):
     rng = b.rng
-    b.role["body"] = b.add_material(coloured("paint", rng))
+    b.role["body"] = b.add_material(colored("paint", rng))
     for role in ("glass", "iron"):
         b.role[role] = b.add_material(make_material(role, rng))
     yaw, length = b.between(0, math.pi), b.between(3.8, 4.8)

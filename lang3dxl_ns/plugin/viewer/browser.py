@@ -21,7 +21,7 @@ from PIL import Image
 
 from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.plugin.viewer.fly_to import overview
-from lang3dxl_ns.plugin.viewer.splats import in_light, sent, splats, with_heat
+from lang3dxl_ns.plugin.viewer.splats import in_light, sent, splats, with_heat, withdrawn
 from lang3dxl_ns.plugin.viewer.worker import Worker
 from lang3dxl_ns.scene.camera import Camera
 
@@ -120,11 +120,11 @@ class BrowserViewer:
             if relevancy is not None:
                 colors = with_heat(colors, relevancy, conversation.display, conversation.highest())
         what = splats(gaussians, colors, self._scale)
-        # Two names in turn: a page ignores what comes for one that it shows; viser keeps the latest of each.
-        self._turn = 1 - self._turn
+        # A new name each time: a page ignores what comes for one that it shows, or still showed a moment ago.
+        self._turn += 1
         before, self._node = self._node, sent(self.viser_server.scene, f"{NODE}_{self._turn}", what)
         if before is not None:
-            before.remove()
+            withdrawn(self.viser_server, before)
         seconds = time.perf_counter() - start
         if self._model.semantic_field is not None:
             self._panel._status.content = (

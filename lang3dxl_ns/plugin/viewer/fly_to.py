@@ -21,7 +21,7 @@ class Stand:
     position: np.ndarray
     """[3]."""
     look_at: np.ndarray
-    """[3], orbit centre."""
+    """[3], orbit center."""
     fov: float
     """Vertical field of view, radians."""
 
@@ -29,7 +29,7 @@ class Stand:
 def stand_of(camera: Camera, aspect: float, target: tuple[float, ...] | None = None) -> Stand:
     """A photo's viewpoint in a window of this aspect ratio (width ÷ height), with all of the photo in view.
 
-    target: orbit centre, moved onto the photo's axis at its distance; None: a unit away.
+    target: orbit center, moved onto the photo's axis at its distance; None: a unit away.
     """
     view = camera.view_matrix.double().cpu().numpy()
     forward, position = view[2, :3], -view[:3, :3].T @ view[:3, 3]
@@ -42,7 +42,7 @@ def stand_of(camera: Camera, aspect: float, target: tuple[float, ...] | None = N
 
 
 def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePhoto:
-    """The farthest photo that sees the scene's centre near its own; otherwise the first."""
+    """The farthest photo that sees the scene's center near its own; otherwise the first."""
     best, farthest = photos[0], 0.0
     for photo in photos:
         camera, lens = photo.camera, photo.lens
@@ -56,7 +56,7 @@ def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePh
 def flight(start: Stand, end: Stand, steps: int) -> Iterator[Stand]:
     """Path from one stand to another, slow at both ends; the last is `end`.
 
-    Around the orbit centre instead of through it: turn, height and distance change evenly.
+    Around the orbit center instead of through it: turn, height and distance change evenly.
     """
     here, there = _around(start), _around(end)
     there[0] = here[0] + math.remainder(there[0] - here[0], math.tau)  # the shorter way round
@@ -73,7 +73,7 @@ def flight(start: Stand, end: Stand, steps: int) -> Iterator[Stand]:
 
 def _around(stand: Stand) -> np.ndarray:
     """Direction (turn about the vertical, elevation; radians) and distance of the camera from its orbit
-    centre."""
+    center."""
     x, y, z = stand.position - stand.look_at
     return np.array([math.atan2(y, x), math.atan2(z, math.hypot(x, y)), math.sqrt(x * x + y * y + z * z)])
 

@@ -154,7 +154,7 @@ def _refuse(why: str) -> Response:
 
 
 def is_camera(message: _messages.ViewerCameraMessage) -> bool:
-    """Whether one can render from this camera: a minimised window has no aspect ratio, for example."""
+    """Whether one can render from this camera: a minimized window has no aspect ratio, for example."""
     vectors = (message.wxyz, message.position, message.look_at, message.up_direction)
     return (
         [len(vector) for vector in vectors] == [4, 3, 3, 3]

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 
 STEPS = {"Previous": -1, "Next": 1}
-COLOUR_MAPS = ("turbo", "viridis", "magma", "plasma", "inferno", "cividis")
+COLOR_MAPS = ("turbo", "viridis", "magma", "plasma", "inferno", "cividis")
 PER_VIEW, PER_SCENE = "to this view", "to the whole scene"
 OWN_LOOK = "of the nearest photo"
 INVITATION = 'Type what to look for: `rose window`, several as `dome; towers`, or `"windows" not "doors"`.'
@@ -123,12 +123,12 @@ class AskPanel(ViewerControl):
         with gui.add_folder("How it is shown"):
             self._threshold = gui.add_slider("Threshold", 0.0, 1.0, 0.01, 0.5, hint="Relevancy that matches")
             self._opacity = gui.add_slider("Opacity", 0.0, 1.0, 0.05, 0.7, hint="Of the heat map")
-            self._colour_map = gui.add_dropdown("Colours", COLOUR_MAPS)
+            self._color_map = gui.add_dropdown("Colors", COLOR_MAPS)
             self._stretch = gui.add_dropdown("Stretch", (PER_VIEW, PER_SCENE), hint="To highest relevancy")
             self._boxes = gui.add_checkbox("3D box", True, hint="Around each prompt's strongest match")
             light = "Render with the look of a photo"
             self._look = gui.add_dropdown("Light", looks, visible=len(looks) > 1, hint=light)
-        shown: tuple[Any, ...] = (self._opacity, self._colour_map, self._stretch, self._look)
+        shown: tuple[Any, ...] = (self._opacity, self._color_map, self._stretch, self._look)
         for setting in shown:
             setting.on_update(lambda _: self._take_settings())
         self._threshold.on_update(lambda _: self._take_settings(find=True))
@@ -240,7 +240,7 @@ class AskPanel(ViewerControl):
             c.display,
             threshold=self._threshold.value,
             opacity=self._opacity.value,
-            colour_map=self._colour_map.value,
+            color_map=self._color_map.value,
         )
         c.per_scene = self._stretch.value == PER_SCENE
         look = self._look.value
@@ -340,7 +340,7 @@ class AskPanel(ViewerControl):
         self._tour = tour
         viewpoint = tour.best() if step == 0 else tour.move(step)
         self._place.content = plain(str(tour))
-        target = None if tour.found.box is None else tour.found.box.centre
+        target = None if tour.found.box is None else tour.found.box.center
         for one in [client] if client is not None else self.viser_server.get_clients().values():
             self._fly_camera(one, viewpoint.camera, target)
 

@@ -80,7 +80,7 @@ class Conversation:
     ) -> None:
         self.display = Display()
         self.per_scene = False
-        """Stretch the colour map to the highest relevancy in the scene instead of in each view."""
+        """Stretch the color map to the highest relevancy in the scene instead of in each view."""
         self.question = Question()
         self.found: list[Found] | None = None
         """None: not searched yet."""

@@ -81,7 +81,7 @@ def in_light(
     gaussians = Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1)).detach()
     pose = camera.view_matrix.to(model.device)
     position, forward = -pose[:3, :3].T @ pose[:3, 3], pose[2, :3]
-    colors = model._colours(g, position)
+    colors = model._colors(g, position)
     if model.appearance is None:
         return gaussians, colors
     field = model.appearance
@@ -100,7 +100,7 @@ def with_heat(
     """Colors with the heat map mixed into matching Gaussians, as `overlay` does for pixels."""
     d = display
     picture = colors.clamp(0, 1)[None], relevancy[None]
-    return overlay(*picture, d.threshold, d.opacity, d.colour_map, highest)[0]
+    return overlay(*picture, d.threshold, d.opacity, d.color_map, highest)[0]
 
 
 def sent(scene: viser.SceneApi, name: str, what: Splats) -> viser.GaussianSplatHandle:
@@ -112,3 +112,17 @@ def sent(scene: viser.SceneApi, name: str, what: Splats) -> viser.GaussianSplatH
         rgbs=what.colors,
         opacities=what.opacities,
     )
+
+
+def withdrawn(server: viser.ViserServer, node: viser.GaussianSplatHandle) -> None:
+    """Remove drawn Gaussians from all pages, and from what the server keeps for new ones.
+
+    viser 0.2.7 alone keeps every removed node's message in memory.
+    """
+    buffer = server._websock_server._broadcast_buffer
+    with buffer.buffer_lock:
+        for number, message in list(buffer.message_from_id.items()):
+            if getattr(message, "name", None) == node.name:
+                del buffer.message_from_id[number], buffer.id_from_redundancy_key[message.redundancy_key()]
+    node.remove()  # pages that show it are told
+    server.scene._handle_from_node_name.pop(node.name, None)

@@ -17,7 +17,7 @@ def test_a_stand_is_where_the_photo_was_taken():
     stand = stand_of(camera, aspect=1.0, target=(0.0, 0.0, 0.0))
     view = camera.view_matrix.numpy()
     np.testing.assert_allclose(view[:3, :3] @ stand.position + view[:3, 3], 0, atol=1e-6)
-    # The painted wall is 5 in front: there, on the photo's axis, is the orbit's centre.
+    # The painted wall is 5 in front: there, on the photo's axis, is the orbit's center.
     np.testing.assert_allclose(view[:3, :3] @ stand.look_at + view[:3, 3], [0, 0, 5], atol=1e-6)
 
 

@@ -117,7 +117,7 @@ def settled(page, unlike: np.ndarray | None = None, seconds: float = 240) -> np.
 
 
 def heat(pixels: np.ndarray) -> float:
-    """Share of pixels as saturated as the heat map's colours."""
+    """Share of pixels as saturated as the heat map's colors."""
     return float((np.ptp(pixels, axis=2) > 100).mean())
 
 

@@ -1,4 +1,4 @@
-"""Catalogue of all numerics cases; to add a component, add a file of cases and a line here."""
+"""Catalog of all numerics cases; to add a component, add a file of cases and a line here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Long and stiff optimisations of the semantic field alone, for drift, growth and breakdown over time."""
+"""Long and stiff optimizations of the semantic field alone, for drift, growth and breakdown over time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DRIFT = 1.05
 
 @dataclass
 class Run:
-    """An optimisation, in tenths of its steps."""
+    """An optimization, in tenths of its steps."""
 
     name: str
     steps: int
@@ -50,17 +50,17 @@ class Run:
 
 
 def runs(quick: bool) -> list[Run]:
-    """Runs the catalogue of optimisations (on the CPU: the steps are too small for a GPU)."""
+    """Runs the catalog of optimizations (on the CPU: the steps are too small for a GPU)."""
     long = 1_000 if quick else 100_000
     steps = 200 if quick else 1_000
     return [
-        optimise("usual rates, no decay", long, 1e-3, 5e-4, 5e-4),
-        optimise("rates 1e6 apart, codes fast", steps, 10.0, 1e-3, 1e-5, converges=False),
-        optimise("rates 1e6 apart, decoder fast", steps, 1e-5, 1e-3, 10.0, converges=False),
+        optimize("usual rates, no decay", long, 1e-3, 5e-4, 5e-4),
+        optimize("rates 1e6 apart, codes fast", steps, 10.0, 1e-3, 1e-5, converges=False),
+        optimize("rates 1e6 apart, decoder fast", steps, 1e-5, 1e-3, 10.0, converges=False),
     ]
 
 
-def optimise(
+def optimize(
     name: str, steps: int, code_rate: float, grid_rate: float, decoder_rate: float, converges: bool = True
 ) -> Run:
     """Adam as in training (epsilon 1e-15) at constant rates, on pixels of a few kinds of things."""
