@@ -4,13 +4,13 @@ import json
 
 import pytest
 import torch
-from lang3dxl_ns.numerics.optimization import Run, runs
 
 from lang3dxl_ns import cli
 from lang3dxl_ns.numerics import catalog, command
 from lang3dxl_ns.numerics.catalog import GROUPS
 from lang3dxl_ns.numerics.command import measure_all
 from lang3dxl_ns.numerics.measure import Bounds, Case, Problem, measure
+from lang3dxl_ns.numerics.optimization import Run, runs
 
 BOUNDS = {"float32": Bounds(), "bf16": Bounds(1e-2, 1e-2, 1e-2, 1e-2)}
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-import viser
 import viser.transforms as tf
 from conftest import make_trainer
 from nerfstudio.configs.base_config import ViewerConfig
