@@ -119,10 +119,10 @@ def withdrawn(server: viser.ViserServer, node: viser.GaussianSplatHandle) -> Non
 
     viser 0.2.7 alone keeps every removed node's message in memory.
     """
-    buffer = server._websock_server._broadcast_buffer
+    name, buffer = node._impl.name, server._websock_server._broadcast_buffer
     with buffer.buffer_lock:
         for number, message in list(buffer.message_from_id.items()):
-            if getattr(message, "name", None) == node.name:
+            if getattr(message, "name", None) == name:
                 del buffer.message_from_id[number], buffer.id_from_redundancy_key[message.redundancy_key()]
     node.remove()  # pages that show it are told
-    server.scene._handle_from_node_name.pop(node.name, None)
+    server.scene._handle_from_node_name.pop(name, None)
