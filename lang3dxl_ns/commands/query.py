@@ -18,6 +18,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.common.reports import progress_bar
+from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.heat_maps import overlay
 from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import Match, QueryConfig, Scene
@@ -76,6 +77,8 @@ class Query:
             found = best["matches"][i]
             where = f"at pixel {found['peak'][0]}, {found['peak'][1]} of {best['view']}"
             print(f"{prompt.text}: {found['score']:.2f} {where}; {folders[i]}")
+            if advice := doubtful(prompt.text, matches[i].doubt):
+                print(f"  {advice}")
 
     def _places(self, scene: Scene) -> Iterator[tuple[str, Camera | str]]:
         """File name (no suffix) of every requested view, and its camera or photo."""
@@ -126,6 +129,7 @@ def _text_report(match: Match, folder: Path) -> dict:
         "text": match.prompt.text,
         "negatives": list(match.prompt.negatives),
         "synonyms": match.synonyms,
+        "doubt": match.doubt,
         "folder": folder.name,
     }
 

@@ -99,7 +99,7 @@ class Lang3DXLPipeline(VanillaPipeline):
     datamanager: Lang3DXLDataManager
     model: Lang3DXLModel
     _engine: QueryEngine | None = None
-    """Split of the current evaluation."""
+    """Of the current evaluation."""
     last_losses: dict[str, Tensor]
     """The weighted losses of the latest training step."""
 

@@ -27,7 +27,6 @@ class Queries:
     """Several prompts as vectors: each has synonyms, any of which may fit, and phrases to compete with.
 
     Vectors shared by several prompts are stored once.
-    Vectors are kept once, however many prompts share them.
     """
 
     vectors: Float[Tensor, "v c"]

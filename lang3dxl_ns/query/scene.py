@@ -17,6 +17,7 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.query.cache import fingerprint
+from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.places import Box, strongest_match
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
@@ -89,6 +90,9 @@ class Match:
     prompt: Prompt
     synonyms: list[str]
     """Synonyms searched along with the prompt."""
+    doubt: float
+    """Share of unrelated words that fit the scene as well: above 0.1 the scene hardly shows the prompt, or
+    CLIP doesn't know it."""
     view: View
     relevancy: Float[Tensor, "h w"]
     """0…1; above 0.5 where the prompt beats all its competitors, 0 where nothing is rendered."""
@@ -126,6 +130,8 @@ class Found:
     """Best first; empty if nothing matches."""
     box: Box | None
     """Around the strongest connected match; None if nothing matches."""
+    doubt: float
+    """As in `Match`."""
 
 
 class Scene:
@@ -163,6 +169,8 @@ class Scene:
         self.file = file
         self.text = TextEncoder(encode_texts, self.config.text)
         self._state, self._cache_dir = state, cache_dir
+        self._doubt_alone: dict[str, float] = {}
+        """Of texts without their synonyms."""
 
     @property
     def device(self) -> torch.device:
@@ -198,6 +206,7 @@ class Scene:
     def match(self, prompts: Sequence[Prompt], place: Camera | str | Float[Tensor, "rows 4"]) -> list[Match]:
         """Matches of parsed prompts in a view."""
         queries, within = self._queries(prompts)
+        doubts = self.doubts.of(queries)[: len(prompts)]
         start = time.perf_counter()
         carried = self.engine.carried(queries)
         seconds = time.perf_counter() - start
@@ -218,7 +227,8 @@ class Scene:
         return [
             Match(
                 prompt,
-                self.text.synonyms(prompt.text),
+                self._synonyms(prompt),
+                doubt,
                 view,
                 relevancy,
                 relevancy > self.config.threshold,
@@ -226,12 +236,26 @@ class Scene:
                 score,
                 seconds,
             )
-            for prompt, relevancy, score, place in zip(prompts, maps, scores, places, strict=True)
+            for prompt, doubt, relevancy, score, place in zip(
+                prompts, doubts, maps, scores, places, strict=True
+            )
         ]
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
-        """Vectors of prompts on the scene's device."""
-        return self.text.queries(prompts).to(self.device)
+        """Vectors of prompts on the scene's device. A text that the scene doubts has its synonyms beside it:
+        where CLIP knows the word itself, they would only blur it."""
+        known = {prompt.text for prompt in prompts if not self._synonyms(prompt)}
+        return self.text.queries(prompts, known).to(self.device)
+
+    def _synonyms(self, prompt: Prompt) -> list[str]:
+        """Synonyms searched along with a prompt."""
+        synonyms = self.text.synonyms(prompt.text)
+        if not synonyms or self.config.text.combine != "fallback":
+            return synonyms
+        if prompt.text not in self._doubt_alone:
+            alone = self.text.plain_queries([prompt.text]).to(self.device)
+            self._doubt_alone[prompt.text] = self.doubts.of(alone)[0]
+        return synonyms if self._doubt_alone[prompt.text] > DOUBTFUL else []
 
     def _queries(self, prompts: Sequence[Prompt]) -> tuple[Queries, int]:
         """Vectors of the prompts, then of the foreground prompts, and the number of the latter."""
@@ -248,8 +272,8 @@ class Scene:
     def find(self, text: str | Sequence[str | Prompt], most: int = 10) -> list[Found]:
         """Matches of each prompt in the scene: the training views that show it best, and a box."""
         prompts = self.prompts(text)
-        scores = self._of_gaussians(prompts)
-        return [self._found(prompt, score, most) for prompt, score in zip(prompts, scores, strict=True)]
+        scores, doubts = self._of_gaussians(prompts), self.doubts.of(self.queries(prompts))
+        return [self._found(*one, most) for one in zip(prompts, scores, doubts, strict=True)]
 
     def _of_gaussians(self, prompts: Sequence[Prompt]) -> Float[Tensor, "q n"]:
         queries, within = self._queries(prompts)
@@ -259,7 +283,7 @@ class Scene:
             scores = scores * (confining.amax(0) > 0.5)
         return scores
 
-    def _found(self, prompt: Prompt, scores: Float[Tensor, " n"], most: int) -> Found:
+    def _found(self, prompt: Prompt, scores: Float[Tensor, " n"], doubt: float, most: int) -> Found:
         excess = (scores - self.config.threshold).clamp_min(0)
         matching = (excess > 0).float()
         viewpoints = []
@@ -275,7 +299,7 @@ class Scene:
         box = None
         if viewpoints and len(rows):
             box = strongest_match(self.gaussians["means"][rows], weight[rows], self._gap)
-        return Found(prompt, viewpoints[:most], box)
+        return Found(prompt, viewpoints[:most], box, doubt)
 
     # ── computed once per checkpoint ────────────────────────────────────────────────────────────────
 
@@ -283,6 +307,11 @@ class Scene:
     def engine(self) -> QueryEngine:
         """The query engine; decodes features of all Gaussians at first use."""
         return self._make_engine()
+
+    @cached_property
+    def doubts(self) -> Doubts:
+        """Tells what the scene doesn't show."""
+        return Doubts(self.engine.of_gaussians, lambda texts: self.text.plain_queries(texts).to(self.device))
 
     @cached_property
     def visible(self) -> dict[str, VisibleGaussians]:

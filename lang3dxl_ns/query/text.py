@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -74,9 +74,10 @@ class TextConfig:
     """Source of common words for specialist ones: off; the shipped table of architectural terms; or a chat
     model behind an OpenAI-compatible endpoint, set by the environment
     (LANG3DXL_CHAT_URL, LANG3DXL_CHAT_KEY, LANG3DXL_CHAT_MODEL), with the table as fallback."""
-    combine: Literal["joined", "mean", "max"] = "joined"
-    """How a prompt and its synonyms are combined: as one string with commas (the paper's way), as the mean of
-    their vectors, or separately, with the best at each pixel."""
+    combine: Literal["fallback", "joined", "mean", "max"] = "fallback"
+    """How a prompt and its synonyms are combined: the prompt alone unless the scene doubts it, then the best
+    of all at each place (fallback); as one string with commas (joined, the paper's way); as the mean of their
+    vectors; or always the best at each place (max)."""
     negatives: tuple[str, ...] = NEGATIVES
     """A prompt matches where it fits better than all of these: phrases that fit anything, and other contents
     of building photos. Phrases named by a prompt or its synonyms don't compete with it."""
@@ -139,10 +140,13 @@ class TextEncoder:
             self._synonyms[text] = [word for word in found if word.lower() != text.lower()]
         return self._synonyms[text]
 
-    def queries(self, prompts: Sequence[Prompt]) -> Queries:
-        """Vectors of prompts, with synonyms combined as configured, and of their competitors."""
+    def queries(self, prompts: Sequence[Prompt], known: Collection[str] = ()) -> Queries:
+        """Vectors of prompts, with synonyms combined as configured, and of their competitors.
+
+        known: texts that are taken without synonyms.
+        """
         return Queries.of(
-            [self._positive(prompt.text) for prompt in prompts],
+            [self._positive(p.text, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
             self.vectors(self.config.negatives),
             [self.vectors(prompt.negatives) for prompt in prompts],
             [self._against(prompt.text) for prompt in prompts],
@@ -159,8 +163,8 @@ class TextEncoder:
     def _against(self, text: str) -> list[int]:
         return competitors(self.config.negatives, [text, *self.synonyms(text)])
 
-    def _positive(self, text: str) -> Float[Tensor, "s c"]:
-        words = [*self.synonyms(text), text]
+    def _positive(self, text: str, synonyms: list[str]) -> Float[Tensor, "s c"]:
+        words = [*synonyms, text]
         if self.config.combine == "joined":
             return self.vectors([", ".join(words)])
         vectors = self.vectors(words)

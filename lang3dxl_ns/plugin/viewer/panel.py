@@ -221,7 +221,7 @@ class AskPanel(ViewerControl):
         if found is not self.conversation.found:
             return  # there is a newer question
         self._show_results(found)
-        self._say(self.conversation.advice() or self._summary(found))
+        self._say("  \n".join(filter(None, (self._summary(found), self.conversation.advice()))))
         self._rerender()
 
     def _summary(self, found: list[Found]) -> str:

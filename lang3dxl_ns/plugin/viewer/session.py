@@ -17,6 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.plugin.load_scene import scene_of_model, text_encoder
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.query.answer import NOTHING, Asked, Display
+from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile
@@ -237,13 +238,13 @@ class Conversation:
 
     def advice(self) -> str | None:
         """Advice about the answer, if something is odd about it."""
-        if self.found is None or any(found.viewpoints for found in self.found):
-            return None
-        words = " or ".join(plain(shortened(found.prompt.text)) for found in self.found)
-        return (
-            f"Nothing in the scene looks like {words} by the threshold of {self.display.threshold:.2f}. "
-            f"Lower it, or try other words: the CLIP of this run may not know these."
-        )
+        found = self.found or []
+        lines = [plain(line) for f in found if (line := doubtful(shortened(f.prompt.text), f.doubt))]
+        if found and not any(f.viewpoints for f in found) and not lines:
+            words = " or ".join(plain(shortened(f.prompt.text)) for f in found)
+            threshold = f"{self.display.threshold:.2f}"
+            return f"Nothing in the scene looks like {words} by the threshold of {threshold}: lower it."
+        return "  \n".join(lines) or None
 
     def status(self) -> str:
         """Times, in one line."""

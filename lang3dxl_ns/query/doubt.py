@@ -1,0 +1,79 @@
+"""Doubt about a prompt: how many words for things that are surely absent fit the scene as well.
+
+A relevancy above 0.5 somewhere proves little: among many Gaussians a few fit any text, nonsense too. So the
+scene is also asked for unrelated things, and a prompt is ranked among them by its best Gaussians. Nothing
+here depends on the encoder or the scene (conformal p-values: Vovk, Gammerman & Shafer 2005).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+from jaxtyping import Float
+from torch import Tensor
+
+from lang3dxl_ns.query.relevancy import Queries
+
+UNRELATED = (
+    "submarine", "piano", "giraffe", "laptop", "pizza", "toothbrush", "violin", "spaceship", "penguin",
+    "teapot", "microscope", "banana", "surfboard", "kangaroo", "refrigerator", "necktie", "volcano",
+    "octopus", "skateboard", "chessboard", "trumpet", "igloo", "sandwich", "elephant", "headphones",
+    "parachute", "walrus", "syringe", "typewriter", "cactus", "dolphin", "pillow", "keyboard", "hamburger",
+    "snowman", "bathtub", "accordion", "helicopter", "sushi", "zebra", "toaster", "jellyfish", "hammock",
+    "stapler", "lobster", "tractor", "camel", "telescope", "balloon", "suitcase", "guitar", "panda",
+    "scissors", "washing machine", "iceberg", "crocodile", "bowling ball", "wedding cake", "tent", "robot",
+)  # fmt: skip
+"""Things that photos of a building hardly show."""
+DOUBTFUL = 0.1
+"""A prompt with more doubt than this is reported as doubtful: so are nine in ten absent things."""
+_BEST = 0.005
+"""Share of the Gaussians that a prompt's fit is read from."""
+
+
+class Doubts:
+    """Doubt about prompts in one scene.
+
+    Args:
+        relevancy: of every Gaussian to queries, 0 where unknown: `QueryEngine.of_gaussians`.
+        queries: of texts as they are, without synonyms: `TextEncoder.plain_queries`.
+    """
+
+    def __init__(
+        self,
+        relevancy: Callable[[Queries], Float[Tensor, "q n"]],
+        queries: Callable[[Sequence[str]], Queries],
+    ) -> None:
+        self._relevancy, self._queries = relevancy, queries
+
+    def of(self, queries: Queries) -> list[float]:
+        """For each prompt the share of texts, itself among them, that fit the scene at least as well as it
+        does: (1 + #{u ≥ prompt}) / (1 + 60). At most x with a probability of x for an absent thing."""
+        unrelated = self._unrelated
+        return [
+            (1 + int((unrelated >= peak).sum())) / (1 + len(unrelated))
+            for peak in peaks(self._relevancy(queries))
+        ]
+
+    @cached_property
+    def _unrelated(self) -> Float[Tensor, " u"]:
+        return peaks(self._relevancy(self._queries(UNRELATED)))
+
+
+def peaks(relevancy: Float[Tensor, "q n"]) -> Float[Tensor, " q"]:
+    """How well each prompt fits where it fits best: the mean relevancy of the best 0.5 % of the Gaussians.
+    0 without Gaussians."""
+    if relevancy.shape[1] == 0:
+        return relevancy.new_zeros(len(relevancy))
+    return relevancy.topk(math.ceil(_BEST * relevancy.shape[1]), dim=1).values.mean(1)
+
+
+def doubtful(text: str, doubt: float) -> str | None:
+    """A sentence about a doubtful prompt; None for the others."""
+    if doubt <= DOUBTFUL:
+        return None
+    return (
+        f"doubtful: {doubt:.0%} of unrelated words fit this scene as well as {text!r}: it may not be here, or "
+        f"the run's CLIP may not know the word"
+    )

@@ -1,0 +1,68 @@
+"""Doubt about prompts: calibrated for absent things, and synonyms only where the text itself is doubted."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from lang3dxl_ns.query.doubt import DOUBTFUL, UNRELATED, Doubts, doubtful, peaks
+from lang3dxl_ns.query.relevancy import Queries
+
+CHANNELS, GAUSSIANS = 16, 1_000
+
+
+def scene_of(features: torch.Tensor, words: dict[str, torch.Tensor]) -> Doubts:
+    """Doubts of a scene with these features; unrelated words point anywhere."""
+    generator = torch.Generator().manual_seed(1)
+    negatives = torch.randn(4, CHANNELS, generator=generator)
+    vectors = {text: torch.randn(CHANNELS, generator=generator) for text in UNRELATED} | words
+
+    def queries(texts):
+        return Queries.of([vectors[text][None] for text in texts], negatives)
+
+    doubts = Doubts(lambda q: q.relevancy_of_cosines(q.cosines(features)), queries)
+    doubts.ask = lambda *texts: doubts.of(queries(texts))  # type: ignore[attr-defined]
+    return doubts
+
+
+def random(count: int, seed: int) -> torch.Tensor:
+    return torch.randn(count, CHANNELS, generator=torch.Generator().manual_seed(seed))
+
+
+def test_a_thing_on_one_gaussian_in_a_hundred_is_not_doubted():
+    thing = random(1, 7)[0]
+    features = F.normalize(random(1, 5) + 0.1 * random(GAUSSIANS, 6), dim=1)
+    features[::100] = F.normalize(thing, dim=0)
+    (doubt,) = scene_of(features, {"thing": thing}).ask("thing")
+    assert doubt == pytest.approx(1 / (1 + len(UNRELATED))) and doubtful("thing", doubt) is None
+
+
+def test_absent_things_are_below_x_no_more_often_than_x():
+    """The law of a p-value, for words drawn as the unrelated ones are."""
+    absent = {str(i): vector for i, vector in enumerate(random(2_000, 9))}
+    features = F.normalize(random(3, 5)[torch.arange(GAUSSIANS) % 3] + 0.2 * random(GAUSSIANS, 6), dim=1)
+    found = torch.tensor(scene_of(features, absent).ask(*absent))
+    for x in (0.05, DOUBTFUL, 0.5):
+        assert (found <= x).double().mean() < x + 0.12  # one scene, 60 words: 2 deviations of the 60
+    assert (found > DOUBTFUL).double().mean() > 0.75
+
+
+def test_the_best_gaussians_decide_whatever_their_order():
+    relevancy = torch.linspace(0, 1, 1_000)[None]
+    best = relevancy[0, -5:].mean()
+    torch.testing.assert_close(peaks(relevancy), best[None])
+    torch.testing.assert_close(peaks(relevancy[:, torch.randperm(1_000)]), best[None])
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_hardly_any_gaussians_are_no_trouble(count):
+    (doubt,) = scene_of(random(count, 3), {"thing": torch.ones(CHANNELS)}).ask("thing")
+    assert 0 < doubt <= 1
+
+
+def test_a_scene_without_known_gaussians_doubts_everything():
+    assert scene_of(torch.zeros(GAUSSIANS, CHANNELS), {"thing": torch.ones(CHANNELS)}).ask("thing") == [1.0]
+
+
+def test_doubt_is_said_with_the_text_and_the_share():
+    said = doubtful("blorptag", 0.84)
+    assert said is not None and "84%" in said and "'blorptag'" in said
