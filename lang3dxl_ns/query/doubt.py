@@ -74,6 +74,6 @@ def doubtful(text: str, doubt: float) -> str | None:
     if doubt <= DOUBTFUL:
         return None
     return (
-        f"doubtful: {doubt:.0%} of unrelated words fit this scene as well as {text!r}: it may not be here, or "
-        f"the run's CLIP may not know the word"
+        f"doubtful: {doubt:.0%} of unrelated words fit this scene as well as {text!r}: it may not be here, "
+        f"or the run's CLIP may not know the word"
     )
