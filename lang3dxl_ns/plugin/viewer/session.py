@@ -240,10 +240,12 @@ class Conversation:
         """Advice about the answer, if something is odd about it."""
         found = self.found or []
         lines = [plain(line) for f in found if (line := doubtful(shortened(f.prompt.text), f.doubt))]
-        if found and not any(f.viewpoints for f in found) and not lines:
+        if found and not any(f.viewpoints for f in found):
             words = " or ".join(plain(shortened(f.prompt.text)) for f in found)
-            threshold = f"{self.display.threshold:.2f}"
-            return f"Nothing in the scene looks like {words} by the threshold of {threshold}: lower it."
+            lines.append(
+                f"Nothing in the scene looks like {words} by the threshold of {self.display.threshold:.2f}. "
+                f"Lower it, or try other words."
+            )
         return "  \n".join(lines) or None
 
     def status(self) -> str:
