@@ -106,7 +106,7 @@ def _time_parts(trainer: Any) -> None:
         def __init__(self, loss):
             self.loss = loss
 
-        def backward(self):
+        def backward(self) -> None:
             with part("backward"):
                 self.loss.backward()
 

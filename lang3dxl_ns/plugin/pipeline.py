@@ -347,7 +347,7 @@ class Lang3DXLPipeline(VanillaPipeline):
             learn_from_photos(self.model, gathering, lambda: bar.advance(learning))
         self.model.train(training)
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None):  # type: ignore[override]
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""
         state = {key.removeprefix("_model."): v for key, v in state_dict.items() if key.startswith("_model.")}
         try:

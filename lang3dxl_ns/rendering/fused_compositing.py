@@ -123,7 +123,7 @@ def _cut(work: np.ndarray, parts: int) -> list[tuple[int, int]]:
 @kernel
 def _collect(
     order, conics, opacities, attached, sums, position, conic, opacity, absolutes, channels, detached
-):
+) -> None:
     """Gradients per Gaussian, from the sums of all parts."""
     row = np.empty(sums.shape[2], sums.dtype)
     for rank in range(len(order)):

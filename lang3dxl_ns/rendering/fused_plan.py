@@ -115,7 +115,7 @@ def _find_visible(means2d, variances, opacities, width, height, boxes, visible):
 
 
 @kernel
-def _pack(order, means2d, conics, variances, opacities, channels, detached, attached, splats, table):
+def _pack(order, means2d, conics, variances, opacities, channels, detached, attached, splats, table) -> None:
     """Gather the compositing data of each Gaussian, contiguous and in depth order."""
     for rank in range(len(order)):
         g = order[rank]
@@ -134,7 +134,7 @@ def _pack(order, means2d, conics, variances, opacities, channels, detached, atta
 
 
 @kernel
-def _count_rows(order, boxes, columns, first, last, sizes):
+def _count_rows(order, boxes, columns, first, last, sizes) -> None:
     """For rows of tiles, add each tile's number of Gaussians to the entry after its own."""
     for g in order:
         for y in range(max(boxes[g, 2], first), min(boxes[g, 3] + 1, last)):
@@ -143,7 +143,7 @@ def _count_rows(order, boxes, columns, first, last, sizes):
 
 
 @kernel
-def _fill_rows(order, boxes, columns, first, last, starts, ranks):
+def _fill_rows(order, boxes, columns, first, last, starts, ranks) -> None:
     place = starts[first * columns : last * columns].copy()
     for rank in range(len(order)):
         g = order[rank]

@@ -28,7 +28,7 @@ SIDES = ((LEFT, 1), (RIGHT, -1))
 """Facing of the long sides, and the sign of y there."""
 
 
-def cathedral(b: Builder):
+def cathedral(b: Builder) -> None:
     """A nave with aisles, optional transept and apse, and no, one or two towers."""
     width, length, height = b.between(10, 14), b.between(30, 46), b.between(14, 22)
     ridge = width * b.between(0.5, 0.95)
@@ -58,7 +58,7 @@ def cathedral(b: Builder):
     _west_front(b, width, height, aisle, tower_width, tower_height)
 
 
-def _aisles(b: Builder, width, length, height, aisle, aisle_height, bays):
+def _aisles(b: Builder, width, length, height, aisle, aisle_height, bays) -> None:
     buttresses, pinnacles = b.chance(0.7), b.chance(0.6)
     for facing, side in SIDES:
         y = side * (width / 2 + aisle / 2)
@@ -93,7 +93,7 @@ def _aisles(b: Builder, width, length, height, aisle, aisle_height, bays):
                 pinnacle(b, (x, y, aisle_height * 1.05), 0.55, 3.6)
 
 
-def _transept(b: Builder, width, length, height, ridge, aisle):
+def _transept(b: Builder, width, length, height, ridge, aisle) -> None:
     x, across, reach = -length * b.between(0.55, 0.7), width * 0.8, width + 2 * aisle + b.between(4, 9)
     b.box("wall", "wall", (x, 0, 0), (across, reach, height))
     b.gable("roof", "roof", (x, 0, height), across * 1.05, reach, ridge * 0.9)
@@ -116,7 +116,7 @@ def _transept(b: Builder, width, length, height, ridge, aisle):
         spire(b, (x, 0, height + ridge * 0.75), width * 0.14, height * 0.9)
 
 
-def _west_front(b: Builder, width, height, aisle, tower_width, tower_height):
+def _west_front(b: Builder, width, height, aisle, tower_width, tower_height) -> None:
     top = "spire" if b.chance(0.55) else str(b.rng.choice(["flat", "dome", "onion", "pyramid"]))
     arrangement = b.rng.random()
     twin = arrangement < 0.6
@@ -157,7 +157,7 @@ def _west_front(b: Builder, width, height, aisle, tower_width, tower_height):
             pinnacle(b, (-0.3, side * width * 0.47, height), 0.9, height * 0.35)
 
 
-def mosque(b: Builder):
+def mosque(b: Builder) -> None:
     """A domed prayer hall with one to six minarets, sometimes with a court in front."""
     width = b.between(20, 31)
     depth, height, radius = width * b.between(0.8, 1.1), b.between(9, 13), width * b.between(0.22, 0.31)
@@ -227,7 +227,7 @@ def _plain_front(b: Builder, width, depth, height, rows) -> float:
     return depth / 2
 
 
-def _minarets(b: Builder, width, depth, height, front, court):
+def _minarets(b: Builder, width, depth, height, front, court) -> None:
     count = int(b.rng.choice([1, 2, 2, 4, 4, 6]))
     tall, radius = height * b.between(2.6, 3.8), width * b.between(0.028, 0.044)
     aside = width / 2 + radius * 1.5
@@ -246,7 +246,7 @@ def _minarets(b: Builder, width, depth, height, front, court):
         minaret(b, place, radius, tall, balconies, octagonal, cap)
 
 
-def hall(b: Builder):
+def hall(b: Builder) -> None:
     """A synagogue-like hall: a large cube under one dome, or a house between two towers."""
     width, height = b.between(14, 20), b.between(11, 15)
     depth = width * b.between(0.9, 1.4)
@@ -266,7 +266,7 @@ def hall(b: Builder):
         chimney(b, (-depth * 0.3, b.rng.choice([-1, 1]) * width * 0.36, height), b.between(3, 7))
 
 
-def _great_dome(b: Builder, width, depth, height):
+def _great_dome(b: Builder, width, depth, height) -> None:
     radius = min(width, depth) * b.between(0.34, 0.44)
     dome(b, (0, 0, height), radius, radius * b.between(0.4, 0.7))
     corner, top = width * b.between(0.15, 0.2), str(b.rng.choice(["dome", "flat", "pyramid", "spire"]))
@@ -276,7 +276,7 @@ def _great_dome(b: Builder, width, depth, height):
             tower(b, place, corner, height * 1.25, top)
 
 
-def _two_towers(b: Builder, width, depth, height):
+def _two_towers(b: Builder, width, depth, height) -> None:
     across, tall = width * b.between(0.24, 0.32), height * b.between(1.4, 2.0)
     top = str(b.rng.choice(["onion", "onion", "dome", "flat", "spire"]))
     sides = int(b.rng.choice([4, 4, 8]))
@@ -291,7 +291,7 @@ def _two_towers(b: Builder, width, depth, height):
         )
 
 
-def _hall_front(b: Builder, width, depth, height):
+def _hall_front(b: Builder, width, depth, height) -> None:
     front = (depth / 2, 0.0, 0.0)
     tall = height * b.between(0.3, 0.38)
     portal(b, "wall", front, FRONT, width * b.between(0.14, 0.2), tall)

@@ -111,31 +111,33 @@ def _random_tables() -> tuple[np.ndarray, np.ndarray]:
 _WHITE, _SMOOTH = _random_tables()
 
 
-def _cell(i, j, seed: int):
+def _cell(i, j, seed: int) -> np.ndarray:
     """A random number in [0, 1) for every cell (i, j)."""
     row, column = (j.astype(np.int32) + 17 * seed) & 127, (i.astype(np.int32) + 31 * seed) & 127
     return _WHITE.take(row * 128 + column)  # faster than two indices
 
 
-def _noise(x, y, seed: int = 0):
+def _noise(x, y, seed: int = 0) -> np.ndarray:
     """Smooth noise in [0, 1] with features one unit in size."""
     row = ((y * 16).astype(np.int32) + 91 * seed) & 511
     column = ((x * 16).astype(np.int32) + 37 * seed) & 511
     return _SMOOTH.take(row * 512 + column)
 
 
-def fractal_noise(x, y, seed: int, octaves: int = 4):
+def fractal_noise(x, y, seed: int, octaves: int = 4) -> np.ndarray:
     """Sum of noise octaves of halving size and weight, in [0, 1]."""
     total = sum(_noise(x * 2**i, y * 2**i, seed + i) / 2**i for i in range(octaves))
     return total / (2 - 2 ** (1 - octaves))
 
 
-def _fade(size: float, footprint):
+def _fade(size: float, footprint) -> np.ndarray:
     """1 if a detail of this size is resolved, 0 if it is finer than two footprints."""
     return np.clip(size / (2 * footprint) - 0.5, 0, 1)
 
 
-def _courses(s, t, footprint, seed: int, width: float, height: float, joint: float, contrast: float):
+def _courses(
+    s, t, footprint, seed: int, width: float, height: float, joint: float, contrast: float
+) -> np.ndarray:
     """Masonry: courses of slightly different gray stones with dark joints."""
     row = np.floor(t / height)
     x = s / width + 0.5 * np.mod(row, 2)
@@ -145,55 +147,55 @@ def _courses(s, t, footprint, seed: int, width: float, height: float, joint: flo
     return (1 + contrast * (_cell(column, row, seed) - 0.5) * _fade(height, footprint)) * joints
 
 
-def _blocks(s, t, footprint, seed):
+def _blocks(s, t, footprint, seed) -> np.ndarray:
     grain = 1 + 0.16 * (_noise(s * 2.1, t * 2.1, seed) - 0.5) * _fade(0.5, footprint)
     return _courses(s, t, footprint, seed, 1.0, 0.48, 0.04, 0.36) * grain
 
 
-def _slabs(s, t, footprint, seed):
+def _slabs(s, t, footprint, seed) -> np.ndarray:
     veins = 1 + 0.25 * (fractal_noise(s * 0.5, t * 0.5, seed, 3) - 0.5)
     return _courses(s, t, footprint, seed, 1.5, 1.5, 0.04, 0.14) * veins
 
 
-def _bricks(s, t, footprint, seed):
+def _bricks(s, t, footprint, seed) -> np.ndarray:
     return _courses(s, t, footprint, seed, 0.4, 0.14, 0.025, 0.5) * (
         1 + 0.2 * (_noise(s * 0.4, t * 0.4, seed) - 0.5)
     )
 
 
-def _stains(s, t, footprint, seed):
+def _stains(s, t, footprint, seed) -> np.ndarray:
     return 1 + 0.3 * (fractal_noise(s * 0.3, t * 0.2, seed, 3) - 0.5)
 
 
-def _bands(s, t, footprint, seed):
+def _bands(s, t, footprint, seed) -> np.ndarray:
     course = np.where(np.mod(t / 0.9, 2) < 1, np.float32(1.15), np.float32(0.62))
     resolved = _fade(0.9, footprint)
     return (course * resolved + 0.88 * (1 - resolved)) * _courses(s, t, footprint, seed, 1.4, 0.9, 0.04, 0.15)
 
 
-def _tiles(s, t, footprint, seed):
+def _tiles(s, t, footprint, seed) -> np.ndarray:
     return _courses(s, t, footprint, seed, 0.45, 0.4, 0.07, 0.5)
 
 
-def _seams(s, t, footprint, seed):
+def _seams(s, t, footprint, seed) -> np.ndarray:
     seam = np.float32(0.4) * (np.mod(s, 1.1) < 0.13) * _fade(0.3, footprint)
     return 1 - seam + 0.25 * (_noise(s * 0.8, t * 0.3, seed) - 0.5)
 
 
-def _planks(s, t, footprint, seed):
+def _planks(s, t, footprint, seed) -> np.ndarray:
     joint = np.float32(0.4) * (np.mod(s, 0.35) < 0.05) * _fade(0.1, footprint)
     return (1 - joint) * (1 + 0.3 * (_cell(np.floor(s / 0.35), np.zeros_like(s), seed) - 0.5))
 
 
-def _panes(s, t, footprint, seed):
+def _panes(s, t, footprint, seed) -> np.ndarray:
     return 0.6 + 0.9 * _cell(np.floor(s / 0.4), np.floor(t / 0.4), seed) * _fade(0.4, footprint)
 
 
-def _leaves(s, t, footprint, seed):
+def _leaves(s, t, footprint, seed) -> np.ndarray:
     return 1 + 0.9 * (fractal_noise(s * 0.8, t * 0.8, seed, 4) - 0.5)
 
 
-def _plain(s, t, footprint, seed):
+def _plain(s, t, footprint, seed) -> np.ndarray:
     return 1 + 0.1 * (_noise(s, t, seed) - 0.5)
 
 

@@ -45,11 +45,11 @@ class Openings(Shape):
         return self.trim_material
 
     @property
-    def bounds(self):
+    def bounds(self) -> tuple[float, float, float, float, float, float]:
         w, h = self.field
         return -0.01, -w / 2, 0.0, 0.01, w / 2, h
 
-    def distance(self, origin, direction):
+    def distance(self, origin: Vector, direction: Vector) -> np.ndarray:
         t = -origin[0] / direction[0]
         y, z = origin[1] + t * direction[1], origin[2] + t * direction[2]
         w, h = self.field

@@ -101,11 +101,11 @@ class Box(Shape):
     size: tuple[float, float, float]
 
     @property
-    def bounds(self):
+    def bounds(self) -> tuple[float, float, float, float, float, float]:
         x, y, z = self.size
         return -x / 2, -y / 2, 0.0, x / 2, y / 2, z
 
-    def distance(self, origin, direction):
+    def distance(self, origin: Vector, direction: Vector) -> np.ndarray:
         bounds = self.bounds
         enter, leave = np.float32(NEAREST), MISS
         for axis in range(3):
@@ -114,7 +114,7 @@ class Box(Shape):
             enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
         return np.where((enter < leave) & (enter > NEAREST), enter, MISS)
 
-    def surface(self, point, direction, sun):
+    def surface(self, point: Vector, direction: Vector, sun: Vector) -> Surface:
         x, y, z = point
         sx, sy, sz = self.size
         # The face is the one whose plane is nearest.
@@ -137,11 +137,12 @@ class Polytope(Shape):
     box: tuple[float, float, float, float, float, float]
 
     @property
-    def bounds(self):
+    def bounds(self) -> tuple[float, float, float, float, float, float]:
         return self.box
 
-    def distance(self, origin, direction):
-        enter, leave = np.float32(NEAREST), MISS
+    def distance(self, origin: Vector, direction: Vector) -> np.ndarray:
+        enter: np.ndarray | np.float32 = np.float32(NEAREST)
+        leave: np.ndarray | np.float32 = MISS
         for (nx, ny, nz), offset in zip(self.normals.tolist(), self.offsets.tolist(), strict=True):
             slope = nx * direction[0] + ny * direction[1] + nz * direction[2]
             t = (offset - (nx * origin[0] + ny * origin[1] + nz * origin[2])) / slope
@@ -149,7 +150,7 @@ class Polytope(Shape):
             leave = np.where(slope < 0, leave, np.minimum(leave, t))
         return np.where((enter < leave) & (enter > NEAREST), enter, MISS)
 
-    def surface(self, point, direction, sun):
+    def surface(self, point: Vector, direction: Vector, sun: Vector) -> Surface:
         x, y, z = point
         planes = zip(self.normals.tolist(), self.offsets.tolist(), strict=True)
         gaps = np.stack([np.abs(nx * x + ny * y + nz * z - offset) for (nx, ny, nz), offset in planes])
@@ -169,11 +170,11 @@ class Frustum(Shape):
     height: float
 
     @property
-    def bounds(self):
+    def bounds(self) -> tuple[float, float, float, float, float, float]:
         r = max(self.bottom, self.top)
         return -r, -r, 0.0, r, r, self.height
 
-    def distance(self, origin, direction):
+    def distance(self, origin: Vector, direction: Vector) -> np.ndarray:
         (ox, oy, oz), (dx, dy, dz) = origin, direction
         slope = (self.top - self.bottom) / self.height
         radius, shrink = self.bottom + slope * oz, slope * dz
@@ -193,7 +194,7 @@ class Frustum(Shape):
                 best = np.where(hit, t, best)
         return best
 
-    def surface(self, point, direction, sun):
+    def surface(self, point: Vector, direction: Vector, sun: Vector) -> Surface:
         x, y, z = point
         slope = (self.top - self.bottom) / self.height
         side = np.abs(np.hypot(x, y) - (self.bottom + slope * z))
@@ -218,11 +219,11 @@ class Ellipsoid(Shape):
     end: float
 
     @property
-    def bounds(self):
+    def bounds(self) -> tuple[float, float, float, float, float, float]:
         x, y, z = self.radii
         return -x, -y, max(self.cut, -z), x, y, min(self.end, z)
 
-    def distance(self, origin, direction):
+    def distance(self, origin: Vector, direction: Vector) -> np.ndarray:
         (ox, oy, oz), (dx, dy, dz) = (
             tuple(v / r for v, r in zip(vector, self.radii, strict=True)) for vector in (origin, direction)
         )
@@ -235,7 +236,7 @@ class Ellipsoid(Shape):
             best = np.where((t > NEAREST) & (z >= self.cut) & (z <= self.end) & (t < best), t, best)
         return best
 
-    def surface(self, point, direction, sun):
+    def surface(self, point: Vector, direction: Vector, sun: Vector) -> Surface:
         x, y, z = (v / r for v, r in zip(point, self.radii, strict=True))
         normal = tuple(v / r for v, r in zip((x, y, z), self.radii, strict=True))
         length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)

@@ -13,7 +13,7 @@ from lang3dxl_ns.demo.landmark.openings import Openings
 from lang3dxl_ns.demo.landmark.vocabulary import Builder, Point, ShapeList, ahead
 
 
-def place_surroundings(b: Builder, center, radius: float):
+def place_surroundings(b: Builder, center, radius: float) -> None:
     """Add the ground and a ring of trees, houses and lamps to the builder's shapes."""
     rng = b.rng
     for role in ("grass", "gravel", "paving", "foliage", "bark", "iron"):
@@ -51,7 +51,7 @@ def passers_by(
     return crowd
 
 
-def _tree(b: Builder, foot: Point):
+def _tree(b: Builder, foot: Point) -> None:
     height, leaves = b.between(4, 11), "foliage" if b.chance(0.6) else "darker foliage"
     x, y, _ = foot
     b.cone("tree", "bark", foot, height * 0.035, height * 0.02, height * 0.6)
@@ -79,7 +79,7 @@ def _tree(b: Builder, foot: Point):
         b.ellipsoid("tree", leaves, blob, (r, r, r * b.between(0.8, 1.1)))
 
 
-def _house(b: Builder, foot: Point):
+def _house(b: Builder, foot: Point) -> None:
     width, depth, height = b.between(7, 12), b.between(8, 16), b.between(4, 9)
     yaw = b.between(0, math.pi)
     b.role["house"] = b.add_material(make_material(str(b.rng.choice(MASONRY)), b.rng))
@@ -115,14 +115,14 @@ def _house(b: Builder, foot: Point):
         )
 
 
-def _lamp(b: Builder, foot: Point):
+def _lamp(b: Builder, foot: Point) -> None:
     x, y, z = foot
     height = b.between(4, 7)
     b.cone("lamp", "iron", foot, 0.13, 0.07, height)
     b.ellipsoid("lamp", "trim", (x, y, z + height), (0.32, 0.32, 0.4))
 
 
-def _person(b: ShapeList, foot: Point):
+def _person(b: ShapeList, foot: Point) -> None:
     rng = b.rng
     for role in ("coat", "trousers"):
         b.role[role] = b.add_material(colored("cloth", rng))
@@ -140,7 +140,7 @@ def _person(b: ShapeList, foot: Point):
     b.ellipsoid("person", "skin", (x, y, z + 1.63 * size), (0.11 * size, 0.11 * size, 0.14 * size))
 
 
-def _car(b: ShapeList, foot: Point):
+def _car(b: ShapeList, foot: Point) -> None:
     rng = b.rng
     b.role["body"] = b.add_material(colored("paint", rng))
     for role in ("glass", "iron"):

@@ -42,23 +42,23 @@ class ShapeList:
 
     # Solids. `material` is a role, `foot` the centre of the base.
 
-    def box(self, part: str, material: str, foot: Point, size: Point, yaw: float = 0.0):
+    def box(self, part: str, material: str, foot: Point, size: Point, yaw: float = 0.0) -> None:
         self.shapes.append(Box(PART[part], self.role[material], foot, yaw, 0, size))
 
-    def cone(self, part: str, material: str, foot: Point, bottom: float, top: float, height: float):
+    def cone(self, part: str, material: str, foot: Point, bottom: float, top: float, height: float) -> None:
         self.shapes.append(Frustum(PART[part], self.role[material], foot, 0.0, 0, bottom, top, height))
 
-    def ellipsoid(self, part: str, material: str, centre: Point, radii: Point, cut=-1e3, end=1e3):
+    def ellipsoid(self, part: str, material: str, centre: Point, radii: Point, cut=-1e3, end=1e3) -> None:
         self.shapes.append(Ellipsoid(PART[part], self.role[material], centre, 0.0, 0, radii, cut, end))
 
     def gable(
         self, part: str, material: str, foot: Point, width: float, length: float, height: float, yaw=0.0
-    ):
+    ) -> None:
         """A gabled roof with its ridge along y (turned by yaw)."""
         fields = gable(width, length, height)
         self.shapes.append(Polytope(PART[part], self.role[material], foot, yaw, 0, **fields))
 
-    def prism(self, part, material, foot: Point, radius, height, sides: int, taper=0.0, yaw=0.0):
+    def prism(self, part, material, foot: Point, radius, height, sides: int, taper=0.0, yaw=0.0) -> None:
         fields = prism(radius, height, sides, taper)
         self.shapes.append(Polytope(PART[part], self.role[material], foot, yaw, 0, **fields))
 
@@ -70,7 +70,7 @@ class Builder(ShapeList):
     facade_height: float = 30.0
     """Metres; windows are 1/60 to 1/8 of it high."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         self._choose_materials()
         self.window_outline = self.pick("round", "pointed", "round", "rectangle", "segment")
         self.glazing = self.pick("mullion", "grid", "lattice", "tracery", "plain", "mullion")
@@ -81,7 +81,7 @@ class Builder(ShapeList):
         self.lantern = self.chance(0.5)
         self.round_spires = self.chance(0.4)
 
-    def _choose_materials(self):
+    def _choose_materials(self) -> None:
         """All parts draw from the same two palettes, so that colour doesn't reveal a category."""
         rng = self.rng
         masonry = [
@@ -119,7 +119,7 @@ def window_row(
     rows: int = 1,
     outline: str | None = None,
     filling: str | None = None,
-):
+) -> None:
     """Windows on a field of wall whose lower edge is centred at `foot`.
 
     Without `columns`, as many as fit well. Their height stays within 1/60 … 1/8 of the façade's.
@@ -151,14 +151,14 @@ def window_row(
     )
 
 
-def rose_window(b: Builder, part: str, foot: Point, facing: float, diameter: float):
+def rose_window(b: Builder, part: str, foot: Point, facing: float, diameter: float) -> None:
     diameter = min(diameter, b.facade_height / 8)
     size = (diameter, diameter)
     field_ = (diameter * 1.5, diameter * 1.3)
     _opening(b, part, "window", foot, facing, field_, 1, 1, size, "circle", "rose")
 
 
-def portal(b: Builder, part: str, foot: Point, facing: float, width: float, height: float):
+def portal(b: Builder, part: str, foot: Point, facing: float, width: float, height: float) -> None:
     """A door with a stepped reveal, sometimes under a gable or behind steps."""
     orders = int(b.rng.integers(1, 5))
     step = 0.26 * width / 2 / orders
@@ -189,7 +189,7 @@ def portal(b: Builder, part: str, foot: Point, facing: float, width: float, heig
         )
 
 
-def niche_row(b: Builder, foot: Point, facing: float, width: float, height: float, columns: int):
+def niche_row(b: Builder, foot: Point, facing: float, width: float, height: float, columns: int) -> None:
     """Blind arches: like windows, but walled up."""
     tall = min(0.86 * height, b.facade_height / 8)
     wide = min(tall * 0.5, 0.7 * width / columns)
@@ -198,7 +198,7 @@ def niche_row(b: Builder, foot: Point, facing: float, width: float, height: floa
 
 def _opening(
     b, part, element, foot, facing, field_, columns, rows, size, outline, filling, orders=1, step=None
-):
+) -> None:
     fillings = {"portal": "shadow" if filling == "open" else "door", "window": "glass", "none": "wall"}
     material = fillings[element] if filling != "louvre" else "shadow"
     depth = 0.35 + 0.3 * orders if element == "portal" else min(0.28 * size[0], 0.7)
@@ -227,7 +227,7 @@ def _opening(
 
 def dome(
     b: Builder, foot: Point, radius: float, drum: float, windows: bool = True, onion: bool | None = None
-):
+) -> None:
     """A dome on a drum of the given height, with windows around the drum."""
     x, y, z = foot
     if drum > 0:
@@ -274,7 +274,7 @@ def _onion(b: Builder, foot: Point, radius: float) -> float:
     return lower + join + height
 
 
-def spire(b: Builder, foot: Point, radius: float, height: float):
+def spire(b: Builder, foot: Point, radius: float, height: float) -> None:
     """A steep pointed roof, round or with four or eight sides, with a cross or ball on top."""
     if b.round_spires:
         b.cone("spire", "spire", foot, radius, 0.0, height)
@@ -288,7 +288,7 @@ def spire(b: Builder, foot: Point, radius: float, height: float):
         b.box("spire", "trim", (x, y, z + height + 0.3 * radius), (bar, 5 * bar, bar))
 
 
-def pinnacle(b: Builder, foot: Point, radius: float, height: float):
+def pinnacle(b: Builder, foot: Point, radius: float, height: float) -> None:
     """A small spire on a square shaft."""
     x, y, z = foot
     b.box("spire", "trim", foot, (radius * 1.7, radius * 1.7, height * 0.35))
@@ -303,7 +303,7 @@ def tower(
     top: str,
     sides: int = 4,
     bare: tuple[float, ...] = (),
-):
+) -> None:
     """A tower in storeys with belfry openings; top: spire, flat, pyramid, dome or onion.
 
     `bare`: facings whose lowest storey has no windows, for a portal.
@@ -344,7 +344,7 @@ def tower(
     _tower_top(b, (x, y, z + height), width, top)
 
 
-def _tower_top(b: Builder, foot: Point, width: float, top: str):
+def _tower_top(b: Builder, foot: Point, width: float, top: str) -> None:
     x, y, z = foot
     corners = [(sx * width * 0.44, sy * width * 0.44) for sx in (-1, 1) for sy in (-1, 1)]
     if top == "spire":
@@ -364,7 +364,7 @@ def _tower_top(b: Builder, foot: Point, width: float, top: str):
         dome(b, foot, width * 0.42, width * 0.14, windows=False, onion=top == "onion")
 
 
-def battlements(b: Builder, foot: Point, width: float, count: int = 5):
+def battlements(b: Builder, foot: Point, width: float, count: int = 5) -> None:
     x, y, z = foot
     merlon = width / (2 * count - 1)
     for i in range(count):
@@ -375,7 +375,9 @@ def battlements(b: Builder, foot: Point, width: float, count: int = 5):
             b.box("tower", "tower", (x + edge, y + along, z), (merlon * 0.6, merlon, merlon * 1.1))
 
 
-def minaret(b: Builder, foot: Point, radius: float, height: float, balconies: int, octagonal: bool, cap: str):
+def minaret(
+    b: Builder, foot: Point, radius: float, height: float, balconies: int, octagonal: bool, cap: str
+) -> None:
     """A slender shaft with balconies; cap: cone, dome or lantern."""
     x, y, z = foot
     base = height * 0.14
@@ -415,7 +417,7 @@ def minaret(b: Builder, foot: Point, radius: float, height: float, balconies: in
     b.cone("minaret", "trim", (x, y, top - 0.2 * radius), radius * 0.12, 0.02, radius * 1.6)
 
 
-def colonnade(b: Builder, start: Point, end: Point, count: int, height: float, radius: float):
+def colonnade(b: Builder, start: Point, end: Point, count: int, height: float, radius: float) -> None:
     """A row of equal columns between two points, with bases and capitals."""
     for i in range(count):
         share = i / (count - 1)
@@ -426,7 +428,7 @@ def colonnade(b: Builder, start: Point, end: Point, count: int, height: float, r
         b.box("column", "trim", (x, y, z), (radius * 2.8, radius * 2.8, radius * 0.8))
 
 
-def chimney(b: Builder, foot: Point, height: float):
+def chimney(b: Builder, foot: Point, height: float) -> None:
     """A smokestack: slender and round like a minaret."""
     radius = height * b.between(0.05, 0.08)
     x, y, z = foot
