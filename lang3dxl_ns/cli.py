@@ -24,6 +24,7 @@ BENCHMARKS = {
     "training": ("benchmarks.training:TrainingBenchmark", "A training step by its parts."),
     "scale": ("benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
     "real-photos": ("benchmarks.real_photos:RealPhotos", "Scenes of real photos, trained and scored."),
+    "queries": ("benchmarks.queries:QueryBenchmark", "From a new text to its picture."),
     "viewer": ("benchmarks.viewer:ViewerBenchmark", "Viewers in a browser: frames, first picture."),
     "ablation": (
         "benchmarks.ablation:Ablation",
