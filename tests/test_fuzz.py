@@ -7,7 +7,6 @@ import os
 import shutil
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import pytest
 import torch
@@ -295,8 +294,8 @@ def test_requests(page, path, headers, host):
         refusal = Guard(host, 7007, page).refusal(path, received)
         assert host == "127.0.0.1" or (refusal is not None and refusal[0] == 403)
         if refusal is None and these.get("Upgrade", "").lower() != "websocket":
-            served = page / (urlsplit(path).path.lstrip("/") or "index.html")
-            assert served.read_text() == "page"
+            served = Guard(host, 7007, page).file(path)
+            assert served is not None and (page / served[1:]).read_text() == "page"
 
 
 @fuzz

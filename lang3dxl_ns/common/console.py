@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
+from lang3dxl_ns.common.errors import printable
+
 QUIET_S = 5.0
 """Seconds before a progress bar appears; shorter work shows none."""
 
@@ -32,13 +34,13 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 def say(*lines: str) -> None:
-    """Print lines verbatim: no rich markup, no wrapping."""
+    """Print lines verbatim: no rich markup, no wrapping, no control characters."""
     from rich import get_console
 
     for line in lines:
-        get_console().print(line, markup=False, highlight=False, soft_wrap=True)
+        get_console().print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
 
 def some(names: Sequence[str], shown: int = 10) -> str:
     """The first few names, for a message."""
-    return ", ".join(names[:shown]) + (", …" if len(names) > shown else "")
+    return printable(", ".join(names[:shown])) + (", …" if len(names) > shown else "")

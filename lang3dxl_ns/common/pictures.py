@@ -22,6 +22,8 @@ class NoPictureError(Exception):
 def open_picture(path: Path) -> Iterator[Image.Image]:
     """The picture in a file, closed afterwards. Raises OSError for the disk, and NoPictureError for a
     damaged file or another format, even if the block is the first to read the pixels."""
+    if path.exists() and not path.is_file():
+        raise NoPictureError("not a file")  # reading a pipe would never end
     Image.init()  # otherwise Pillow knows only the most common
     try:
         with Image.open(path, formats=[form for form in FORMATS if form in Image.OPEN]) as image:

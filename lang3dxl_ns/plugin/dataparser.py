@@ -15,7 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from lang3dxl_ns.common.console import some
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, printable
 from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
@@ -46,7 +46,7 @@ class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
     follow_links: bool = False
     """Whether photos and masks may be symbolic links that leave their folder."""
     downscale_factor: int | None = 1
-    """Keep 1: photos are resized on reading (--pipeline.datamanager.camera-res-scale-factor)."""
+    """Always 1: photos are resized on reading (--pipeline.datamanager.camera-res-scale-factor)."""
 
 
 @dataclass
@@ -64,6 +64,11 @@ class PhotoCollectionDataParser(ColmapDataParser):
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         data = self.config.data = Path(self.config.data).expanduser().absolute()
+        if self.config.downscale_factor != 1:  # nerfstudio would hand the photos' names to a shell
+            raise UserError(
+                f"--downscale-factor is {self.config.downscale_factor}: leave it at 1, resize photos with "
+                "--pipeline.datamanager.camera-res-scale-factor"
+            )
         if not data.is_dir():
             raise UserError(
                 f"{data} is not a folder: pass the folder that holds images/ and sparse/0 as --data"
@@ -212,7 +217,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         if left_out:
             CONSOLE.log(f"[yellow]{len(left_out)} photos of the model are left out:[/yellow]")
             for name, why in left_out.items():
-                CONSOLE.log(f"  {escape(f'{name}: {why}')}")
+                CONSOLE.log(f"  {escape(printable(f'{name}: {why}'))}")
         kept = {name: g for name, g in reconstruction.photos.items() if name not in left_out}
         self.reconstruction = replace(reconstruction, photos=kept)
 

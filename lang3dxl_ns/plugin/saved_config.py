@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from importlib.metadata import entry_points
 from pathlib import Path, PurePath
@@ -19,6 +19,8 @@ from lang3dxl_ns.common.errors import UserError
 TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
 _PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
 _PYTHON = "tag:yaml.org,2002:python/"
+_UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
+"""nerfstudio's classes that unpickle what they read."""
 
 
 def read_config(path: Path) -> TrainerConfig:
@@ -55,8 +57,15 @@ def _differences(settings: Any, place: str = "") -> Iterator[str]:
     yield from (f"has the unknown setting {place}{name}" for name in sorted(set(vars(settings)) - known))
     for name in sorted(known):
         value = getattr(settings, name)
+        if name == "_target" and value is not _default(settings, name):
+            yield f"would start {place}{name} {value!r}"
         if is_dataclass(value) and not isinstance(value, type):
             yield from _differences(value, f"{place}{name}.")
+
+
+def _default(settings: Any, name: str) -> Any:
+    (known,) = (field for field in fields(settings) if field.name == name)
+    return known.default if known.default_factory is MISSING else known.default_factory()
 
 
 def check_command_line(arguments: Sequence[str]) -> None:
@@ -86,14 +95,18 @@ def _asks_for(path: Path) -> str | None:
     """What a file's settings should not ask for, in a few words; None if there is nothing."""
     try:
         root = yaml.compose(path.read_text(), Loader=yaml.Loader)
-    except (yaml.YAMLError, OSError, ValueError, RecursionError):
+    except (yaml.YAMLError, OSError, ValueError):
         return None  # the command can't read it either
+    except RecursionError:  # the command, called from fewer functions, might
+        return "nest more deeply than settings do"
     known = {"torch", *_PACKAGES, *_plugins()}
     for tag in _tags(root):
         kind, _, name = tag.removeprefix(_PYTHON).partition(":")
         package, last = name.partition(".")[0], name.rpartition(".")[2]
         if kind == "module":
             return f"load the module {name}"
+        if last in _UNSAFE:
+            return f"load {name}"
         if kind in ("object/apply", "object/new") and not _is_harmless(name, known):
             return f"call {name}"
         if kind == "object" and not (package in known and last[:1].isupper()):
@@ -129,7 +142,7 @@ def _is_harmless(name: str, known: set[str]) -> bool:
     if module in sys.modules:
         kind = getattr(sys.modules[module], last, None)
         return isinstance(kind, type) and issubclass(kind, PurePath | Enum)
-    return module.partition(".")[0] in _plugins()
+    return module.partition(".")[0] in _plugins() - {"lang3dxl_ns"}
 
 
 def _is_settings_function(name: str) -> bool:
@@ -155,9 +168,9 @@ class _SettingsLoader(yaml.UnsafeLoader):
         if not name.startswith(tuple(f"{package}." for package in _PACKAGES)):
             raise yaml.constructor.ConstructorError(None, None, f"it asks for {name}", mark)
         found = super().find_python_name(name, mark)
-        if not isinstance(found, type):
+        if not isinstance(found, type) or found.__name__ in _UNSAFE:
             raise yaml.constructor.ConstructorError(
-                None, None, f"it asks for {name}, which is not a class", mark
+                None, None, f"it asks for {name}, which is no class of settings", mark
             )
         return found
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.preparation.collection import SCALE_RATIO, CropPlan
 from lang3dxl_ns.preparation.physical_scale import crop_sides
@@ -157,11 +158,15 @@ def write_needs(needs: Sequence[Need], folder: Path) -> None:
 
 
 def read_needs(folder: Path) -> dict[str, bool]:
-    """The verdicts in a run's folder, by component; empty if there are none."""
+    """The verdicts in a run's folder, by component; empty without a file. UserError for a damaged one."""
     path = folder / f"{NEEDS_FILE}.json"
     if not path.is_file():
         return {}
-    return {component: need["needed"] for component, need in json.loads(path.read_text()).items()}
+    try:
+        found = json.loads(path.read_text())
+        return {component: bool(need["needed"]) for component, need in found.items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(f"{path} can't be read ({error!r}): copy it again, or remove it") from error
 
 
 def _figure(value: float | None) -> str | None:

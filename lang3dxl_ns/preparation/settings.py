@@ -19,10 +19,6 @@ DENSE_MODEL = "facebook/dinov2-small"
 """For semantics that are trained with the scene."""
 
 
-DENSE_MODEL = "facebook/dinov2-small"
-"""For semantics that are trained with the scene."""
-
-
 _BOUNDS = {"scales": (1, 100), "dense_tokens": (1, 1024), "crop_batch": (1, 1 << 16), "workers": (1, 1024)}
 
 

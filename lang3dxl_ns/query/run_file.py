@@ -19,13 +19,13 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.scene.camera import MOST_PIXELS, Camera, Lens, view_matrix
+from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
+from lang3dxl_ns.scene.colmap import FARTHEST
+from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.photo import Photo
 
 SCENE_FILE = "lang3dxl_scene.json"
 """File name, beside config.yml."""
-LONGEST_SIDE = 1 << 16
-"""Most pixels of a picture to render."""
 _VERSION = 2
 
 
@@ -125,11 +125,13 @@ def _checked(scene: SceneFile) -> SceneFile:
     """The scene, after validating all its values. Raises ValueError."""
     _expect(scene.photos != [], "it lists no photo")
     for photo in scene.photos:
-        _expect(isinstance(photo.name, str) and photo.name != "", f"a photo is called {photo.name!r}")
+        _expect(is_name(photo.name), f"a photo is called {photo.name!r}")
         _expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
         _expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
         _expect(_is_pose(photo.camera_to_world), f"{photo.name} has no pose")
-        check_lens(photo.lens)
+        turned = torch.tensor(photo.camera_to_world)[:, :3].double().det()
+        _expect(1e-3 < abs(float(turned)) < 1e3, f"{photo.name} has no pose")
+        photo.lens.check()
     _expect(len({photo.name for photo in scene.photos}) == len(scene.photos), "a photo is listed twice")
     for text in (scene.clip, scene.clip_identity):
         _expect(isinstance(text, str | None), f"its CLIP is {text!r}")
@@ -154,24 +156,7 @@ def _is_pose(rows: object) -> bool:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
-
-
-def check_lens(lens: Lens) -> None:
-    """Raises ValueError for a lens that cannot be rendered with."""
-    numbers = (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion)
-    _expect(all(map(_is_number, numbers)), "a lens has a value that is not a number")
-    sizes = isinstance(lens.width, int) and isinstance(lens.height, int) and min(lens.width, lens.height) > 0
-    _expect(sizes, f"a picture has {lens.width} × {lens.height} pixels")
-    _expect(
-        lens.width * lens.height <= MOST_PIXELS and max(lens.width, lens.height) <= LONGEST_SIDE,
-        f"{lens.width} × {lens.height} pixels are too many",
-    )
-    _expect(min(lens.fx, lens.fy) > 0, f"a lens has the focal lengths {lens.fx}, {lens.fy}")
-    _expect(
-        isinstance(lens.fisheye, bool) and len(lens.distortion) in (0, 4, 5, 8),
-        "a lens has no known distortion",
-    )
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < FARTHEST
 
 
 def read_camera_path(path: Path) -> Sequence[Camera]:
@@ -194,5 +179,5 @@ def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
     _expect(0 < frame["fov"] < 180, f"a camera has a field of view of {frame['fov']} degrees")
     focal = height / 2 / math.tan(math.radians(frame["fov"]) / 2)
     lens = Lens(width, height, focal, focal, width / 2, height / 2)
-    check_lens(lens)
+    lens.check()
     return lens.camera(view_matrix(pose[:3]))

@@ -14,6 +14,10 @@ MOST_PIXELS = 180_000_000
 """Most pixels of a picture: Pillow rejects larger ones as an attack."""
 
 
+LONGEST_SIDE = 1 << 16
+"""Most pixels of a picture's side."""
+
+
 def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
     """Width and height of a photo at `scale`, at least one pixel each."""
     return max(1, round(width * scale)), max(1, round(height * scale))
@@ -43,6 +47,20 @@ class Lens:
         """Intrinsic matrix in float64, pixels."""
         rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
         return torch.tensor(rows, dtype=torch.float64)
+
+    def check(self) -> None:
+        """Raises ValueError for a lens that cannot be rendered with."""
+        values = (self.width, self.height, self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not all(type(x) in (int, float) and abs(x) < 1e30 for x in values):
+            raise ValueError("a lens has a value that is not a number")
+        if type(self.width) is not int or type(self.height) is not int or min(self.width, self.height) < 1:
+            raise ValueError(f"a picture has {self.width} × {self.height} pixels")
+        if self.width * self.height > MOST_PIXELS or max(self.width, self.height) > LONGEST_SIDE:
+            raise ValueError(f"{self.width} × {self.height} pixels are too many")
+        if min(self.fx, self.fy) <= 0:
+            raise ValueError(f"a lens has the focal lengths {self.fx}, {self.fy}")
+        if type(self.fisheye) is not bool or len(self.distortion) not in (0, 4, 5, 8):
+            raise ValueError("a lens has no known distortion")
 
     def resized(self, width: int, height: int) -> Lens:
         """The same lens at another resolution."""

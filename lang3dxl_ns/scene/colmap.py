@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.scene.camera import MOST_PIXELS, Lens
 from lang3dxl_ns.scene.colmap_check import check_binary_model
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
@@ -99,7 +99,10 @@ def read_reconstruction(model_dir: Path) -> Reconstruction:
 def _name(number: int, image: pycolmap.Image) -> str | None:
     """A photo's name; None (logged) if it can't be read."""
     try:
-        return image.name
+        if is_plain(image.name):
+            return image.name
+        say(f"photo {image.name} of the COLMAP model is left out: its name has control characters; rename it")
+        return None
     except UnicodeDecodeError:
         say(
             f"photo {number} of the COLMAP model is left out: its name is not UTF-8; rename its file (convmv "

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, is_plain
 
 
 def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
@@ -25,6 +25,14 @@ def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
             "if you trust the links, pass `lang3dxl-colmap --follow-links True` after all other options"
         )
     return path
+
+
+def is_name(name: object) -> bool:
+    """Whether this can be the name of a photo in a folder: relative, not upwards, no control characters."""
+    if not isinstance(name, str) or not is_plain(name):
+        return False
+    path = PurePosixPath(name)
+    return path.name != "" and not path.is_absolute() and ".." not in path.parts
 
 
 def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bool = False) -> Path | None:

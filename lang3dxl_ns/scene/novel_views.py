@@ -47,7 +47,7 @@ def read_novel_views(scene: Path) -> NovelViews | None:
         content = json.loads(path.read_text())
         cameras = [_tracked(view) for view in content["views"]]
         return NovelViews(path.parent, cameras, bool(content["same_light"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path} is damaged ({error!r}): make the scene again, or remove the file") from error
 
 
@@ -70,12 +70,14 @@ def write_novel_cameras(folder: Path, cameras: Sequence[TrackedPhoto], same_ligh
 
 def _tracked(view: dict) -> TrackedPhoto:
     fx, fy, cx, cy = (float(value) for value in view["intrinsics"])
+    lens = Lens(int(view["width"]), int(view["height"]), fx, fy, cx, cy)
+    lens.check()
     points = np.array(view["points"], dtype=np.float64).reshape(-1, 3)
     pose = np.array(view["camera_from_world"], dtype=np.float64).reshape(3, 4)
     x, y, z = pose @ np.column_stack([points, np.ones(len(points))]).T
     return TrackedPhoto(
         name=f"{FOLDER}/{view['name']}",
-        lens=Lens(int(view["width"]), int(view["height"]), fx, fy, cx, cy),
+        lens=lens,
         camera_from_world=pose,
         points=points,
         pixels=np.column_stack([fx * x / z + cx, fy * y / z + cy]),

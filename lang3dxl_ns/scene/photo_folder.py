@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import ExifTags, Image
+from PIL import ExifTags
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif")
 UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw")
@@ -70,10 +72,10 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
             bad[name] = f"{path.suffix} can't be read here: convert it to JPEG or PNG"
             continue
         try:
-            with Image.open(path) as image:
+            with open_picture(path) as image:
                 image.verify()
             good.append(name)
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        except (OSError, NoPictureError) as error:
             bad[name] = f"the file is damaged ({error})"
     return PhotoFolder(photos.folder, tuple(good)), bad
 
@@ -92,9 +94,13 @@ def photos_below(folder: Path) -> list[str]:
 
 def _size_and_lens(path: Path) -> tuple[tuple[int, int], tuple | None]:
     """Size in pixels, and camera and focal length from EXIF, if present."""
-    with Image.open(path) as image:
-        exif = image.getexif()
-        details = exif.get_ifd(ExifTags.IFD.Exif)
-        focal = details.get(ExifTags.Base.FocalLengthIn35mmFilm) or details.get(ExifTags.Base.FocalLength)
-        body = exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)
-        return image.size, (*map(str, body), float(focal)) if any(body) and focal else None
+    with open_picture(path) as image:
+        size = image.size
+        with suppress(Exception):  # damaged EXIF, which may hold anything
+            exif = image.getexif()
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            focal = details.get(ExifTags.Base.FocalLengthIn35mmFilm) or details.get(ExifTags.Base.FocalLength)
+            body = exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)
+            if any(body) and focal:
+                return size, (*map(str, body), float(focal))
+    return size, None

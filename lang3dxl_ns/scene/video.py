@@ -21,6 +21,13 @@ MOST_FRAMES = 300
 """Most frames of a long video; the rate is reduced accordingly."""
 _LOOK = (240, 135)  # pixels at which sharpness is judged: motion blur shows there too
 
+_READING = ("-v", "error", "-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi,mpegts,mpeg")
+"""Options of ffmpeg for a stranger's file: playlists, for example, would name other files and addresses."""
+
+
+def _address(video: Path) -> str:
+    return f"file:{video.absolute()}"  # a name may look like an option, or like another protocol
+
 
 def is_video(path: Path) -> bool:
     """Whether this is a file that ffmpeg may be able to read as a video."""
@@ -65,7 +72,7 @@ def _sharpest(sharpness: Float[Array, " n"], stretches: int) -> Int[Array, " s"]
 def _sharpness(video: Path) -> Float[Array, " n"]:
     """Variance of the Laplacian of every frame, downsized and gray."""
     width, height = _LOOK
-    command = ["ffmpeg", "-v", "error", "-i", str(video), "-an", "-vf", f"scale={width}:{height}"]
+    command = ["ffmpeg", *_READING, "-i", _address(video), "-an", "-vf", f"scale={width}:{height}"]
     command += ["-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "gray", "-"]
     values = []
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
@@ -79,14 +86,15 @@ def _sharpness(video: Path) -> Float[Array, " n"]:
 def _duration(video: Path) -> float:
     command = [
         "ffprobe",
-        "-v",
-        "error",
+        *_READING,
         "-select_streams",
         "v:0",
         "-show_entries",
         "stream=codec_type:format=duration",
     ]
-    found = subprocess.run([*command, "-of", "json", str(video)], capture_output=True, text=True, check=False)
+    found = subprocess.run(
+        [*command, "-of", "json", _address(video)], capture_output=True, text=True, check=False
+    )
     try:
         answer = json.loads(found.stdout)
         if not answer["streams"]:
@@ -104,7 +112,7 @@ def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     wanted = "+".join(f"eq(n,{index})" for index in chosen)
-    command = ["ffmpeg", "-v", "error", "-i", str(video), "-an", "-vf", f"select='{wanted}'"]
+    command = ["ffmpeg", *_READING, "-i", _address(video), "-an", "-vf", f"select='{wanted}'"]
     command += ["-fps_mode", "passthrough", "-q:v", "2", str(partial / "frame_%05d.jpg")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode or not any(partial.iterdir()):

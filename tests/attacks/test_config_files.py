@@ -2,6 +2,7 @@
 
 import contextlib
 import shutil
+import zipfile
 
 import pytest
 import torch
@@ -28,6 +29,9 @@ TRAPS = [
     "!!python/name:torch.hub.load ''",
     "!!python/module:antigravity ''",
     "!!python/object:collections.OrderedDict {{}}",
+    "!!python/object:nerfstudio.data.dataparsers.minimal_dataparser.MinimalDataParserConfig {{}}",
+    "!!python/name:nerfstudio.configs.dataparser_configs.MinimalDataParserConfig ''",
+    "!<tag:yaml.org,2002:python/object/apply:os.system> ['touch {trap}']",
 ]
 
 
@@ -72,6 +76,35 @@ def test_nerfstudios_commands_end_before_they_read_such_a_config(tmp_path, text,
     with pytest.raises(SystemExit, match=r"config\.yml asks to (call|load|make)"):
         check_command_line(["ns-eval", *option.format(path).split()])
     assert not trap.exists()
+
+
+def test_a_config_that_nests_too_deeply_for_the_check_is_refused(tmp_path):
+    """nerfstudio reads it from fewer frames of the stack, where it may just fit."""
+    path, _ = trapped(tmp_path, TRAPS[0])
+    path.write_text(path.read_text() + f"\ndeep: {'[' * 5000}{']' * 5000}\n")
+    with pytest.raises(SystemExit, match="nest more deeply"):
+        check_command_line(["--load-config", str(path)])
+    with pytest.raises(UserError, match=r"config\.yml can't be read"):
+        read_config(path)
+
+
+@pytest.mark.parametrize(
+    ("setting", "other"),
+    [
+        ("lang3dxl_ns.plugin.dataparser.PhotoCollectionDataParser", "nerfstudio.data.dataparsers.X.Blender"),
+        ("lang3dxl_ns.plugin.model.Lang3DXLModel", "nerfstudio.data.datasets.base_dataset.InputDataset"),
+        ("lang3dxl_ns.plugin.pipeline.Lang3DXLPipeline", "nerfstudio.engine.trainer.Trainer"),
+    ],
+)
+def test_settings_can_not_start_another_class_than_their_own(copy, setting, other):
+    path = copy / "config.yml"
+    text = path.read_text()
+    assert setting in text
+    other = other.replace("X.Blender", "blender_dataparser.Blender")
+    path.write_text(text.replace(f"python/name:{setting} ", f"python/name:{other} "))
+    for opening in (load_scene, open_run):
+        with pytest.raises(UserError, match=r"would start .*_target"):
+            opening(path)
 
 
 def test_a_config_whose_writer_is_trusted_passes(tmp_path, monkeypatch):
@@ -136,6 +169,22 @@ def test_checkpoints_of_other_methods_and_shapes_are_named(copy, state):
     for opening in (load_scene, open_run):
         with pytest.raises(UserError, match=r"checkpoint"):
             opening(copy / "config.yml")
+
+
+def test_a_checkpoint_that_would_fill_the_memory_is_refused(copy):
+    path = max((copy / "nerfstudio_models").glob("*.ckpt"))
+    state = torch.load(path, weights_only=True)
+    (key,) = [k for k in state["pipeline"] if k.endswith("gauss_params.means")]
+    state["pipeline"][key] = torch.zeros(1).expand(10**12, 3)
+    torch.save(state, path)
+    assert path.stat().st_size < 1e8
+    for opening in (load_scene, open_run):
+        with pytest.raises(UserError, match=r"means is larger than what is stored of it"):
+            opening(copy / "config.yml")
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("step/data/0", bytes(10**8))
+    with pytest.raises(UserError, match="packed"):
+        load_scene(copy / "config.yml")
 
 
 @pytest.mark.parametrize("name", ["means", "features_dc", "codes"])

@@ -1,8 +1,10 @@
 """Pictures and COLMAP models of strangers."""
 
 import io
+import os
 import shutil
 import struct
+import subprocess
 
 import numpy as np
 import pycolmap
@@ -11,6 +13,7 @@ from conftest import make_trainer
 from PIL import Image
 from scenes import write_scene
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS, NoPictureError, open_picture
 from lang3dxl_ns.evaluation.annotations import read_gray
@@ -20,6 +23,8 @@ from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.regions import _read_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.video import extract_frames
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n%%EndComments\n(trap) run\n%%EOF\n"
 
@@ -112,6 +117,47 @@ def test_a_symlink_loop_among_photos_is_passed_over(folder, capsys):
     assert "photo_001.jpg" in capsys.readouterr().out
 
 
+def test_photos_to_reconstruct_are_of_the_named_formats_too(tmp_path):
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.jpg")
+    (tmp_path / "b.jpg").write_bytes(EPS)
+    os.mkfifo(tmp_path / "c.jpg")
+    good, bad = readable(find_photos(tmp_path))
+    assert good.names == ("a.jpg",)
+    assert "formats JPEG" in bad["b.jpg"] and "not a file" in bad["c.jpg"]
+
+
+def test_damaged_exif_is_no_exif(tmp_path):
+    for i, tail in enumerate((b"", b"II*\0" + b"\xff" * 40, b"MM\0*\0\0\0\x08\xff\xff" + b"\1" * 60)):
+        Image.new("RGB", (40, 30)).save(tmp_path / f"{i}.jpg", exif=b"Exif\0\0" + tail)
+    assert len(shared_cameras(find_photos(tmp_path))) == 1
+
+
+PLAYLISTS = {
+    "playlist": "#EXTM3U\n#EXT-X-TARGETDURATION:2\n#EXTINF:2,\n{secret}\n#EXT-X-ENDLIST\n",
+    "list": "ffconcat version 1.0\nfile '{secret}'\n",
+}
+
+
+@pytest.mark.parametrize("kind", PLAYLISTS)
+@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="needs ffmpeg")
+def test_a_video_can_not_name_other_files(tmp_path, kind):
+    """A playlist under the name of a video would have its frames taken from any file of this machine."""
+    secret = tmp_path / "secret.mp4"
+    made = ["ffmpeg", "-v", "error", "-f", "lavfi", "-i", "testsrc=duration=2:size=64x48", str(secret)]
+    subprocess.run(made, check=True)
+    assert len(list((extract_frames(secret) / "images").iterdir())) == 4
+    (tmp_path / "walk.mp4").write_text(PLAYLISTS[kind].format(secret=secret))
+    with pytest.raises(UserError, match=r"walk\.mp4 is not a video"):
+        extract_frames(tmp_path / "walk.mp4")
+
+
+@pytest.mark.parametrize("factor", [2, None])
+def test_names_of_photos_never_reach_nerfstudios_shell(folder, factor):
+    parser = PhotoCollectionDataParserConfig(data=folder, downscale_factor=factor).setup()
+    with pytest.raises(UserError, match="--downscale-factor is"):
+        parser.get_dataparser_outputs(split="train")
+
+
 # ── models ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -157,6 +203,25 @@ def test_photos_whose_names_are_not_utf8_are_left_out_and_named(folder, capsys):
     path.write_bytes(path.read_bytes().replace(b"photo_001.jpg", b"ph\xf6to_01.jpg"))
     assert set(used(folder)) == {"photo_000.jpg", "photo_002.jpg", "photo_003.jpg"}
     assert "its name is not UTF-8" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("name", [b"a\x1b[2J\r\n_.jpg", b"\x1b]0;title\x07.jpg"])
+def test_names_of_photos_can_not_command_the_terminal(folder, capsys, name):
+    path = folder / "sparse" / "0" / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"photo_001.jpg", name.ljust(13, b"_")))
+    (folder / "images" / "photo_\x1b[2J.jpg").write_bytes(b"")
+    assert set(used(folder)) == {"photo_000.jpg", "photo_002.jpg", "photo_003.jpg"}
+    said = capsys.readouterr().out
+    assert "control characters" in said and "\x1b" not in said and "\\x1b" in said
+
+
+def test_messages_never_command_the_terminal(capsys):
+    assert (
+        str(UserError("photo a\x1b[2J\x9b\r\ud800: é 日本\n b"))
+        == r"photo a\x1b[2J\x9b\r\ud800: é 日本" + "\n b"
+    )
+    say("a\x1b[2J")
+    assert capsys.readouterr().out == "a\\x1b[2J\n"
 
 
 def test_a_camera_of_billions_of_pixels_is_refused(folder):

@@ -6,8 +6,10 @@ import math
 import pytest
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.needs import NEEDS_FILE, read_needs
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
 from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.novel_views import read_novel_views
 
 POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]]
 
@@ -49,6 +51,13 @@ def set_of_lens(name, value):
         lambda content: content.update(data=None),
         set_of_photo("name", 3),
         set_of_photo("name", ""),
+        *(
+            set_of_photo("name", name)
+            for name in ("/etc/x", "..", "a/../../b", ".", "/", "a\0b", "a\n", "\x1b[2J")
+        ),
+        set_of_photo("name", "\ud800"),
+        set_of_photo("camera_to_world", [[0.0] * 4] * 3),
+        set_of_photo("camera_to_world", [[1e29] * 4] * 3),
         set_of_photo("split", "none"),
         set_of_photo("mask", 5),
         set_of_photo("camera_to_world", POSE[0]),
@@ -79,6 +88,28 @@ def test_a_scene_file_that_is_none_is_named(tmp_path, text):
     (tmp_path / "scene.json").write_text(text)
     with pytest.raises(UserError, match=r"scene\.json can't be read"):
         SceneFile.read(tmp_path / "scene.json")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "", "[1]", '{"a": 1}', '{"a": {}}', "\xff"])
+def test_damaged_needs_of_a_run_are_named(tmp_path, text):
+    assert read_needs(tmp_path) == {}
+    (tmp_path / f"{NEEDS_FILE}.json").write_text(text)
+    with pytest.raises(UserError, match=rf"{NEEDS_FILE}\.json can't be read"):
+        read_needs(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{}, {"width": 10**9}, {"width": "a"}, {"intrinsics": [math.nan] * 4}, {"points": 3}, {"points": [[1]]}],
+)
+def test_damaged_test_views_are_named(tmp_path, change):
+    view = {"name": "../../a.png", "width": 40, "height": 30, "intrinsics": [50, 51, 20, 15]}
+    view |= {"camera_from_world": POSE, "points": [[0, 0, 1.0]]} | change
+    (tmp_path / "test_views").mkdir()
+    path = tmp_path / "test_views" / "cameras.json"
+    path.write_text(json.dumps({"same_light": True, "views": [view] if change else view}))
+    with pytest.raises(UserError, match=r"cameras\.json is damaged"):
+        read_novel_views(tmp_path)
 
 
 MATRIX = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 2, 0, 0, 0, 1]

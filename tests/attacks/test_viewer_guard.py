@@ -79,6 +79,14 @@ def get(server, path: str, host: str | None = None, **headers: str) -> http.clie
     return response
 
 
+def reply(server, request: str) -> bytes:
+    """What comes back for a request that no client library would send."""
+    port = server.get_port()
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as raw:
+        raw.sendall(request.format(port=port).replace("\n", "\r\n").encode() + b"\r\n\r\n")
+        return b"".join(iter(lambda: raw.recv(1 << 16), b""))
+
+
 def page(server, **options):
     """A page's websocket."""
     port = server.get_port()
@@ -135,6 +143,54 @@ def test_only_files_of_the_page_are_served(local, path):
     answer = get(local, path)
     assert answer.status in (403, 404)
     assert b"root:" not in answer.content and b"import" not in answer.content
+
+
+@pytest.mark.parametrize("upgrade", ["WebSocket", "WEBSOCKET", "websocket", "websocket, x", "h2c", ""])
+@pytest.mark.parametrize("name", ["etc/passwd", "proc/self/environ"])
+def test_no_file_is_served_as_the_handshake_of_a_websocket(local, upgrade, name):
+    answer = get(local, f"/../../../../../../../../../../{name}", Upgrade=upgrade, Connection="Upgrade")
+    assert answer.status >= 400 and b"root:" not in answer.content and b"PATH=" not in answer.content
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        "GET / HTTP/1.1\nHost: 127.0.0.1:{port}\nHost: evil.example",
+        "GET / HTTP/1.1\nHost: 127.0.0.1:{port}\nOrigin: http://127.0.0.1:{port}\nOrigin: http://evil.example",
+        "GET / HTTP/1.1\nHost: 127.0.0.1:{port}\nUpgrade: websocket\nUpgrade: x",
+        "GET / HTTP/1.1",
+        "HEAD / HTTP/1.1\nHost: 127.0.0.1:{port}",
+        "POST / HTTP/1.1\nHost: 127.0.0.1:{port}",
+        "CONNECT evil.example:80 HTTP/1.1\nHost: 127.0.0.1:{port}",
+        "GET http://evil.example/../../../../../../../etc/passwd HTTP/1.1\nHost: 127.0.0.1:{port}",
+        "GET /%2e%2e/%2e%2e/_viser.py HTTP/1.1\nHost: 127.0.0.1:{port}",
+        "GET /%252e%252e/_viser.py HTTP/1.1\nHost: 127.0.0.1:{port}",
+        "GET / HTTP/1.1\nHost: [::1",
+        "GET / HTTP/1.1\nHost: 127.0.0.1:{port}\nOrigin: http://[::1",
+        "\x16\x03\x01\x02",
+    ],
+)
+def test_odd_requests_are_refused_without_a_traceback(local, request_, caplog):
+    answer = reply(local, request_)
+    assert answer[:12] in (b"HTTP/1.1 400", b"HTTP/1.1 403", b"HTTP/1.1 404")
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    "address", ["//index.html", "http://127.0.0.1/index.html", "/./index.html", "/#/../../etc/passwd"]
+)
+def test_odd_addresses_of_the_page_are_the_page(local, address, caplog):
+    answer = reply(local, f"GET {address} HTTP/1.1\nHost: 127.0.0.1:{{port}}")
+    assert answer[:12] == b"HTTP/1.1 200" and b"<html" in answer and not caplog.records
+
+
+def test_links_in_the_folder_of_the_page_lead_nowhere(tmp_path):
+    (tmp_path / "build").mkdir()
+    (tmp_path / "secret").write_text("secret")
+    (tmp_path / "build" / "link").symlink_to(tmp_path / "secret")
+    (tmp_path / "build" / "folder").symlink_to(tmp_path)
+    guard = Guard("127.0.0.1", 7007, tmp_path / "build")
+    assert guard.file("/link") is None and guard.file("/folder/secret") is None
 
 
 def test_the_page_itself_is_served(local):
@@ -236,6 +292,7 @@ def test_only_values_that_an_input_can_have_arrive(local):
         set_value(socket_, local, "FPS", update_cb="gone")
         set_value(socket_, local, "FPS", value=3.0, is_button=True)
         tell(socket_, type="GuiUpdateMessage", id="unknown", updates={"value": 1})
+        tell(socket_, type="GuiUpdateMessage", id=["unknown"], updates={"value": 1})
         tell(socket_, type="GuiUpdateMessage", id=handle_of(local, "FPS")._impl.id, updates=3)
         assert heard(local, socket_) == []
         set_value(socket_, local, "Path", value="two")
@@ -302,6 +359,10 @@ def test_degenerate_cameras_are_rejected(local, change):
         msgspec.msgpack.encode({"type": "NoSuchMessage"}),
         msgspec.msgpack.encode({"type": "ViewerCameraMessage"}),
         msgspec.msgpack.encode(CAMERA | {"position": 5}),
+        msgspec.msgpack.encode(CAMERA | {"wxyz": ("a", "b", "c", "d")}),
+        msgspec.msgpack.encode(CAMERA | {"wxyz": "abcd"}),
+        msgspec.msgpack.encode(CAMERA | {"position": (None, [], {})}),
+        msgspec.msgpack.encode(CAMERA | {"aspect": None}),
         json.dumps(CAMERA).encode(),
     ],
 )

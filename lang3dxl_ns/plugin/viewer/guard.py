@@ -99,9 +99,9 @@ class Guard:
                 # Remove the token from the address, which the page could pass on.
                 cookie = f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
                 return http.HTTPStatus.SEE_OTHER, {"Set-Cookie": cookie, "Location": "/"}, b""
-            if headers.get("Upgrade", "").lower() == "websocket" or self._serves(place.path):
+            if is_handshake(headers) or self.file(path) is not None:
                 return None
-        except (ValueError, OSError):  # an invalid address or file name
+        except (ValueError, LookupError):  # an invalid address, or a header given twice
             pass
         return http.HTTPStatus.NOT_FOUND, {}, b"404"
 
@@ -129,12 +129,15 @@ class Guard:
     def _is_token(self, offered: str) -> bool:
         return secrets.compare_digest(offered.encode(), self.token.encode())
 
-    def _serves(self, path: str) -> bool:
-        """Whether this is a file of the page."""
-        if self.root is None:
-            return False
-        file = (self.root / (path.lstrip("/") or "index.html")).resolve()
-        return file.is_relative_to(self.root.resolve()) and file.is_file()
+    def file(self, path: str) -> str | None:
+        """The address, in its plainest form, of the page's file that a path names; None if it names none."""
+        try:
+            root = (self.root or Path("/none")).resolve()
+            file = (root / (urlsplit(path).path.lstrip("/") or "index.html")).resolve()
+            inside = file.is_relative_to(root) and file.is_file()
+        except (ValueError, OSError):  # no address, or none that a file could have
+            return None
+        return f"/{file.relative_to(root).as_posix()}" if inside else None
 
     # ── messages ────────────────────────────────────────────────────────────────────────────────────────
 
@@ -142,11 +145,19 @@ class Guard:
         """Whether to handle a page's message; limits its contents to valid values."""
         if isinstance(message, SHARING):
             return self.share
-        if isinstance(message, _messages.GuiUpdateMessage):
-            return _is_update(handler, message)
-        if isinstance(message, _messages.ViewerCameraMessage):
-            return is_camera(message)
-        return isinstance(message, IN_THE_SCENE) and _is_sound(list(vars(message).values()))
+        try:
+            if isinstance(message, _messages.GuiUpdateMessage):
+                return _is_update(handler, message)
+            if isinstance(message, _messages.ViewerCameraMessage):
+                return is_camera(message)
+            return isinstance(message, IN_THE_SCENE) and _is_sound(list(vars(message).values()))
+        except (TypeError, ValueError, AttributeError, ArithmeticError):  # fields of other types
+            return False
+
+
+def is_handshake(headers: Headers) -> bool:
+    """Whether a request opens a websocket instead of asking for a file. LookupError for two answers."""
+    return headers.get("Upgrade", "").lower() == "websocket"
 
 
 def _refuse(why: str) -> Response:
@@ -158,6 +169,7 @@ def is_camera(message: _messages.ViewerCameraMessage) -> bool:
     vectors = (message.wxyz, message.position, message.look_at, message.up_direction)
     return (
         [len(vector) for vector in vectors] == [4, 3, 3, 3]
+        and all(isinstance(x, int | float) for vector in vectors for x in vector)
         and _is_sound(vectors)
         and 0.5 < math.hypot(*message.wxyz) < 2
         and math.dist(message.position, message.look_at) > 0
@@ -259,9 +271,12 @@ class GuardedProtocol(WebSocketServerProtocol):
         self.guard = guard
 
     async def process_request(self, path: str, request_headers: Headers) -> Any:
-        """Refuse, or pass the request on to viser."""
+        """Refuse, or pass the request on to viser: only for a file, by the address that the guard resolved,
+        since viser reads addresses and headers in other ways."""
         refusal = self.guard.refusal(path, request_headers)
-        return refusal if refusal is not None else await super().process_request(path, request_headers)
+        if refusal is not None or is_handshake(request_headers):
+            return refusal
+        return await super().process_request(self.guard.file(path) or "/none", request_headers)
 
     async def recv(self) -> Any:
         """The next message; viser would not notice that an invalid one ended the connection."""
