@@ -10,6 +10,7 @@ from typing import Any
 _PUBLIC = {
     "load_scene": "plugin.load_scene",
     "Scene": "query.scene",
+    "together": "query.match",
     "QueryConfig": "query.scene",
     "Camera": "scene.camera",
     "Gaussians": "rendering",

@@ -25,6 +25,10 @@ BENCHMARKS = {
     "scale": ("benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
     "real-photos": ("benchmarks.real_photos:RealPhotos", "Scenes of real photos, trained and scored."),
     "queries": ("benchmarks.queries:QueryBenchmark", "From a new text to its picture."),
+    "best-views": (
+        "benchmarks.best_views:BestViews",
+        "Whether the views that queries choose show the words.",
+    ),
     "viewer": ("benchmarks.viewer:ViewerBenchmark", "Viewers in a browser: frames, first picture."),
     "ablation": (
         "benchmarks.ablation:Ablation",

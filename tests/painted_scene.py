@@ -13,8 +13,10 @@ from torch import Tensor
 
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.match import View
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.query.scene import QueryConfig, Scene, View
+from lang3dxl_ns.query.scene import QueryConfig, Scene
+from lang3dxl_ns.query.splat_file import GaussianArrays
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, Lens, camera_to_world
@@ -75,12 +77,18 @@ def activated(gaussians: dict[str, Tensor]) -> Gaussians:
     return Gaussians(g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(1))
 
 
-def render(camera: Camera, carried: Tensor) -> View:
+def render(camera: Camera, carried: Tensor | None) -> View:
     """Gray for walls, brighter for every further word."""
     g = painted_gaussians()
     colors = (g["words"][:, None] / 3.0).expand(-1, 3)
     drawn = rasterize(activated(g), camera, colors, features=carried, render_depth=True)
     return View(camera, drawn.image, drawn.features, drawn.alpha[..., 0], drawn.depth[..., 0])
+
+
+def paint(camera: Camera, look: str | None) -> GaussianArrays:
+    g = painted_gaussians()
+    colors = (g["words"][:, None] / 3.0).expand(-1, 3)
+    return GaussianArrays.of(activated(g), colors)
 
 
 def fill(camera: Camera, weight: Tensor) -> Tensor:
@@ -115,5 +123,11 @@ def painted_scene(cache_dir: Path | None = None, config: QueryConfig | None = No
     file = SceneFile(photos, "clip", "0123", 1.0, torch.eye(4)[:3].tolist(), "nowhere")
     gaussians = painted_gaussians()
     parts = {"render": render, "fill": fill, "engine": engine, "gaussians": gaussians, "file": file}
-    parts |= {"encode_texts": encode_texts, "state": gaussians, "cache_dir": cache_dir, "config": config}
+    parts |= {
+        "encode_texts": encode_texts,
+        "state": gaussians,
+        "paint": paint,
+        "cache_dir": cache_dir,
+        "config": config,
+    }
     return Scene(**{**parts, **changes})

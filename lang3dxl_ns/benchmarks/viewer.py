@@ -15,10 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+from lang3dxl_ns.query.find_run import find_config
 
 SWITCHES = [
     *("--headless", "--no-sandbox", "--disable-background-networking", "--disable-component-update"),
@@ -35,12 +37,12 @@ _ALIKE = 0.5
 """Mean difference, of 255, up to which pictures count as the same."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ViewerBenchmark:
     """Drag `lang3dxl view` and `ns-viewer` of a run, and a page with many Gaussians, in Chromium."""
 
-    load_config: Path
-    """config.yml of a run."""
+    run: tyro.conf.Positional[Path | None] = None
+    """Folder of a run, or its config.yml (default: the newest under outputs/)."""
     out: Path
     """Folder for viewer.md and viewer.json."""
     many: int = 300_000
@@ -52,12 +54,13 @@ class ViewerBenchmark:
 
     def main(self) -> None:
         rows = []
-        view = ["lang3dxl", "view", "--load-config", str(self.load_config), "--port"]
-        server = ["ns-viewer", "--load-config", str(self.load_config), "--viewer.websocket-host", "127.0.0.1"]
+        config = find_config(self.run)
+        view = ["lang3dxl", "view", str(config), "--port"]
+        server = ["ns-viewer", "--load-config", str(config), "--viewer.websocket-host", "127.0.0.1"]
         pages: dict[str, Callable[[int], Any]] = {
             "lang3dxl view": lambda port: _served([*view, str(port)]),
             "ns-viewer": lambda port: _served([*server, "--viewer.websocket-port", str(port)]),
-            f"lang3dxl view, {self.many:,} Gaussians": lambda port: _many(self.load_config, self.many, port),
+            f"lang3dxl view, {self.many:,} Gaussians": lambda port: _many(config, self.many, port),
         }
         for name, served in pages.items():
             port = _free_port()
@@ -175,17 +178,18 @@ def _served(command: list[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _many(load_config: Path, count: int, port: int) -> Iterator[None]:
+def _many(config: Path, count: int, port: int) -> Iterator[None]:
     """A page with copies of a run's Gaussians."""
     import torch
     import viser
 
+    from lang3dxl_ns.plugin.light import in_light
     from lang3dxl_ns.plugin.open_run import open_run
     from lang3dxl_ns.plugin.viewer.guard import guard_viewers
-    from lang3dxl_ns.plugin.viewer.splats import in_light, sent, splats
+    from lang3dxl_ns.plugin.viewer.splats import sent, splats
 
     guard_viewers()
-    _, pipeline, _ = open_run(load_config)
+    _, pipeline, _ = open_run(config)
     gaussians, colors = in_light(pipeline.model, pipeline.scene_file.photos[0].camera, None)
     one = splats(gaussians, colors, 10.0)
     chosen = torch.randint(len(one.centers), (count,), generator=torch.Generator().manual_seed(0)).numpy()

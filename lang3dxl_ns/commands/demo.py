@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import shlex
 import sys
 import time
@@ -106,8 +107,9 @@ class Demo:
         say = get_console().print
         say(self.markdown(report), soft_wrap=True, highlight=False, markup=False)
         say(f"\nReport and picture: {folder / 'report.md'}, {folder / 'report.png'}", soft_wrap=True)
-        config_path = shlex.quote(str(folder / "config.yml"))
-        say(f"Walk through it: lang3dxl view --load-config {config_path}", soft_wrap=True)
+        run = shlex.quote(os.path.relpath(out))
+        say(f"Walk through it: lang3dxl view {run}", soft_wrap=True)
+        say(f'Ask it:          lang3dxl query {run} --text "windows" --out found', soft_wrap=True)
 
     def _scene(self, out: Path) -> Path:
         """The scene in `out`, generated unless it is there. Raises UserError if another one is there."""

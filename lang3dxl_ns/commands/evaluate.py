@@ -76,8 +76,8 @@ class EvaluateRun:
     Writes scores.md and scores.json.
     """
 
-    load_config: Path
-    """config.yml of the run."""
+    run: tyro.conf.Positional[Path | None] = None
+    """Folder of the run, or its config.yml (default: the newest under outputs/)."""
     split: Literal["held-out", "seen", "test"] = "held-out"
     """Photos held out of training, labeled training photos, or the scene's test views."""
     ground_truth: Path | None = None
@@ -92,7 +92,7 @@ class EvaluateRun:
     def main(self) -> None:
         from lang3dxl_ns.plugin.open_run import open_run
 
-        _, pipeline, _ = open_run(self.load_config)
+        _, pipeline, _ = open_run(self.run)
         pipeline.config.evaluated_photos = self.split
         if self.ground_truth is not None:
             pipeline.config.ground_truth = self.ground_truth

@@ -6,6 +6,8 @@ import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import tyro
+
 
 @dataclass(kw_only=True)
 class View:
@@ -16,8 +18,8 @@ class View:
     viewer; it is open to the whole network by default, and trusts the file.)
     """
 
-    load_config: Path
-    """config.yml of the run."""
+    run: tyro.conf.Positional[Path | None] = None
+    """Folder of the run, or its config.yml (default: the newest under outputs/)."""
     text: str = ""
     """Initial prompt."""
     host: str = "127.0.0.1"
@@ -33,7 +35,7 @@ class View:
 
         if self.text:
             os.environ[QUERY_VARIABLE] = self.text
-        config, pipeline, _ = open_run(self.load_config)
+        config, pipeline, _ = open_run(self.run)
         viewer = replace(
             config.viewer,
             websocket_host=self.host,

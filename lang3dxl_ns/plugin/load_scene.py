@@ -22,13 +22,17 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+from lang3dxl_ns.plugin.light import harmonics, in_light
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.plugin.saved_config import read_config
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, load_image_text_encoder
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.find_run import find_config
+from lang3dxl_ns.query.match import View
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, ScenePhoto
-from lang3dxl_ns.query.scene import QueryConfig, Scene, View
+from lang3dxl_ns.query.scene import QueryConfig, Scene
+from lang3dxl_ns.query.splat_file import GaussianArrays
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera
@@ -68,30 +72,34 @@ def _photos(datamanager: Lang3DXLDataManager, split: Literal["train", "eval"]) -
             camera_to_world=cameras.camera_to_worlds[i].tolist(),
             lens=photo.lens.scaled(dataset.scale),
             mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
+            size=(photo.lens.width, photo.lens.height),
         )
         for i, photo in enumerate(photos)
     ]
 
 
 def load_scene(
-    config: str | Path, device: torch.device | str | None = None, settings: QueryConfig | None = None
+    run: str | Path | None = None,
+    device: torch.device | str | None = None,
+    settings: QueryConfig | None = None,
 ) -> Scene:
     """The scene of a run.
 
     Args:
-        config: the run's config.yml, loaded without executing code (nerfstudio's own commands, ns-eval
-            and others, do trust the file). The latest checkpoint beside it is used.
+        run: the run's folder, a folder above it (the newest run there is taken), or its config.yml; None:
+            the newest under outputs/. The file is loaded without executing code (nerfstudio's own
+            commands, ns-eval and others, do trust it). The latest checkpoint beside it is used.
         device: by default a GPU if there is one.
         settings: of queries.
 
     Raises UserError for a folder without a checkpoint, a run without semantics, or another CLIP than the
     run's.
     """
-    path = Path(config).expanduser()
-    run = read_config(path)
+    path = find_config(run)
+    config = read_config(path)
     file = SceneFile.read(path.parent / SCENE_FILE)
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    model = _load_model(run, path.parent, file, device)
+    model = _load_model(config, path.parent, file, device)
     return scene_of_model(model, file, path.parent, settings)
 
 
@@ -122,13 +130,17 @@ def scene_of_model(
         raise UserError(NOT_FINISHED)
     parts = gaussians_of(model)
 
-    def render(camera: Camera, features: Float[Tensor, "n d"]) -> View:
+    def render(camera: Camera, features: Float[Tensor, "n d"] | None) -> View:
         with guard():
             return _draw(model, camera, features)
 
     def fill(camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
         with guard():
             return filled_pixels(partial(model.composite, view_of(camera)), weight, model.num_points)
+
+    def paint(camera: Camera, look: str | None) -> GaussianArrays:
+        with guard():
+            return GaussianArrays.of(*in_light(model, camera, look), harmonics=harmonics(model))
 
     def engine() -> QueryEngine:
         with guard():
@@ -143,6 +155,7 @@ def scene_of_model(
         file=file,
         encode_texts=encode_texts,
         state=model.state_dict(),
+        paint=paint,
         cache_dir=cache_dir,
         config=settings,
         watch=watch,
@@ -254,12 +267,11 @@ def check_checkpoint(place: Path) -> None:
 
 
 @torch.no_grad()
-def _draw(model: Lang3DXLModel, camera: Camera, features: Float[Tensor, "n d"]) -> View:
+def _draw(model: Lang3DXLModel, camera: Camera, features: Float[Tensor, "n d"] | None) -> View:
     """Render a camera of the rasterizer with a model in evaluation mode."""
     start = time.perf_counter()
     model.set_crop(None)
     outputs, rendered = model.render(view_of(camera).to(model.device), features)
-    assert rendered is not None
     maps = {name: outputs[name][..., 0] for name in ("accumulation", "depth")}
     seconds = time.perf_counter() - start
     return View(camera, outputs["rgb"], rendered, maps["accumulation"], maps["depth"], seconds)

@@ -13,15 +13,16 @@ from lang3dxl_ns.plugin.load_scene import latest_checkpoint
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.saved_config import read_config
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainerConfig
+from lang3dxl_ns.query.find_run import find_config
 
 
-def open_run(config_path: Path) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPipeline, int]:
+def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPipeline, int]:
     """Settings, pipeline (in evaluation mode) and iteration of a run's latest checkpoint.
 
-    Raises UserError for a config.yml that is damaged, asks for more than settings, or is of another method;
-    and for a checkpoint that is missing, damaged, or does not fit the settings.
+    run: as for `find_config`. Raises UserError for a config.yml that is damaged, asks for more than settings,
+    or is of another method; and for a checkpoint that is missing, damaged, or does not fit the settings.
     """
-    config_path = config_path.expanduser().absolute()
+    config_path = find_config(run).absolute()
     config = read_config(config_path)
     if not isinstance(config, Lang3DXLTrainerConfig):
         raise UserError(f"{config_path} is a run of another method: use nerfstudio's own commands")

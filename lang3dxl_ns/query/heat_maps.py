@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from numpy import ndarray as Array
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
@@ -47,3 +51,44 @@ def _colors(name: str) -> Float[Tensor, "256 3"]:
             f"there is no color map {name!r}: choose one of matplotlib's, such as turbo or viridis"
         )
     return torch.tensor(colormaps[name](torch.linspace(0, 1, 256).numpy())[:, :3], dtype=torch.float32)
+
+
+PROMPT_COLORS = (
+    *((230, 25, 75), (0, 130, 200), (245, 130, 48), (60, 180, 75), (145, 30, 180)),
+    *((70, 240, 240), (240, 50, 230), (210, 245, 60), (170, 110, 40), (128, 0, 0)),
+)
+"""Distinct colors, one per prompt; they repeat after the tenth."""
+_FONT_SHARE = 32
+"""Height of a legend's letters: the picture's width divided by this, at least 11 pixels."""
+
+
+def tinted(
+    image: Float[Tensor, "h w 3"],
+    maps: Float[Tensor, "q h w"],
+    thresholds: Float[Tensor, " q"],
+    opacity: float = 0.7,
+) -> Float[Tensor, "h w 3"]:
+    """The image with each prompt's matches in its own color: that of the most relevant where several match,
+    stronger with relevancy."""
+    excess = torch.where(maps > thresholds[:, None, None], maps, 0.0)
+    best, which = excess.max(0)
+    colors = torch.tensor([PROMPT_COLORS[i % len(PROMPT_COLORS)] for i in range(len(maps))]).to(image) / 255
+    strength = opacity * (best > 0) * (0.5 + 0.5 * heat(best, float(thresholds.min())))
+    return torch.lerp(image, colors[which], strength[..., None].to(image))
+
+
+def with_legend(
+    picture: UInt8[Array, "h w 3"], labels: Sequence[str], colors: Sequence[tuple[int, int, int]]
+) -> UInt8[Array, "h+legend w 3"]:
+    """A picture with a line below for each label: a square of its color, and the words."""
+    height, width = picture.shape[:2]
+    size = max(width // _FONT_SHARE, 11)
+    line = size + size // 2
+    canvas = Image.new("RGB", (width, height + line * len(labels)), "white")
+    canvas.paste(Image.fromarray(picture))
+    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(size)
+    for i, label in enumerate(labels):
+        top = height + i * line + (line - size) // 2
+        pen.rectangle((size // 2, top, size // 2 + size, top + size), fill=colors[i % len(colors)])
+        pen.text((2 * size, top + size / 2), " ".join(label.split()), "black", font, anchor="lm")
+    return np.asarray(canvas)

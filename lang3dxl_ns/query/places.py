@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lang3dxl_ns.scene.camera import Camera
 
 _OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
+STRONG = 0.5
+"""The match itself is above this fraction of the way from the threshold to the highest relevancy."""
+_CORE = 0.002
+"""Share of a match's weight that a neighborhood must hold to belong to a group."""
+_MOST_POINTS = 20_000
+"""Heaviest Gaussians that are grouped: DBSCAN keeps all their neighborhoods in memory."""
 
 
 @dataclass(frozen=True)
@@ -42,39 +48,46 @@ def world_points(
     return (torch.stack([x, y, z], dim=1) - view[:3, 3]) @ view[:3, :3]
 
 
-def strongest_match(points: Float[Tensor, "n 3"], weights: Float[Tensor, " n"], gap: float) -> Box:
-    """Box of the connected points with the largest total weight; gaps of about `gap` (world units) divide."""
-    cells, cell_of = (points / gap).floor().long().unique(dim=0, return_inverse=True)
-    group = _connected(cells)[cell_of.cpu()].to(points.device)
-    totals = torch.zeros(int(group.max()) + 1, dtype=weights.dtype, device=points.device)
-    totals.index_add_(0, group, weights)
-    chosen = points[group == totals.argmax()].double()
-    low, high = (_quantile(chosen, q) for q in (_OUTLIERS, 1 - _OUTLIERS))
-    return Box(tuple(low.tolist()), tuple(high.tolist()), float(totals.max() / totals.sum()))  # type: ignore[arg-type]
+def strongest_match(
+    means: Float[Tensor, "n 3"],
+    scores: Float[Tensor, " n"],
+    mass: Float[Tensor, " n"],
+    threshold: float,
+    gap: float,
+) -> Box | None:
+    """Box of the connected Gaussians that match best; None if none does.
+
+    Only Gaussians more than half-way from the threshold to the best count, so that weaker matches beside the
+    strongest don't widen its box. DBSCAN tells groups apart.
+
+    Args:
+        means: centers, world units.
+        scores: relevancy, 0…1.
+        mass: pixels that each fills, over all views.
+        threshold: relevancy above which a Gaussian matches.
+        gap: world units that divide two groups.
+    """
+    weights = (scores - threshold).clamp_min(0) * mass
+    rows = (weights > 0).nonzero().squeeze(1)
+    if not len(rows):
+        return None
+    level = threshold + STRONG * (_high(scores[rows], mass[rows]) - threshold)
+    strong = rows[scores[rows] >= level]
+    strong = strong[weights[strong].argsort(descending=True)[:_MOST_POINTS]]
+    points, share = means[strong].double().cpu().numpy(), weights[strong].double().cpu().numpy()
+    from sklearn.cluster import DBSCAN  # takes a second to import
+
+    groups = DBSCAN(eps=gap, min_samples=1).fit_predict(points, sample_weight=share / (share.sum() * _CORE))
+    if (groups < 0).all():  # no dense place: the heaviest Gaussian
+        groups = np.where(np.arange(len(groups)) == share.argmax(), 0, -1)
+    totals = np.bincount(groups[groups >= 0], weights=share[groups >= 0])
+    chosen = points[groups == totals.argmax()]
+    low, high = np.quantile(chosen, (_OUTLIERS, 1 - _OUTLIERS), axis=0, method="nearest")
+    return Box(tuple(low.tolist()), tuple(high.tolist()), float(totals.max() / share.sum()))
 
 
-def _quantile(points: Float[Tensor, "n 3"], q: float) -> Float[Tensor, "3"]:
-    """Quantile along each axis; torch.quantile takes at most 16 million values."""
-    return points.sort(dim=0).values[round(q * (len(points) - 1))]
-
-
-def _connected(cells: Int[Tensor, "n 3"]) -> Int[Tensor, " n"]:
-    """Group of every cell; cells that touch, even at a corner, are in one group."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    cells = cells.cpu() - cells.amin(0).cpu() + 1
-    strides = torch.tensor([1, 0, 0])
-    strides[1] = cells[:, 0].max() + 2
-    strides[2] = strides[1] * (cells[:, 1].max() + 2)
-    keys, order = (cells * strides).sum(1).sort()
-    sources, targets = [], []
-    for step in list(product((-1, 0, 1), repeat=3))[14:]:  # half of the neighbors: the rest is symmetric
-        wanted = keys + (torch.tensor(step) * strides).sum()
-        place = torch.searchsorted(keys, wanted).clamp_max(len(keys) - 1)
-        touching = keys[place] == wanted
-        sources.append(order[touching])
-        targets.append(order[place[touching]])
-    rows, columns = torch.cat(sources).numpy(), torch.cat(targets).numpy()
-    graph = coo_matrix(([1] * len(rows), (rows, columns)), shape=(len(cells),) * 2)
-    return torch.from_numpy(connected_components(graph, directed=False)[1]).long()
+def _high(scores: Float[Tensor, " n"], mass: Float[Tensor, " n"]) -> float:
+    """Relevancy that 2 % of the matching mass exceed: the highest, without stray Gaussians."""
+    order = scores.argsort(descending=True)
+    share = mass[order].cumsum(0) / mass.sum()
+    return float(scores[order][int((share < _OUTLIERS).sum().clamp_max(len(order) - 1))])

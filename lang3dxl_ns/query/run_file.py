@@ -8,13 +8,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
+from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
@@ -29,7 +30,7 @@ SCENE_FILE = "lang3dxl_scene.json"
 _VERSION = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ScenePhoto:
     """A photo's name and camera, at training resolution."""
 
@@ -41,11 +42,29 @@ class ScenePhoto:
     """Of the file: masks are drawn on the distorted photo, while views are undistorted."""
     mask: str | None = None
     """File of the photo's foreground mask."""
+    size: tuple[int, int] | None = None
+    """Width and height of the file; None in runs of earlier versions: that of the lens."""
+
+    def __repr__(self) -> str:
+        width, height = self.size or (self.lens.width, self.lens.height)
+        held_out = ", held out" if self.split == "eval" else ""
+        return f"ScenePhoto({self.name!r}, {width} × {height} pixels{held_out})"
 
     @property
     def camera(self) -> Camera:
-        """The camera for the rasterizer."""
+        """The camera for the rasterizer, at training resolution."""
         return self.lens.camera(view_matrix(torch.tensor(self.camera_to_world)))
+
+    @property
+    def full_camera(self) -> Camera:
+        """The camera at the file's resolution."""
+        lens = self.lens if self.size is None else self.lens.resized(*self.size)
+        return lens.camera(view_matrix(torch.tensor(self.camera_to_world)))
+
+    @property
+    def pose(self) -> Float64[Array, "4 4"]:
+        """Camera → world in the model's frame, nerfstudio's axes."""
+        return self.camera.pose
 
     def photo(self, folder: Path = Path()) -> Photo:
         """The photo in its folder; without its mask if that is gone."""
@@ -116,9 +135,10 @@ class SceneFile:
         )
 
 
-def _photo(lens: dict[str, Any], **rest: Any) -> ScenePhoto:
+def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
     distortion = tuple(lens.pop("distortion"))
-    return ScenePhoto(lens=Lens(**lens, distortion=distortion), **rest)
+    size = None if size is None else tuple(size)
+    return ScenePhoto(lens=Lens(**lens, distortion=distortion), size=size, **rest)
 
 
 def _checked(scene: SceneFile) -> SceneFile:
@@ -132,6 +152,9 @@ def _checked(scene: SceneFile) -> SceneFile:
         turned = torch.tensor(photo.camera_to_world)[:, :3].double().det()
         _expect(1e-3 < abs(float(turned)) < 1e3, f"{photo.name} has no pose")
         photo.lens.check()
+        if photo.size is not None:
+            _expect(len(photo.size) == 2, f"{photo.name} has the size {photo.size}")
+            replace(photo.lens, width=photo.size[0], height=photo.size[1]).check()
     _expect(len({photo.name for photo in scene.photos}) == len(scene.photos), "a photo is listed twice")
     for text in (scene.clip, scene.clip_identity):
         _expect(isinstance(text, str | None), f"its CLIP is {text!r}")

@@ -4,141 +4,46 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine
-from lang3dxl_ns.query.places import Box, strongest_match
-from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
-from lang3dxl_ns.query.run_file import SceneFile
-from lang3dxl_ns.query.text import Prompt, TextConfig, TextEncoder, parse_prompts
+from lang3dxl_ns.query.match import Found, Match, View, Viewpoint
+from lang3dxl_ns.query.overview import overview
+from lang3dxl_ns.query.places import strongest_match
+from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.rank_views import rank_views
+from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
+from lang3dxl_ns.query.splat_file import GaussianArrays, write_gaussians
+from lang3dxl_ns.query.text import Prompt, TextEncoder, parse_prompts
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
-from lang3dxl_ns.scene.camera import Camera, posed, resized
+from lang3dxl_ns.scene.camera import Camera, posed, resized, with_longer_side
 
 _LEAST_PIXELS = 1.0
 """Pixels of a small view that a match must fill."""
-
-
-@dataclass
-class QueryConfig:
-    """Settings of queries."""
-
-    text: TextConfig = field(default_factory=TextConfig)
-    """Synonyms, their combination, canonical phrases."""
-    temperature: float = TEMPERATURE
-    """Softmax temperature of the relevancy; changes neither the ranking of Gaussians nor what matches."""
-    threshold: float = 0.5
-    """Relevancy above which a pixel matches."""
-    min_alpha: float = 0.3
-    """Coverage below which a pixel can't match."""
-    foreground: str = ""
-    """Restrict matches to what this prompt finds, such as `building`; for views without a mask. The view of a
-    photo with a foreground mask is always restricted to it."""
-    views: int = 100
-    """Number of training views, evenly spread, that `find` chooses from."""
-    view_side: int = 256
-    """Pixels of their longer side, for measuring which Gaussians they show."""
-
-    def __post_init__(self) -> None:
-        """Raises UserError for invalid options."""
-        check_numbers(self, _BOUNDS)
-
-
-_BOUNDS = {
-    "temperature": (1e-3, 1e4),
-    "threshold": (0, 1),
-    "min_alpha": (0, 1),
-    "views": (1, 1e6),
-    "view_side": (8, 8192),
-}
-
-
-@dataclass
-class View:
-    """A rendering, shared by several prompts."""
-
-    camera: Camera
-    image: Float[Tensor, "h w 3"]
-    """Colors, 0…1."""
-    carried: Float[Tensor, "h w d"]
-    """Values that Gaussians carried for the prompts, composited over black."""
-    alpha: Float[Tensor, "h w"]
-    """Coverage, 0…1."""
-    depth: Float[Tensor, "h w"]
-    """Along the camera's axis, units of the model's frame."""
-    seconds: float = 0.0
-    """Rendering time."""
-    counts: Bool[Tensor, "h w"] | None = None
-    """Foreground of the photo at this view; None: everything."""
-
-
-@dataclass
-class Match:
-    """Match of a prompt in a view."""
-
-    prompt: Prompt
-    synonyms: list[str]
-    """Synonyms searched along with the prompt."""
-    doubt: float
-    """Share of unrelated words that fit the scene as well: above 0.1 the scene hardly shows the prompt, or
-    CLIP doesn't know it."""
-    view: View
-    relevancy: Float[Tensor, "h w"]
-    """0…1; above 0.5 where the prompt beats all its competitors, 0 where nothing is rendered."""
-    mask: Bool[Tensor, "h w"]
-    """Above the threshold."""
-    peak: tuple[int, int]
-    """Column and row of the most relevant pixel."""
-    score: float
-    """Relevancy there."""
-    seconds: float
-    """For all prompts of the call, without rendering."""
-
-
-@dataclass
-class Viewpoint:
-    """A training camera that shows a match."""
-
-    name: str
-    """Name of the photo."""
-    camera: Camera
-    area: float
-    """Share of the view that matches."""
-    score: float
-    """Relevancy of the best pixel."""
-    rank: float
-    """Mean over the view of relevancy above the threshold: area times confidence."""
-
-
-@dataclass
-class Found:
-    """Matches of a prompt in the scene."""
-
-    prompt: Prompt
-    viewpoints: list[Viewpoint]
-    """Best first; empty if nothing matches."""
-    box: Box | None
-    """Around the strongest connected match; None if nothing matches."""
-    doubt: float
-    """As in `Match`."""
+LARGEST = 1920
+"""Longer side of pictures in pixels, where no size is asked for."""
+Place = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
+"""A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
 
 
 class Scene:
-    """A trained scene; `lang3dxl_ns.load_scene(config.yml)` makes one.
+    """A trained scene; `lang3dxl_ns.load_scene(run)` makes one.
 
     Args:
-        render: renders a camera, compositing the values that Gaussians carry [n, d].
+        render: renders a camera, compositing the values that Gaussians carry [n, d], if any.
         fill: from a camera and a weight per pixel to the pixels that every Gaussian fills.
         engine: makes the query engine; called once, at the first query.
         gaussians: the model's raw parameters (means, codes, …).
@@ -146,18 +51,21 @@ class Scene:
         encode_texts: the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
         state: all tensors that affect a rendering or decoding; they key the cache.
         cache_dir: folder for small views and the table; None: no cache.
+        paint: from a camera and a training photo's name (None: the look of the camera's own view) to the
+            Gaussians as arrays, with their colors as seen from there.
         watch: called with a short description of slow work; None: a progress bar.
     """
 
     def __init__(
         self,
-        render: Callable[[Camera, Float[Tensor, "n d"]], View],
+        render: Callable[[Camera, Float[Tensor, "n d"] | None], View],
         fill: Callable[[Camera, Float[Tensor, "h w"]], Float[Tensor, " n"]],
         engine: Callable[[], QueryEngine],
         gaussians: Mapping[str, Tensor],
         file: SceneFile,
         encode_texts: Callable[[list[str]], Tensor],
         state: Mapping[str, Tensor],
+        paint: Callable[[Camera, str | None], GaussianArrays],
         cache_dir: Path | None = None,
         config: QueryConfig | None = None,
         watch: Callable[[str], None] | None = None,
@@ -168,9 +76,17 @@ class Scene:
         self.gaussians = gaussians
         self.file = file
         self.text = TextEncoder(encode_texts, self.config.text)
-        self._state, self._cache_dir = state, cache_dir
+        self._state, self._paint, self._cache_dir = state, paint, cache_dir
         self._doubt_alone: dict[str, float] = {}
         """Of texts without their synonyms."""
+
+    def __repr__(self) -> str:
+        photos = self.photos
+        held_out = sum(photo.split == "eval" for photo in photos)
+        return (
+            f"Scene({len(self.gaussians['means']):,} Gaussians, {len(photos)} photos ({held_out} held out) "
+            f"of {self.file.data}, CLIP {self.file.clip})"
+        )
 
     @property
     def device(self) -> torch.device:
@@ -179,23 +95,57 @@ class Scene:
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
-    def camera(self, place: Camera | str | Float[Tensor, "rows 4"]) -> Camera:
-        """The given camera, that of a photo by name, or one at a pose (camera → world in the model's frame,
-        nerfstudio's axes) with the first photo's lens. Raises UserError for an unknown name."""
-        if isinstance(place, Camera):
-            return place
-        if isinstance(place, str):
-            return self.file.photo(place).camera
-        return posed(place, like=self.file.photos[0].camera)
+    @property
+    def photos(self) -> list[ScenePhoto]:
+        """Training photos, then held-out ones: names, cameras, poses."""
+        return self.file.photos
 
-    def query(self, texts: str | Sequence[str], place: Camera | str | Float[Tensor, "rows 4"]) -> list[Match]:
+    def camera(self, place: Place, size: int | None = None) -> Camera:
+        """The given camera, that of a photo by name, or one at a pose (camera → world in the model's frame,
+        nerfstudio's axes) with the first photo's lens. size: of the longer side in pixels; by default a
+        camera's own, and that of the photo's file, at most 1920. Raises UserError for an unknown name."""
+        size = self.config.size if size is None else size
+        if isinstance(place, Camera):
+            return place if size is None else with_longer_side(place, size)
+        photo = self.file.photo(place) if isinstance(place, str) else self.photos[0]
+        camera = (
+            photo.full_camera if isinstance(place, str) else posed(torch.as_tensor(place), photo.full_camera)
+        )
+        return resized(camera, LARGEST) if size is None else with_longer_side(camera, size)
+
+    def render(self, place: Place, size: int | None = None) -> View:
+        """The scene from a photo's viewpoint by name, a camera or a pose, at a size as for `camera`."""
+        view = self._render(self.camera(place, size), None)
+        view.name = self.file.photo(place).name if isinstance(place, str) else None
+        return view
+
+    def query(
+        self,
+        texts: str | Sequence[str],
+        place: Place | None = None,
+        size: int | None = None,
+        threshold: float | None = None,
+    ) -> list[Match]:
         """Matches in a view, one per prompt.
 
-        texts: prompts as `parse_prompts` reads them ("dome; rose window", '"windows" not "arcades"'). The
-        view of a photo, by name, is restricted to its foreground. Raises UserError for an empty text or an
-        unknown photo.
+        Args:
+            texts: prompts as `parse_prompts` reads them ("dome; rose window", '"windows" not "arcades"').
+            place: a photo's name (matches are restricted to its foreground), a camera or a pose; None: for
+                each prompt the training view that shows it best.
+            size: of the longer side in pixels, as for `camera`.
+            threshold: relevancy above which a pixel matches; default: the settings', 0.5.
+
+        Raises UserError for an empty text or an unknown photo.
         """
-        return self.match(self.prompts(texts), place)
+        prompts = self.prompts(texts)
+        if place is not None:
+            return self.match(prompts, place, size, threshold)
+        names = self.best_views(prompts)
+        return [self.match([p], n, size, threshold)[0] for p, n in zip(prompts, names, strict=True)]
+
+    def best_views(self, prompts: str | Sequence[str | Prompt]) -> list[str]:
+        """For each prompt the name of the training photo whose view shows it best, or comes closest."""
+        return [(f.viewpoints or f.closest)[0].name for f in self.find(prompts, most=1)]
 
     def prompts(self, texts: str | Sequence[str | Prompt]) -> list[Prompt]:
         """Parsed prompts. Raises UserError if there are none."""
@@ -203,16 +153,25 @@ class Scene:
         prompts = [p for text in typed for p in ([text] if isinstance(text, Prompt) else parse_prompts(text))]
         return prompts or parse_prompts("")
 
-    def match(self, prompts: Sequence[Prompt], place: Camera | str | Float[Tensor, "rows 4"]) -> list[Match]:
-        """Matches of parsed prompts in a view."""
+    def match(
+        self,
+        prompts: Sequence[Prompt],
+        place: Place,
+        size: int | None = None,
+        threshold: float | None = None,
+    ) -> list[Match]:
+        """Matches of parsed prompts in a view; see `query`."""
+        threshold = self._threshold(threshold)
         queries, within = self._queries(prompts)
         doubts = self.doubts.of(queries)[: len(prompts)]
         start = time.perf_counter()
         carried = self.engine.carried(queries)
         seconds = time.perf_counter() - start
-        view = self._render(self.camera(place), carried)
-        view.counts = self._foreground_of(place) if isinstance(place, str) else None
+        view = self._render(self.camera(place, size), carried)
+        if isinstance(place, str):
+            view.name, view.counts = self.file.photo(place).name, self._foreground_of(place, view.camera)
         start = time.perf_counter()
+        assert view.carried is not None
         maps = self.engine.maps(view.carried, queries)
         keep = view.alpha >= self.config.min_alpha
         if view.counts is not None:
@@ -227,24 +186,32 @@ class Scene:
         return [
             Match(
                 prompt,
-                self._synonyms(prompt),
+                self.synonyms(prompt),
                 doubt,
                 view,
                 relevancy,
-                relevancy > self.config.threshold,
+                relevancy > threshold,
                 (place % view.camera.width, place // view.camera.width),
                 score,
                 seconds,
+                threshold,
             )
             for prompt, doubt, relevancy, score, place in zip(
                 prompts, doubts, maps, scores, places, strict=True
             )
         ]
 
+    def _threshold(self, asked: float | None) -> float:
+        if asked is None:
+            return self.config.threshold
+        if not 0 <= asked <= 1:
+            raise UserError(f"the threshold is {asked}: give a relevancy from 0 to 1")
+        return asked
+
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
         """Vectors of prompts on the scene's device. A text that the scene doubts has its synonyms beside it:
         where CLIP knows the word itself, they would only blur it."""
-        known = {prompt.text for prompt in prompts if not self._synonyms(prompt)}
+        known = {prompt.text for prompt in prompts if not self.synonyms(prompt)}
         return self.text.queries(prompts, known).to(self.device)
 
     def _synonyms(self, prompt: Prompt) -> list[str]:
@@ -269,11 +236,49 @@ class Scene:
             raise UserError(f"{text!r} are {len(prompts)} prompts: score Gaussians for one at a time")
         return self._of_gaussians(prompts)[0]
 
-    def find(self, text: str | Sequence[str | Prompt], most: int = 10) -> list[Found]:
+    def find(
+        self, text: str | Sequence[str | Prompt], most: int = 10, threshold: float | None = None
+    ) -> list[Found]:
         """Matches of each prompt in the scene: the training views that show it best, and a box."""
-        prompts = self.prompts(text)
+        prompts, threshold = self.prompts(text), self._threshold(threshold)
         scores, doubts = self._of_gaussians(prompts), self.doubts.of(self.queries(prompts))
-        return [self._found(*one, most) for one in zip(prompts, scores, doubts, strict=True)]
+        return [self._found(*one, most, threshold) for one in zip(prompts, scores, doubts, strict=True)]
+
+    def arrays(self, text: str | None = None, look: str | None = None) -> GaussianArrays:
+        """All Gaussians as NumPy arrays, with their relevancy to a prompt if one is given.
+
+        Colors that depend on the view, or on a photo's light, are those towards the overview photo, under the
+        look of the training photo `look` (default: of the overview photo).
+        """
+        camera = overview(self.photos, tuple(self.gaussians["means"].median(0).values.tolist())).camera
+        found = self._paint(camera, look)
+        if text is None:
+            return found
+        return replace(found, relevancy=self.query_gaussians(text).cpu().float().numpy())
+
+    def export(
+        self,
+        path: str | Path,
+        text: str | None = None,
+        threshold: float | None = None,
+        everything: bool = False,
+        look: str | None = None,
+    ) -> int:
+        """Write the Gaussians as a .ply or .spz file for splat viewers; returns how many.
+
+        With a text, only those that match it, or with `everything` all of them; the PLY has their relevancy
+        as a property. Colors as in `arrays`. Raises UserError if nothing matches.
+        """
+        found, threshold = self.arrays(text, look), self._threshold(threshold)
+        if found.relevancy is not None and not everything:
+            keep = found.relevancy > threshold
+            if not keep.any():
+                raise UserError(
+                    f"no Gaussian matches {text!r}: the best reaches {found.relevancy.max():.2f}; lower "
+                    f"--threshold, now {threshold}, or write all with their relevancy (--all)"
+                )
+            found = found[keep]
+        return write_gaussians(Path(path), found)
 
     def _of_gaussians(self, prompts: Sequence[Prompt]) -> Float[Tensor, "q n"]:
         queries, within = self._queries(prompts)
@@ -283,23 +288,20 @@ class Scene:
             scores = scores * (confining.amax(0) > 0.5)
         return scores
 
-    def _found(self, prompt: Prompt, scores: Float[Tensor, " n"], doubt: float, most: int) -> Found:
-        excess = (scores - self.config.threshold).clamp_min(0)
-        matching = (excess > 0).float()
-        viewpoints = []
-        for name, view in self.visible.items():
-            area = view.share(matching)
-            if area * view.camera.width * view.camera.height < _LEAST_PIXELS:
-                continue
-            camera, score = self.file.photo(name).camera, view.highest(scores, _LEAST_PIXELS / 4)
-            viewpoints.append(Viewpoint(name, camera, area, score, view.share(excess)))
-        viewpoints.sort(key=lambda v: v.rank, reverse=True)
-        weight = excess * self._mass
-        rows = (weight > 0).nonzero().squeeze(1)
+    def _found(
+        self, prompt: Prompt, scores: Float[Tensor, " n"], doubt: float, most: int, threshold: float
+    ) -> Found:
+        ranks = rank_views(self.visible, self.gaussians["means"], scores, threshold)
+        closest = [
+            Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
+            for name, found in ranks.items()
+        ]
+        closest.sort(key=lambda v: v.rank, reverse=True)
+        viewpoints = [v for v in closest if v.area * self.visible[v.name].size >= _LEAST_PIXELS]
         box = None
-        if viewpoints and len(rows):
-            box = strongest_match(self.gaussians["means"][rows], weight[rows], self._gap)
-        return Found(prompt, viewpoints[:most], box, doubt)
+        if viewpoints:
+            box = strongest_match(self.gaussians["means"], scores, self._mass, threshold, self._gap)
+        return Found(prompt, viewpoints[:most], box, doubt, closest[:most])
 
     # ── computed once per checkpoint ────────────────────────────────────────────────────────────────
 
@@ -325,15 +327,18 @@ class Scene:
         return views
 
     def _visible(self, name: str, camera: Camera) -> VisibleGaussians:
-        counts = self._foreground_of(name)
-        weight = torch.ones(1, 1) if counts is None else counts.float()
-        size = camera.height, camera.width
-        small = F.interpolate(weight[None, None], size, mode="nearest-exact")[0, 0]
-        return VisibleGaussians.of(camera, self._fill(camera, small.to(self.device)))
+        counts = self._foreground_of(name, camera)
+        weight = torch.ones(camera.height, camera.width) if counts is None else counts.float()
+        return VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
 
-    def _foreground_of(self, name: str) -> Bool[Tensor, "h w"] | None:
+    def _foreground_of(self, name: str, camera: Camera) -> Bool[Tensor, "h w"] | None:
         counts = self.file.photo(name).foreground()
-        return None if counts is None else counts.to(self.device)
+        if counts is None:
+            return None
+        size = camera.height, camera.width
+        return (
+            F.interpolate(counts[None, None].float(), size, mode="nearest-exact")[0, 0].bool().to(self.device)
+        )
 
     @cached_property
     def _mass(self) -> Float[Tensor, " n"]:

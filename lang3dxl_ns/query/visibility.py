@@ -33,15 +33,14 @@ class VisibleGaussians:
         rows = (mass > _LEAST).nonzero().squeeze(1)
         return cls(camera, rows.int(), mass[rows].half())
 
+    @property
+    def size(self) -> int:
+        """Pixels of the view."""
+        return self.camera.width * self.camera.height
+
     def share(self, values: Float[Tensor, " n"]) -> float:
         """Mean of the Gaussians' values over the view."""
-        area = self.camera.width * self.camera.height
-        return float((values[self.rows] * self.pixels.float()).sum()) / area
-
-    def highest(self, values: Float[Tensor, " n"], least: float) -> float:
-        """Highest value among Gaussians that fill at least this many pixels, or 0."""
-        large = self.rows[self.pixels >= least]
-        return float(values[large].max()) if len(large) else 0.0
+        return float((values[self.rows] * self.pixels.float()).sum()) / self.size
 
     def distance(self, means: Float[Tensor, "n 3"]) -> float:
         """Median depth of the visible Gaussians, world units; NaN if there are none."""

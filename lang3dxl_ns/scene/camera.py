@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
+from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 
 MOST_PIXELS = 180_000_000
 """Most pixels of a picture: Pillow rejects larger ones as an attack."""
-
 
 LONGEST_SIDE = 1 << 16
 """Most pixels of a picture's side."""
@@ -89,6 +90,11 @@ class Camera:
     width: int
     height: int
 
+    @property
+    def pose(self) -> Float64[Array, "4 4"]:
+        """Camera → world, nerfstudio's axes (x right, y up, z backward), as `Scene.camera` takes it."""
+        return np.vstack([camera_to_world(self.view_matrix.detach().double()).cpu().numpy(), [0, 0, 0, 1.0]])
+
     def detach(self) -> Camera:
         """The same camera, without gradient."""
         return Camera(self.view_matrix.detach(), self.intrinsics.detach(), self.width, self.height)
@@ -141,7 +147,14 @@ def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "
 
 def resized(camera: Camera, longer_side: int) -> Camera:
     """The same view with fewer pixels, never more."""
-    factor = min(longer_side / max(camera.width, camera.height), 1.0)
+    return with_longer_side(camera, min(longer_side, max(camera.width, camera.height)))
+
+
+def with_longer_side(camera: Camera, pixels: int) -> Camera:
+    """The same view at another resolution. Raises UserError for fewer than one pixel, or too many."""
+    if not (isinstance(pixels, int) and 1 <= pixels <= LONGEST_SIDE):
+        raise UserError(f"a picture of {pixels} pixels can't be rendered: give 1 to {LONGEST_SIDE}")
+    factor = pixels / max(camera.width, camera.height)
     width, height = max(round(camera.width * factor), 1), max(round(camera.height * factor), 1)
     zoom = camera.intrinsics.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
     return Camera(camera.view_matrix, camera.intrinsics * zoom, width, height)

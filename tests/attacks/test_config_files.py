@@ -65,7 +65,7 @@ def test_our_commands_run_nothing_in_a_config(tmp_path, text, command):
     path, trap = trapped(tmp_path, text)
     out = [] if command == "view" else ["--out", str(tmp_path / "out.ply")]
     with pytest.raises(SystemExit, match=r"Error: .*config\.yml can't be read"):
-        main([*command.split(), "--load-config", str(path), *out])
+        main([*command.split(), str(path), *out])
     assert not trap.exists()
 
 

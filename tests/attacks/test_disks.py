@@ -96,7 +96,7 @@ def test_a_full_or_read_only_disk_is_one_line_and_leaves_no_half_file(
     monkeypatch.setattr(files.os, "fsync", refuse(number))
     options = ["--threshold", "0"] + (["--image", "photo_000"] if command == "query" else [])
     with pytest.raises(SystemExit, match=r"Error: .*found.*" + os.strerror(number)):
-        main([command, "--load-config", str(run / "config.yml"), "--text", "a", "--out", str(out), *options])
+        main([command, str(run / "config.yml"), "--text", "a", "--out", str(out), *options])
     assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
 
 
@@ -105,16 +105,16 @@ def test_a_full_or_read_only_disk_is_one_line_and_leaves_no_half_file(
 def test_places_that_can_not_be_written_to_are_told_before_the_work(tmp_path, command, out):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(SystemExit, match=r"Error: .*(not a file|shorter|does not exist|another place)"):
-        main([command, "--load-config", "none.yml", "--text", "a", "--out", str(tmp_path / out / "x")])
+        main([command, "none.yml", "--text", "a", "--out", str(tmp_path / out / "x")])
     assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_a_file_is_no_folder_and_a_folder_no_file(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(SystemExit, match=r"Error: .*file: File exists; name a folder"):
-        main(["query", "--load-config", "none.yml", "--text", "a", "--out", str(tmp_path / "file")])
-    with pytest.raises(SystemExit, match=r"Error: --out .* is a folder: name"):
-        main(["export", "--load-config", "none.yml", "--text", "a", "--out", str(tmp_path)])
+        main(["query", "none.yml", "--text", "a", "--out", str(tmp_path / "file")])
+    with pytest.raises(SystemExit, match=r"Error: .* is a folder: name"):
+        main(["export", "none.yml", "--text", "a", "--out", str(tmp_path)])
 
 
 @pytest.mark.parametrize("place", ["/dev/null", "/dev/null/below", "/proc/none", "n" * 300])

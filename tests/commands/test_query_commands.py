@@ -24,7 +24,7 @@ def run(monkeypatch):
 
 
 def test_query_writes_pictures_map_and_report(run, tmp_path, capsys):
-    words = ("query", "--load-config", "c", "--text", 'dome not "window"', "--text", "window;oculus")
+    words = ("query", "c", "--text", 'dome not "window"', "--text", "window;oculus")
     run(*words, "--image", "all/0003.jpg", "--out", tmp_path)
     report = json.loads((tmp_path / "query.json").read_text())
     assert report["threshold"] == 0.5
@@ -48,12 +48,12 @@ def test_query_writes_pictures_map_and_report(run, tmp_path, capsys):
 
 
 def test_without_a_view_the_best_one_is_taken(run, tmp_path):
-    run("query", "--load-config", "c", "--text", "dome", "--out", tmp_path)
+    run("query", "c", "--text", "dome", "--out", tmp_path)
     assert (tmp_path / "dome" / "right_0002.npy").exists()
 
 
 def test_all_photos_are_asked(run, tmp_path):
-    run("query", "--load-config", "c", "--text", "dome", "--all", "--out", tmp_path)
+    run("query", "c", "--text", "dome", "--all", "--out", tmp_path)
     assert len(list((tmp_path / "dome").glob("*.npy"))) == 4
 
 
@@ -65,7 +65,6 @@ def test_a_camera_path_is_followed(run, tmp_path):
     (tmp_path / "path.json").write_text(json.dumps(path))
     run(
         "query",
-        "--load-config",
         "c",
         "--text",
         "dome",
@@ -88,24 +87,24 @@ def test_a_camera_path_is_followed(run, tmp_path):
 )
 def test_mistakes_end_in_a_sentence(run, tmp_path, words, message):
     with pytest.raises(SystemExit, match=message):
-        run("query", "--load-config", "c", "--out", tmp_path, *words)
+        run("query", "c", "--out", tmp_path, *words)
 
 
 def test_settings_are_flags(run, tmp_path):
-    words = ("query", "--load-config", "c", "--text", "dome", "--image", "0002", "--out", tmp_path)
+    words = ("query", "c", "--text", "dome", "--image", "0002", "--out", tmp_path)
     run(*words, "--threshold", 0.9999, "--synonyms", "off")
     assert not np.asarray(Image.open(tmp_path / "dome" / "right_0002.mask.png")).any()
 
 
 def test_export_writes_the_matching_gaussians_or_all_with_scores(run, tmp_path):
-    run("export", "--load-config", "c", "--text", "dome", "--out", tmp_path / "dome.ply")
+    run("export", "c", "--text", "dome", "--out", tmp_path / "dome.ply")
     domes = int((painted_gaussians()["words"] == 1).sum())
     assert f"element vertex {domes}\n".encode() in (tmp_path / "dome.ply").read_bytes()
-    run("export", "--load-config", "c", "--text", "dome", "--all", "--out", tmp_path / "all.ply")
+    run("export", "c", "--text", "dome", "--all", "--out", tmp_path / "all.ply")
     content = (tmp_path / "all.ply").read_bytes()
-    assert b"element vertex 5185\n" in content and b"property float score\n" in content
+    assert b"element vertex 5185\n" in content and b"property float relevancy\n" in content
     with pytest.raises(SystemExit, match="no Gaussian matches 'palm tree'"):
-        run("export", "--load-config", "c", "--text", "palm tree", "--out", tmp_path / "none.ply")
+        run("export", "c", "--text", "palm tree", "--out", tmp_path / "none.ply")
 
 
 def test_folder_names_are_safe_and_differ():
@@ -119,3 +118,22 @@ def test_photos_of_one_stem_do_not_overwrite_each_other():
     assert file_names(["a.jpg", "a.png", "../c.d.jpg"]) == ["a_jpg", "a_png", ".._c.d"]
     names = file_names(["a/b.jpg", "a_b.jpg", "a/b.png"])
     assert len(set(names)) == 3
+
+
+def test_each_text_gets_its_own_best_view(run, tmp_path):
+    run("query", "c", "--text", "dome; window", "--out", tmp_path)
+    assert [path.name for path in (tmp_path / "dome").glob("*.npy")] == ["right_0002.npy"]
+    assert [path.name for path in (tmp_path / "window").glob("*.npy")] == ["left_0001.npy"]
+    assert not (tmp_path / "together").exists()
+
+
+def test_a_view_of_several_texts_is_also_one_picture(run, tmp_path):
+    run("query", "c", "--text", "dome; window", "--image", "0003", "--size", 200, "--out", tmp_path)
+    picture = np.asarray(Image.open(tmp_path / "together" / "all_0003.png"))
+    assert picture.shape[1] == 200 and picture.shape[0] > 200  # and a legend
+    assert np.load(tmp_path / "dome" / "all_0003.npy").shape == (200, 200)
+
+
+def test_a_text_that_nothing_matches_says_so(run, tmp_path, capsys):
+    run("query", "c", "--text", "palm tree", "--out", tmp_path)
+    assert "no match; this view comes closest" in capsys.readouterr().out

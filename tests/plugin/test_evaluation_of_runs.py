@@ -101,7 +101,7 @@ def test_evaluate_run_writes_the_report_of_a_run(train, scene, tmp_path):
     trainer = train(scene, iterations=2)
     truth = label(scene, tmp_path / "truth", (0, 1))
     config = str(trainer.base_dir / "config.yml")
-    common = ["evaluate", "run", "--load-config", config, "--ground-truth", str(truth), "--split", "seen"]
+    common = ["evaluate", "run", config, "--ground-truth", str(truth), "--split", "seen"]
     cli.main([*common, "--out", str(tmp_path / "out")])
     report = json.loads((tmp_path / "out" / "scores.json").read_text())
     assert list(report["results"]["photos"]) == ["photo_001.jpg"]

@@ -1,12 +1,14 @@
 """Loading a scene from a run's folder alone."""
 
 import shutil
+from math import isqrt
 from types import SimpleNamespace
 
 import pytest
 import torch
 from conftest import make_trainer
 from PIL import Image
+from plyfile import PlyData
 from scenes import write_scene
 
 import lang3dxl_ns
@@ -14,7 +16,10 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.language import open_scorer
 from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.plugin.load_scene import scene_of_model
+from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
+from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +36,12 @@ def trainer(tmp_path_factory, tiny_clip, tiny_dense):
     return trainer
 
 
+@pytest.fixture(scope="module")
+def scene_photos(tmp_path_factory):
+    """A folder of photos."""
+    return write_scene(tmp_path_factory.mktemp("photos"), photos=6, points=200)
+
+
 @pytest.fixture
 def config(trainer):
     return trainer.base_dir / "config.yml"
@@ -44,7 +55,7 @@ def scene(trainer):
 def test_it_answers_without_its_photos(scene):
     match = scene.query('rose window; dome not "tower"', "photo_002.jpg")[1]
     photo = scene.file.photo("photo_002")
-    assert match.relevancy.shape == (photo.lens.height, photo.lens.width)
+    assert match.relevancy.shape == photo.size[::-1] and not match.view.image.requires_grad
     assert match.relevancy.min() >= 0 and match.relevancy.max() <= 1
     assert len(scene.query_gaussians("dome")) == len(scene.gaussians["means"])
     assert len(scene.find("dome")) == 1
@@ -107,7 +118,7 @@ def test_a_model_in_training_can_be_asked(trainer):
 
 
 def test_mistakes_are_reported(config, tmp_path):
-    with pytest.raises(UserError, match="is not a file"):
+    with pytest.raises(UserError, match="is not a file or folder"):
         lang3dxl_ns.load_scene(tmp_path / "config.yml")
     (tmp_path / "config.yml").write_text("a: 1")
     with pytest.raises(UserError, match=r"not the config.yml of a nerfstudio run"):
@@ -138,3 +149,46 @@ def test_a_run_remembers_its_foreground_masks(trainer, scene):
     photo = scene.file.photo("photo_001")
     assert photo.mask == str(photos["photo_001.jpg"].mask_path)
     assert photo.foreground() is None  # its file has moved with the data
+
+
+@pytest.mark.parametrize("look", ["on", "off"])
+def test_an_exported_ply_has_the_colors_of_the_rendering(train, scene_photos, tmp_path, look):
+    """The file, drawn by the rules of splat viewers, is the rendering."""
+    trainer = train(
+        scene_photos, 30, pipeline__model__appearance__use=look, pipeline__model__view_dependence="on"
+    )
+    scene = lang3dxl_ns.load_scene(trainer.base_dir)
+    assert scene.export(tmp_path / "all.ply", "dome", everything=True) == len(scene.gaussians["means"])
+    rows = PlyData.read(tmp_path / "all.ply")["vertex"]
+    columns = {name: torch.tensor(rows[name].copy()) for name in rows.data.dtype.names}
+    camera = overview(scene.photos, tuple(scene.gaussians["means"].median(0).values.tolist())).camera
+
+    def stack(stem, count):
+        return torch.stack([columns[f"{stem}_{i}"] for i in range(count)], 1)
+
+    means = torch.stack([columns[axis] for axis in "xyz"], 1)
+    count = sum(name.startswith("f_rest") for name in columns) // 3
+    rest = (
+        stack("f_rest", 3 * count).view(-1, 3, count).transpose(1, 2)
+        if count
+        else means.new_zeros(len(means), 0, 3)
+    )
+    coefficients = torch.cat((stack("f_dc", 3)[:, None], rest), 1)
+    position = -camera.view_matrix[:3, :3].T @ camera.view_matrix[:3, 3]
+    colors = (spherical_harmonics(isqrt(count + 1) - 1, means - position, coefficients) + 0.5).clamp_min(0)
+    shapes = Gaussians(means, stack("rot", 4), stack("scale", 3).exp(), columns["opacity"].sigmoid())
+    drawn = rasterize(shapes, camera, colors)
+    view = scene.render(camera)  # over black, like viewers
+    assert view.alpha.mean() > 0.3 and (look == "on") == (count == 0)
+    torch.testing.assert_close(drawn.image.clamp(0, 1), view.image, atol=1e-5, rtol=0)
+    torch.testing.assert_close(columns["relevancy"], scene.query_gaussians("dome"))
+
+
+def test_a_view_has_the_size_of_the_photos_file(train, scene_photos):
+    trainer = train(scene_photos, 2, pipeline__datamanager__camera_res_scale_factor=0.5)
+    scene = lang3dxl_ns.load_scene(trainer.base_dir)
+    photo = scene.photos[0]
+    with Image.open(scene_photos / "images" / photo.name) as file:
+        assert photo.size == file.size == (2 * photo.lens.width, 2 * photo.lens.height)
+        assert scene.render(photo.name).image.shape[:2] == file.size[::-1]
+    assert max(scene.render(photo.name, size=20).image.shape[:2]) == 20

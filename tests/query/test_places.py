@@ -27,32 +27,41 @@ def clouds(*places: float, count: int = 500) -> torch.Tensor:
     return torch.cat([p + torch.rand(count, 3, generator=generator) for p in places])
 
 
+def box_of(points, scores, mass=None, gap=0.3):
+    mass = torch.ones(len(points)) if mass is None else mass
+    return strongest_match(points, scores, mass, 0.5, gap)
+
+
 def test_the_heavier_of_two_matches_wins_though_it_has_fewer_points():
     points = torch.cat([clouds(0.0, count=2000), clouds(5.0, count=1000)])
-    weights = torch.cat([torch.full((2000,), 0.1), torch.full((1000,), 0.3)])
-    box = strongest_match(points, weights, gap=0.3)
+    mass = torch.cat([torch.full((2000,), 0.1), torch.full((1000,), 0.3)])
+    box = box_of(points, torch.full((3000,), 0.8), mass)
     assert all(5.0 <= low < 5.1 for low in box.low) and all(5.9 < high <= 6.0 for high in box.high)
     assert box.share == pytest.approx(0.6, rel=1e-4)
     assert box.center == pytest.approx((5.5, 5.5, 5.5), abs=0.05)
 
 
+def test_weaker_matches_around_the_best_do_not_widen_its_box():
+    """Four windows that are a bit like a rose, around the rose window that is."""
+    points = torch.cat([clouds(1.0), clouds(0.0, 0.5, 1.5, 2.0)])
+    scores = torch.cat([torch.full((500,), 0.9), torch.full((2000,), 0.6)])
+    box = box_of(points, scores)
+    assert min(box.low) >= 1.0 and max(box.high) <= 2.0
+
+
 def test_nothing_depends_on_where_the_world_begins():
     points = clouds(0.0, 3.0)
-    weights = torch.linspace(1, 2, 1000)
-    here, there = (strongest_match(points + shift, weights, 0.4) for shift in (0.0, -40.0))
-    torch.testing.assert_close(torch.tensor(here.low) - 40, torch.tensor(there.low))
+    scores = torch.linspace(0.8, 0.9, 1000)
+    here, there = (box_of(points + shift, scores, gap=0.4) for shift in (0.0, -40.0))
+    torch.testing.assert_close(torch.tensor(here.low) - 40, torch.tensor(there.low), atol=1e-4, rtol=0)
 
 
 def test_a_few_stray_points_do_not_widen_the_box():
     points = torch.cat([clouds(0.0), torch.tensor([[1.0 + 0.2 * i, 0.5, 0.5] for i in range(6)])])
-    assert strongest_match(points, torch.ones(506), gap=0.3).high[0] < 1.05
+    assert box_of(points, torch.full((506,), 0.9)).high[0] < 1.05
 
 
-def test_touching_at_a_corner_connects():
-    points = torch.tensor([[0.5, 0.5, 0.5], [1.5, 1.5, 1.5], [2.5, 0.5, 2.5], [9.5, 0.5, 0.5]])
-    assert strongest_match(points, torch.ones(4), gap=1.0).share == pytest.approx(0.75)
-
-
-def test_a_single_point_is_its_own_box():
-    box = strongest_match(torch.tensor([[1.0, 2.0, 3.0]]), torch.ones(1), 0.1)
-    assert box.low == box.high == (1.0, 2.0, 3.0)
+def test_one_point_is_a_box_and_none_is_not():
+    box = box_of(torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([0.9]), gap=0.1)
+    assert box.low == box.high == (1.0, 2.0, 3.0) and box.share == 1.0
+    assert box_of(clouds(0.0), torch.full((500,), 0.5)) is None

@@ -1,18 +1,26 @@
-"""The splat PLY, read back by an independent reader."""
+"""Splat files: read back, they hold what was written."""
 
 import numpy as np
 import pytest
 import torch
 
-from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.splat_file import GaussianArrays, write_gaussians
+from lang3dxl_ns.rendering import Gaussians
+
+GRAY = 0.28209479177387814
 
 
-@pytest.fixture(params=[0, 1, 3])
-def gaussians(request):
-    g, n = torch.Generator().manual_seed(0), 7
-    shapes = {"means": (3,), "features_dc": (3,), "features_rest": ((request.param + 1) ** 2 - 1, 3),
-              "opacities": (1,), "scales": (3,), "quats": (4,)}  # fmt: skip
-    return {name: torch.randn(n, *shape, generator=g) for name, shape in shapes.items()}
+@pytest.fixture(params=[None, 0, 3], ids=["plain", "degree-0", "degree-1"])
+def gaussians(request) -> GaussianArrays:
+    g = torch.Generator().manual_seed(0)
+
+    def rand(*shape):
+        return torch.rand(7, *shape, generator=g)
+
+    shapes = Gaussians(rand(3) * 4 - 2, rand(4) - 0.5, rand(3) + 0.01, rand())
+    harmonics = None if request.param is None else rand(1 + request.param, 3) - 0.5
+    return GaussianArrays.of(shapes, rand(3), torch.linspace(0, 1, 7), harmonics)
 
 
 def read(path) -> np.ndarray:
@@ -25,33 +33,52 @@ def read(path) -> np.ndarray:
     return rows
 
 
-def test_every_property_is_in_its_place(gaussians, tmp_path):
-    assert write_splats(tmp_path / "all.ply", gaussians) == 7
+def test_every_property_of_a_ply_is_in_its_place(gaussians, tmp_path):
+    assert write_gaussians(tmp_path / "all.ply", gaussians) == 7
     rows = read(tmp_path / "all.ply")
-    coefficients = gaussians["features_rest"].shape[1]
+    extra = 0 if gaussians.harmonics is None else gaussians.harmonics.shape[1] - 1
     expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    expected += [f"f_rest_{i}" for i in range(3 * coefficients)]
-    expected += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    expected += [f"f_rest_{i}" for i in range(3 * extra)]
+    expected += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "relevancy"]
     assert list(rows.dtype.names) == expected
-    np.testing.assert_array_equal(rows["y"], gaussians["means"][:, 1])
-    np.testing.assert_array_equal(rows["opacity"], gaussians["opacities"][:, 0])
-    for channel in range(3 if coefficients else 0):
-        first = rows[f"f_rest_{channel * coefficients}"]
-        np.testing.assert_array_equal(first, gaussians["features_rest"][:, 0, channel])
-    color = 0.5 + 0.28209479177387814 * rows["f_dc_0"]
-    base = gaussians["features_dc"][:, 0]
-    expected_color = 0.5 + 0.28209479177387814 * base if coefficients else base.sigmoid()
-    np.testing.assert_allclose(color, expected_color, atol=1e-6)
+    np.testing.assert_array_equal(rows["y"], gaussians.means[:, 1])
+    np.testing.assert_allclose(1 / (1 + np.exp(-rows["opacity"])), gaussians.opacities, atol=1e-5)
+    np.testing.assert_allclose(np.exp(rows["scale_1"]), gaussians.scales[:, 1], rtol=1e-5)
+    np.testing.assert_array_equal(rows["relevancy"], gaussians.relevancy)
+    for channel in range(3 if extra else 0):
+        first = rows[f"f_rest_{channel * extra}"]
+        np.testing.assert_array_equal(first, gaussians.harmonics[:, 1, channel])
+    if gaussians.harmonics is None:
+        np.testing.assert_allclose(0.5 + GRAY * rows["f_dc_2"], gaussians.colors[:, 2], atol=1e-6)
+    else:
+        np.testing.assert_array_equal(rows["f_dc_2"], gaussians.harmonics[:, 0, 2])
 
 
-def test_only_the_matching_ones_or_all_with_their_scores(gaussians, tmp_path):
-    scores = torch.linspace(0, 1, 7)
-    assert write_splats(tmp_path / "some.ply", gaussians, keep=scores > 0.6) == 3
-    np.testing.assert_array_equal(read(tmp_path / "some.ply")["x"], gaussians["means"][4:, 0])
-    assert write_splats(tmp_path / "all.ply", gaussians, scores=scores) == 7
-    np.testing.assert_array_equal(read(tmp_path / "all.ply")["score"], scores)
+def test_an_spz_file_is_read_back_by_its_library(gaussians, tmp_path):
+    gsply = pytest.importorskip("gsply")
+    assert write_gaussians(tmp_path / "all.spz", gaussians) == 7
+    found = gsply.read_spz(tmp_path / "all.spz")
+    np.testing.assert_allclose(found.means, gaussians.means, atol=1e-5)
+    np.testing.assert_allclose(found.scales, gaussians.log_scales, atol=1 / 16)
+    opacities = 1 / (1 + np.exp(-np.asarray(found.opacities).reshape(-1)))
+    np.testing.assert_allclose(opacities, gaussians.opacities, atol=1 / 255)
+    colors = 0.5 + GRAY * np.asarray(found.sh0)
+    np.testing.assert_allclose(colors, 0.5 + GRAY * gaussians.coefficients[:, 0], atol=0.005)
+    same = np.abs((np.asarray(found.quats) * gaussians.quats).sum(1))  # q and −q are one rotation
+    np.testing.assert_allclose(same, 1, atol=0.01)
 
 
 def test_broken_gaussians_stay_out(gaussians, tmp_path):
-    gaussians["scales"][2, 1] = float("nan")
-    assert write_splats(tmp_path / "all.ply", gaussians) == 6
+    gaussians.scales[2, 1] = float("nan")
+    assert write_gaussians(tmp_path / "all.ply", gaussians) == 6
+
+
+def test_some_can_be_picked(gaussians):
+    few = gaussians[gaussians.relevancy > 0.6]
+    assert len(few) == 3 and repr(few) == "GaussianArrays(3 Gaussians, with relevancy)"
+    np.testing.assert_array_equal(few.means, gaussians.means[4:])
+
+
+def test_other_kinds_of_files_are_refused(gaussians, tmp_path):
+    with pytest.raises(UserError, match=r"end it in .ply or .spz"):
+        write_gaussians(tmp_path / "all.obj", gaussians)

@@ -20,9 +20,10 @@ from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO
 from PIL import Image
 
 from lang3dxl_ns.plugin.cameras import view_of
-from lang3dxl_ns.plugin.viewer.fly_to import overview
-from lang3dxl_ns.plugin.viewer.splats import in_light, sent, splats, with_heat, withdrawn
+from lang3dxl_ns.plugin.light import in_light
+from lang3dxl_ns.plugin.viewer.splats import sent, splats, with_heat, withdrawn
 from lang3dxl_ns.plugin.viewer.worker import Worker
+from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.scene.camera import Camera
 
 if TYPE_CHECKING:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
-from lang3dxl_ns.query.run_file import ScenePhoto
-from lang3dxl_ns.query.scene import Found, Viewpoint
+from lang3dxl_ns.query.match import Found, Viewpoint
 from lang3dxl_ns.scene.camera import Camera
 
 
@@ -39,18 +37,6 @@ def stand_of(camera: Camera, aspect: float, target: tuple[float, ...] | None = N
     half_width = max(k[0, 2], camera.width - k[0, 2]) / k[0, 0]
     fov = 2 * math.atan(max(half_height, half_width / aspect))
     return Stand(position, position + max(ahead, 0.05) * forward, fov)
-
-
-def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePhoto:
-    """The farthest photo that sees the scene's center near its own; otherwise the first."""
-    best, farthest = photos[0], 0.0
-    for photo in photos:
-        camera, lens = photo.camera, photo.lens
-        x, y, z = camera.view_matrix[:3, :3] @ torch.tensor(middle) + camera.view_matrix[:3, 3]
-        wide, high = abs(x) * lens.fx / lens.width, abs(y) * lens.fy / lens.height
-        if z > farthest and max(wide, high) < z / 4:
-            best, farthest = photo, float(z)
-    return best
 
 
 def flight(start: Stand, end: Stand, steps: int) -> Iterator[Stand]:

@@ -17,14 +17,15 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.viewer.fly_to import Stand, Tour, box_lines, flight, overview, stand_of
+from lang3dxl_ns.plugin.viewer.fly_to import Stand, Tour, box_lines, flight, stand_of
 from lang3dxl_ns.plugin.viewer.frame_size import keep_frames_recognizable
 from lang3dxl_ns.plugin.viewer.frustums import draw_frustums
 from lang3dxl_ns.plugin.viewer.guard import Guard, guard_viewers, is_local
 from lang3dxl_ns.plugin.viewer.session import Conversation, plain, shortened
 from lang3dxl_ns.plugin.viewer.worker import Worker
+from lang3dxl_ns.query.match import Found
+from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.run_file import ScenePhoto
-from lang3dxl_ns.query.scene import Found
 from lang3dxl_ns.scene.camera import Camera
 
 if TYPE_CHECKING:

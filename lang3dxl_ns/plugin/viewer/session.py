@@ -19,9 +19,10 @@ from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.query.answer import NOTHING, Asked, Display
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile
-from lang3dxl_ns.query.scene import Found, QueryConfig, Scene
+from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.text import EncodeTexts, Prompt
 
 

@@ -11,11 +11,9 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.query.answer import Display
 from lang3dxl_ns.query.heat_maps import overlay
-from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE, Gaussians
-from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.rendering.gaussians import Gaussians
 
 FAINTEST = 1 / 255
 """Gaussians with less opacity than 8 bits can show are not sent."""
@@ -67,28 +65,6 @@ def rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-
-
-@torch.no_grad()
-def in_light(
-    model: Lang3DXLModel, camera: Camera, look: str | None
-) -> tuple[Gaussians, Float[Tensor, "n 3"]]:
-    """All Gaussians and their colors as seen from a camera, under the look of a photo by name (None: the
-    model's look for this view). A browser keeps them for other views: view-dependent colors are those
-    towards this camera."""
-    g = model.gauss_params
-    scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
-    gaussians = Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1)).detach()
-    pose = camera.view_matrix.to(model.device)
-    position, forward = -pose[:3, :3].T @ pose[:3, 3], pose[2, :3]
-    colors = model._colors(g, position)
-    if model.appearance is None:
-        return gaussians, colors
-    field = model.appearance
-    vector = field.vector(look) if look is not None else field.vector_of_view(position, forward)
-    everything = torch.arange(len(colors), device=colors.device)
-    colors, lit = field(gaussians, colors, vector, everything, None)
-    return lit, colors
 
 
 def with_heat(

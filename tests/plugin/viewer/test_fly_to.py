@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from painted_scene import photo
 
-from lang3dxl_ns.plugin.viewer.fly_to import Stand, Tour, box_lines, flight, overview, stand_of
-from lang3dxl_ns.query.scene import Found, Viewpoint
+from lang3dxl_ns.plugin.viewer.fly_to import Stand, Tour, box_lines, flight, stand_of
+from lang3dxl_ns.query.match import Found, Viewpoint
+from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.text import Prompt
 
 

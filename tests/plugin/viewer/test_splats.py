@@ -11,10 +11,11 @@ from nerfstudio.configs.base_config import ViewerConfig
 from scenes import write_scene
 
 from lang3dxl_ns.plugin.cameras import view_of
+from lang3dxl_ns.plugin.light import in_light
 from lang3dxl_ns.plugin.open_run import open_run
 from lang3dxl_ns.plugin.viewer import browser
 from lang3dxl_ns.plugin.viewer.browser import BrowserViewer, camera_of
-from lang3dxl_ns.plugin.viewer.splats import in_light, splats, with_heat
+from lang3dxl_ns.plugin.viewer.splats import splats, with_heat
 from lang3dxl_ns.query.answer import Display
 from lang3dxl_ns.query.heat_maps import overlay
 from lang3dxl_ns.rendering import Gaussians, rasterize

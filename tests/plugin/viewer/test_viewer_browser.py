@@ -57,7 +57,8 @@ def address(run, request):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     program, *words = request.param.split()
-    command = [Path(sys.executable).parent / program, *words, "--load-config", run / "config.yml"]
+    option = [] if program == "lang3dxl" else ["--load-config"]
+    command = [Path(sys.executable).parent / program, *words, *option, run / "config.yml"]
     options = [*COMMANDS[request.param], str(port)]
     log = run / "viewer.log"
     with (

@@ -1,0 +1,48 @@
+"""Finding a run from a folder above it."""
+
+import os
+
+import pytest
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.find_run import find_config
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch):
+    """Two runs of two scenes; the second is newer."""
+    monkeypatch.chdir(tmp_path)
+    made = []
+    for i, name in enumerate(("outputs/a/lang3dxl/2024", "outputs/b/lang3dxl/2023")):
+        (tmp_path / name).mkdir(parents=True)
+        path = tmp_path / name / "config.yml"
+        path.touch()
+        os.utime(path, (1000 + i, 1000 + i))
+        made.append(path)
+    return made
+
+
+def test_the_newest_under_outputs_is_found(runs):
+    assert find_config().resolve() == runs[1]
+    assert find_config("outputs").resolve() == runs[1]
+
+
+def test_a_folder_names_its_own_runs(runs, tmp_path):
+    for place in (runs[0], runs[0].parent, tmp_path / "outputs" / "a", str(runs[0].parent)):
+        assert find_config(place).resolve() == runs[0]
+    (tmp_path / "outputs" / "config.yml").touch()
+    assert find_config(tmp_path / "outputs") == tmp_path / "outputs" / "config.yml"
+
+
+@pytest.mark.parametrize("place", ["nowhere", "nowhere/config.yml", "\0"])
+def test_wrong_places_are_one_sentence(runs, place):
+    with pytest.raises(UserError, match="is not a file or folder"):
+        find_config(place)
+
+
+def test_folders_without_a_run_say_how_to_make_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"no outputs/ here.*ns-train"):
+        find_config()
+    with pytest.raises(UserError, match=r"holds no run.*ns-train"):
+        find_config(tmp_path)
