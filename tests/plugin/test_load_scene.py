@@ -180,7 +180,7 @@ def test_an_exported_ply_has_the_colors_of_the_rendering(train, scene_photos, tm
     drawn = rasterize(shapes, camera, colors)
     view = scene.render(camera)  # over black, like viewers
     assert view.alpha.mean() > 0.3 and (look == "on") == (count == 0)
-    torch.testing.assert_close(drawn.image.clamp(0, 1), view.image, atol=1e-5, rtol=0)
+    torch.testing.assert_close(drawn.image.clamp(0, 1), view.image, atol=2e-3, rtol=0)
     torch.testing.assert_close(columns["relevancy"], scene.query_gaussians("dome"))
 
 
