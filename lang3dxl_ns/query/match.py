@@ -133,7 +133,7 @@ class Viewpoint:
     area: float
     """Share of the view that matches."""
     score: float
-    """Relevancy of the best spot, 1/32 of the view's longer side wide."""
+    """Mean relevancy of the most relevant thousandth of the view."""
     rank: float
     """How well the view shows the match, 0…1 (`rank_views`)."""
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -50,8 +49,7 @@ class GaussianArrays:
         return f"GaussianArrays({len(self):,} Gaussians{with_relevancy})"
 
     def __getitem__(self, keep: Bool[Array, " n"]) -> GaussianArrays:
-        chosen: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: None if a is None else a[keep] for name, a in chosen.items()})
+        return GaussianArrays(*(None if a is None else a[keep] for a in vars(self).values()))  # type: ignore[arg-type]
 
     @classmethod
     def of(
