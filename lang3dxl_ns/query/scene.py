@@ -214,7 +214,7 @@ class Scene:
         known = {prompt.text for prompt in prompts if not self.synonyms(prompt)}
         return self.text.queries(prompts, known).to(self.device)
 
-    def _synonyms(self, prompt: Prompt) -> list[str]:
+    def synonyms(self, prompt: Prompt) -> list[str]:
         """Synonyms searched along with a prompt."""
         synonyms = self.text.synonyms(prompt.text)
         if not synonyms or self.config.text.combine != "fallback":
