@@ -10,6 +10,7 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 import torch
+import tyro
 
 from lang3dxl_ns.common.reports import (
     command_line,
@@ -29,12 +30,12 @@ _SIZES = ("wooden", "narrow", "broken", "painted", "tall", "small", "wide", "car
 _THINGS = ("window", "gate", "stair")
 
 
-@dataclass
+@dataclass(kw_only=True)
 class QueryBenchmark:
     """Time new texts and frames with heat maps on a trained run; one thread, processor time without a GPU."""
 
-    load_config: Path
-    """config.yml of the run."""
+    run: tyro.conf.Positional[Path | None] = None
+    """Folder of the run, or its config.yml (default: the newest under outputs/)."""
     out: Path
     """Folder for queries.md and queries.json."""
     size: tuple[int, int] = (640, 480)
@@ -49,7 +50,7 @@ class QueryBenchmark:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            scene = load_scene(self.load_config)
+            scene = load_scene(self.run)
             figures = self.measure(scene)
         finally:
             torch.set_num_threads(threads)
