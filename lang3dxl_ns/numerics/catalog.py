@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from lang3dxl_ns.numerics import (
     appearance,
+    compression,
     decoder,
     downsampler,
     gathering,
@@ -27,6 +28,7 @@ GROUPS = (
     physical_scale,
     relevancy,
     gathering,
+    compression,
 )
 
 
