@@ -31,6 +31,7 @@ from lang3dxl_ns.benchmarks.rasterizer_scenes import (
     Recipe,
     make_problem,
 )
+from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.reports import (
@@ -178,7 +179,7 @@ class RasterizerBenchmark:
         """Measure, and write the report."""
         device = self.device
         if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
+            device = best_device()
         plan = replace(self, device=device)
         if self.quick:
             plan = replace(plan, gaussians=(1_000,), image_sizes=((80, 60),), repeats=2)

@@ -47,7 +47,7 @@ class Prepare(PreparationConfig):
 
 def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:
     """The data manager for a folder of photos with these settings; prepares nothing yet."""
-    from lang3dxl_ns.methods import DEVICE
+    from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
     from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
     from lang3dxl_ns.preparation.encoders import option_prefix
@@ -60,4 +60,4 @@ def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | 
         **{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)},
     )
     config.settle_targets(learned=config.makes_dense or config.regions not in ("auto", "none"))
-    return config.setup(device=DEVICE, test_mode="test")
+    return config.setup(device=best_device(), test_mode="test")

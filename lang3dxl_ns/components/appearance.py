@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.hash_grid import HashGrid
 from lang3dxl_ns.rendering.gaussians import Gaussians
@@ -203,7 +204,8 @@ class AppearanceField(nn.Module):
         if seed is not None:
             # Sampled for all on the CPU: the same whatever is visible, and on every device.
             noise = torch.rand(count, generator=torch.Generator().manual_seed(seed))
-            logits = logits + torch.logit(noise, eps=1e-6).to(logits)[visible]
+            shift = to_device(torch.logit(noise, eps=1e-6).to(logits.dtype), logits.device)
+            logits = logits + shift[visible]
         return torch.sigmoid(logits / TEMPERATURE)
 
     # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────

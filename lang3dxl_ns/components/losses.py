@@ -6,6 +6,7 @@ empty mask gives zero with zero gradient.
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import torch
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from pytorch_msssim import ssim
 from torch import Tensor
 
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
 
@@ -104,10 +106,15 @@ def _region_means(
     carry no gradient, and the loss above loses none: the deviations in a region sum to zero, and so does the
     gradient through its mean.
     """
-    regions, inverse, counts = torch.unique(labels, return_inverse=True, return_counts=True)
+    # Regions are numbered without asking how many there are, for which a GPU would have to be waited for.
+    order = labels.argsort()
+    ranked = labels[order]
+    first = F.pad((ranked[1:] != ranked[:-1]).long(), (1, 0))
+    inverse = torch.empty_like(order).scatter_(0, order, first.cumsum(0))
+    counts = torch.zeros_like(order).index_add_(0, inverse, torch.ones_like(order)).clamp_min(1)
 
     def means(values: Tensor) -> Tensor:
-        sums = values.new_zeros(len(regions), values.shape[1]).index_add_(0, inverse, values)
+        sums = torch.zeros_like(values).index_add_(0, inverse, values)
         return (sums / counts[:, None])[inverse]
 
     rough = means(features)
@@ -138,4 +145,12 @@ def _ssim(prediction: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) ->
         from lang3dxl_ns.components.ssim import ssim as compiled_ssim
 
         return compiled_ssim(images[0][0], images[1][0].to(prediction))
-    return ssim(*images, data_range=1.0, win_size=_SSIM_WINDOW, win_sigma=1.5)
+    return ssim(*images, data_range=1.0, win=_window(images[0].device))
+
+
+@functools.cache
+def _window(device: torch.device) -> Float[Tensor, "3 1 1 11"]:
+    """SSIM's Gaussian window, copied to a device once."""
+    x = torch.arange(_SSIM_WINDOW, dtype=torch.float32) - _SSIM_WINDOW // 2
+    weights = torch.exp(-(x**2) / (2 * 1.5**2))
+    return to_device((weights / weights.sum()).expand(3, 1, 1, -1).contiguous(), device)

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.reports import (
     command_line,
@@ -52,7 +53,7 @@ class Numerics:
         """Measure, write the report, and exit with an error if a case missed its bound."""
         device = self.device
         if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
+            device = best_device()
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # the timer measures processor time
         try:

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
@@ -43,11 +44,18 @@ class AnsweringModel(SplatfactoModel):
         """The camera's outputs, with those of `answers`."""
         start = time.perf_counter()
         if self.answers is None:
-            return super().get_outputs_for_camera(camera, obb_box)
+            return self._fresh(camera, obb_box)
         outputs = self._rendered(camera, obb_box)
         found = self.answers.outputs(outputs, self.carried_map, time.perf_counter() - start)
         # In the order in which viewers list them.
         return {"rgb": outputs["rgb"], **found, **outputs}
+
+    @torch.no_grad()
+    def _fresh(self, camera: Cameras, obb_box: OrientedBox | None) -> dict[str, Tensor]:
+        """As splatfacto renders, but the camera stays where it is: its size is read without waiting for a
+        GPU."""
+        self.set_crop(obb_box)
+        return self.get_outputs(camera)
 
     def _rendered(self, camera: Cameras, obb_box: OrientedBox | None) -> dict[str, Tensor]:
         """The rendering; reused if the same view gets another prompt or display."""
@@ -55,13 +63,13 @@ class AnsweringModel(SplatfactoModel):
         view = self._view_state(camera)
         asked, kept = self.answers.carried(), self._kept
         if kept is None or obb_box is not None or kept.view != view:
-            outputs = super().get_outputs_for_camera(camera, obb_box)
+            outputs = self._fresh(camera, obb_box)
             self._kept = None if obb_box is not None else _Kept(view, outputs, asked, self.carried_map)
             return outputs
         if asked is not kept.asked:
             kept.asked, kept.carried_map = asked, None
             if asked is not None:
-                kept.carried_map = self.composite(camera.to(self.device), asked)
+                kept.carried_map = self.composite(camera, asked)
         self.carried_map = kept.carried_map
         return kept.outputs
 

@@ -51,11 +51,11 @@ def lens_of(cameras: Cameras, index: int) -> Lens:
     )
 
 
-def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"], device: torch.device) -> Camera:
-    """The lens of a nerfstudio camera at a (possibly refined) pose, camera → world."""
+def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"]) -> Camera:
+    """The lens of a nerfstudio camera at a (possibly refined) pose, camera → world; where these are."""
     return Camera(
-        view_matrix=view_matrix(pose.to(device)),
-        intrinsics=camera.get_intrinsics_matrices()[0].to(device),
+        view_matrix=view_matrix(pose),
+        intrinsics=camera.get_intrinsics_matrices()[0],
         width=int(camera.width.item()),
         height=int(camera.height.item()),
     )

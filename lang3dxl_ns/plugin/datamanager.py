@@ -27,6 +27,7 @@ from rich.markup import escape
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.timing import part
@@ -432,9 +433,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return data
 
     def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, dict]:
-        """A photo's data for a step, on the device, with `name` and `image_idx`."""
+        """A photo's data for a step, on the device, with `name` and `image_idx`. The camera stays on the CPU:
+        the host reads its size, and would wait for a GPU."""
         batch: dict[str, Any] = {
-            key: value.to(self.device) if isinstance(value, Tensor) else value for key, value in data.items()
+            key: to_device(value, self.device) if isinstance(value, Tensor) else value
+            for key, value in data.items()
         }
         for key, number in (
             ("clip_target", torch.float32),
@@ -444,7 +447,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             if key in batch:
                 batch[key] = batch[key].to(number)
         batch |= {"image_idx": index, "name": dataset.photos[index].name}
-        return dataset.cameras[index : index + 1].to(self.device), batch
+        return dataset.cameras[index : index + 1], batch
 
 
 class EvalPhotos:

@@ -19,6 +19,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
+from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
@@ -98,7 +99,7 @@ def load_scene(
     path = find_config(run)
     config = read_config(path)
     file = SceneFile.read(path.parent / SCENE_FILE)
-    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    device = torch.device(device or best_device())
     model = _load_model(config, path.parent, file, device)
     return scene_of_model(model, file, path.parent, settings)
 
@@ -271,7 +272,7 @@ def _draw(model: Lang3DXLModel, camera: Camera, features: Float[Tensor, "n d"] |
     """Render a camera of the rasterizer with a model in evaluation mode."""
     start = time.perf_counter()
     model.set_crop(None)
-    outputs, rendered = model.render(view_of(camera).to(model.device), features)
+    outputs, rendered = model.render(view_of(camera), features)
     maps = {name: outputs[name][..., 0] for name in ("accumulation", "depth")}
     seconds = time.perf_counter() - start
     return View(camera, outputs["rgb"], rendered, maps["accumulation"], maps["depth"], seconds)

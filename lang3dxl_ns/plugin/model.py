@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from lang3dxl_ns.baselines.encoders import make_encoder
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
@@ -37,8 +38,12 @@ from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig, make_strategy
 from lang3dxl_ns.preparation.targets import FeatureStatistics
 from lang3dxl_ns.rendering import Gaussians, Rendering, rasterize, spherical_harmonics
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
+from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.scene.camera import Camera, in_view
 from lang3dxl_ns.scene.geometry import center_and_radius
+
+DECODE_SIZES = 5
+"""Sizes at which code maps are decoded in training."""
 
 
 class Lang3DXLModel(AnsweringModel):
@@ -254,18 +259,35 @@ class Lang3DXLModel(AnsweringModel):
         """Values of Gaussians composited over black in a camera; differentiable in the features alone."""
         view, _ = self._view(camera)
         gaussians = self._activated(self.gauss_params).detach()
-        antialiased = self.config.rasterize_mode == "antialiased"
-        return rasterize(gaussians, view.detach(), features, antialiased=antialiased).image
+        antialiased, backend = self.config.rasterize_mode == "antialiased", self._backend
+        return rasterize(gaussians, view.detach(), features, antialiased=antialiased, backend=backend).image
+
+    @property
+    def _backend(self) -> Backend:
+        """The rasterizer asked for, which only a GPU has a choice of."""
+        return self.config.rasterizer if self.means.is_cuda else "auto"
 
     def _view(self, camera: Cameras) -> tuple[Camera, Float[Tensor, "3 4"]]:
-        """The camera for the rasterizer, refined in training, and its pose."""
-        pose = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
+        """The camera for the rasterizer, refined in training, and its pose (on the model's device). The
+        former stays on the CPU unless it is refined: there, reading its size takes no time."""
+        pose = camera.camera_to_worlds[0]
+        if (
+            self.training
+            and self.camera_optimizer.config.mode != "off"
+            and "cam_idx" in (camera.metadata or {})
+        ):
+            index, pose = camera.metadata["cam_idx"], to_device(pose, self.device)
+            # A slice, since an index would be copied to the GPU first.
+            change = self.camera_optimizer(slice(index, index + 1))[0]
+            pose = torch.cat([change[:, :3] @ pose[:, :3], pose[:, 3:] + change[:, 3:]], dim=1)
         downscale = self._get_downscale_factor()
-        camera.rescale_output_resolution(1 / downscale)
-        view = to_rasterizer(camera, pose[0], self.device)
-        camera.rescale_output_resolution(downscale)
+        if downscale != 1:
+            camera.rescale_output_resolution(1 / downscale)
+        view = to_rasterizer(camera, pose)
+        if downscale != 1:
+            camera.rescale_output_resolution(downscale)
         self.last_size = (view.height, view.width)
-        return view, pose[0].to(self.device)
+        return view, to_device(pose, self.device)
 
     def _activated(self, g: Mapping[str, Tensor]) -> Gaussians:
         scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
@@ -283,29 +305,34 @@ class Lang3DXLModel(AnsweringModel):
         colors, in_photo = self._colors(g, pose[:, 3]), gaussians
         if self.appearance is not None:
             vector = self._light(camera, pose)
-            visible = in_view(view, gaussians.means, gaussians.scales).nonzero().squeeze(1)
+            near = view.detach().to(self.device)
+            visible = in_view(near, gaussians.means, gaussians.scales).nonzero().squeeze(1)
             seed = self.step if self.training else None
             with part("appearance"):
                 colors, in_photo = self.appearance(gaussians, colors, vector, visible, seed)
         settings: dict[str, Any] = {
+            "backend": self._backend,
             "antialiased": self.config.rasterize_mode == "antialiased",
             "absgrad": self.strategy.absgrad and self.training,
         }
-        rendering = rasterize(
-            gaussians,
-            view,
-            colors,
-            background,
-            features=features,
-            detach_features=not self.config.feature_gradient_to_geometry,
-            render_depth=not self.training or self.config.output_depth_during_training,
-            **settings,
-        )
-        if in_photo is not gaussians:
-            # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
-            photo = rasterize(in_photo, view, colors, background, **settings)
-            rendering = replace(rendering, image=photo.image, info=photo.info)
-        return rendering, background
+        depth = not self.training or self.config.output_depth_during_training
+        detach = not self.config.feature_gradient_to_geometry
+        if in_photo is gaussians:
+            rendering = rasterize(
+                gaussians, view, colors, background,
+                features=features, detach_features=detach, render_depth=depth, **settings,
+            )  # fmt: skip
+            return rendering, background
+        photo = rasterize(in_photo, view, colors, background, **settings)
+        if features is None and not depth:
+            return photo, background
+        # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
+        carried = colors.detach()[:, :1] if features is None else features
+        if detach:
+            gaussians, view = gaussians.detach(), view.detach()
+        scene = rasterize(gaussians, view, carried, render_depth=depth, **settings | {"absgrad": False})
+        image = None if features is None else scene.image
+        return replace(photo, features=image, alpha=scene.alpha, depth=scene.depth), background
 
     def _light(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
         """Vector of the training photo, of the chosen look, or by the rule for other views."""
@@ -383,11 +410,13 @@ class Lang3DXLModel(AnsweringModel):
         return self.downsampler.match(clip, batch["clip_target"], batch["crop_sides"], mask)
 
     def _random_size(self) -> int:
-        """Longer side to decode at in this iteration; the same after a resume."""
+        """Longer side to decode at in this iteration, one of a few, since a GPU's libraries prepare for every
+        new size; the same after a resume."""
         assert self.config.decode_size is not None
         smallest, largest = self.config.decode_size
         generator = torch.Generator().manual_seed(self.step)
-        return int(torch.randint(smallest, largest + 1, (), generator=generator))
+        place = int(torch.randint(DECODE_SIZES, (), generator=generator)) / (DECODE_SIZES - 1)
+        return round(smallest + place * (largest - smallest))
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
         """Numbers for the log: PSNR of the step's photo and the number of Gaussians."""
@@ -396,7 +425,11 @@ class Lang3DXLModel(AnsweringModel):
             "psnr": psnr(outputs["rgb"].detach(), target),
             "gaussian_count": torch.tensor(self.num_points),
         }
-        self.camera_optimizer.get_metrics_dict(metrics)
+        if self.camera_optimizer.config.mode != "off":
+            change = self.camera_optimizer.pose_adjustment.detach()
+            for name, sizes in {"translation": change[:, :3], "rotation": change[:, 3:].rad2deg()}.items():
+                metrics[f"camera_opt_{name}_mean"] = sizes.norm(dim=1).mean()
+                metrics[f"camera_opt_{name}_max"] = sizes.norm(dim=1).max()
         return metrics
 
     @torch.no_grad()

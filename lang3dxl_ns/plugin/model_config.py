@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from gsplat.strategy import DefaultStrategy
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from lang3dxl_ns.baselines.encoders import EncoderConfig
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.plugin.densification import Densification
 
 SHORT_FIELD_RUN = 5_000
 """Runs with fewer iterations use the field's `short` preset."""
@@ -37,7 +37,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     region_weight: float = 5e-4
     """Weight of the feature variance inside regions, if the scene has regions."""
     decode_size: tuple[int, int] | None = None
-    """The code map is decoded at a random size in this range: pixels of its longer side, inclusive.
+    """The code map is decoded at one of five sizes in this range: pixels of its longer side, inclusive.
     None: 56 to 72 in short runs, 80 to 120 (the paper's) in long ones."""
     warm_up: float = 0.0
     """Fraction of the run that trains colors only, before the semantic losses start."""
@@ -48,6 +48,12 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     color and a quarter of the numbers per Gaussian. `auto`: by the scene's measured needs."""
     camera_optimization: Literal["auto", "on", "off"] = "auto"
     """Refine the cameras during training. `auto`: if the COLMAP model's reprojection error is large."""
+    rasterizer: Literal["auto", "gsplat", "torch"] = "auto"
+    """What renders on a GPU. `auto`: gsplat, built at its first use (docs/gpu.md), or, if it can't be built,
+    torch, many times slower."""
+    max_gaussians: int | None = None
+    """Most Gaussians that densification makes; beyond, the least opaque go. None: what the GPU's (or the
+    machine's) memory holds; 0: no limit."""
     sky_gaussians: int = 2_000
     """Gaussians on a sphere around the scene for the sky and the far distance, where a COLMAP
     model has no points; 0 for none."""
@@ -90,10 +96,10 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
             self.decode_size = (56, 72) if short else (80, 120)
 
 
-def make_strategy(config: Lang3DXLModelConfig) -> DefaultStrategy:
-    """gsplat's densification with the run's schedule."""
+def make_strategy(config: Lang3DXLModelConfig) -> Densification:
+    """Densification with the run's schedule."""
     steps = config.total_steps
-    return DefaultStrategy(
+    return Densification(
         prune_opa=config.cull_alpha_thresh,
         grow_grad2d=config.densify_grad_thresh,
         grow_scale3d=config.densify_size_thresh,

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.load_scene import latest_checkpoint
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
@@ -31,8 +31,7 @@ def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPip
     # The folder may have moved: nerfstudio composes its path from these.
     config.output_dir, config.experiment_name, config.method_name = folder.parent, "", ""
     config.timestamp, config.load_dir, config.pipeline.datamanager.run = folder.name, path.parent, folder
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    pipeline = config.pipeline.setup(device=device, test_mode="test")
+    pipeline = config.pipeline.setup(device=best_device(), test_mode="test")
     assert isinstance(pipeline, Lang3DXLPipeline)
     pipeline.eval()
     pipeline.load_pipeline(state["pipeline"], state["step"])

@@ -27,7 +27,9 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.device import unused_gpu, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.plugin.checkpoint import restore_run_state, run_state
 from lang3dxl_ns.plugin.datamanager import PhotosGoneError
@@ -40,10 +42,12 @@ from lang3dxl_ns.plugin.load_scene import (
 )
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.plugin.saved_config import read_config
+from lang3dxl_ns.plugin.sizes import plan, sizes_of
 from lang3dxl_ns.plugin.step_guard import StepGuard
 from lang3dxl_ns.preparation.encoders import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs, write_needs
 from lang3dxl_ns.query.run_file import SCENE_FILE
+from lang3dxl_ns.rendering import gsplat_build
 
 SHORT_RUN = 1_000
 """Iterations of a run that uses the short-run rates."""
@@ -140,6 +144,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         sure that the encoders can be had before a folder is made for it."""
         print_user_errors_plainly()
         check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
+        if self.pipeline.model.max_gaussians is not None:
+            check_numbers(self.pipeline.model, {"max_gaussians": (0, 1e9)}, "--pipeline.model.")
         check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
         self.pipeline.datamanager.check()
         fresh = self.timestamp == "{timestamp}"
@@ -147,8 +153,20 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.fit_to_run()
         data = self.pipeline.datamanager
         check_encoders(data.clip, data.dense)
+        self._check_device()
         if fresh:
             self._claim_folder()
+
+    def _check_device(self) -> None:
+        """Before anything is prepared: say if a GPU stays unused, and build gsplat if it is needed."""
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise UserError(f"torch can't use a GPU here: {unused_gpu() or 'there is none'}")
+        warn_of_unused_gpu()
+        rasterizer = self.pipeline.model.rasterizer
+        if self.machine.device_type == "cuda" and rasterizer == "auto":
+            gsplat_build.ready()
+        elif self.machine.device_type == "cuda" and rasterizer == "gsplat":
+            gsplat_build.make_ready()
 
     def _claim_folder(self) -> None:
         """Create a unique folder, even if two runs start in the same second."""
@@ -165,6 +183,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         latest one. Raises UserError if that is damaged."""
         folder = super().get_checkpoint_dir()
         print_user_errors_plainly()
+        warn_of_unused_gpu()
         check_checkpoint(folder)
         return folder
 
@@ -261,9 +280,22 @@ class Lang3DXLTrainer(Trainer):
     _is_ending = False
     _run_state: dict[str, Any] | None = None
 
+    def __init__(self, config: Lang3DXLTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        """Mixed precision means bfloat16 where the GPU has it: it has float32's range, so that gradients need
+        no scale, and no step is lost or waits for one. Older GPUs (before Ampere) take float16 with a
+        scale."""
+        super().__init__(config, local_rank, world_size)
+        if self.mixed_precision:
+            wide = torch.cuda.is_bf16_supported(including_emulation=False)
+            torch.set_autocast_dtype("cuda", torch.bfloat16 if wide else torch.float16)
+            self.use_grad_scaler = config.use_grad_scaler or not wide
+            self.grad_scaler = GradScaler(enabled=self.use_grad_scaler)
+
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up, then seed, so that preparation does not affect the run's randomness. Writes a description
         of the scene into the run's folder, so that it can be queried without the photos."""
+        # nerfstudio turns this on, and photos of many sizes would then be tuned for in nearly every step.
+        torch.backends.cudnn.benchmark = False
         data, self.config.data = self.config.data, None  # otherwise the viewer would write camera paths there
         try:
             super().setup(test_mode)
@@ -275,9 +307,20 @@ class Lang3DXLTrainer(Trainer):
             describe_scene(self.pipeline.datamanager).write(self.base_dir / SCENE_FILE)
             if test_mode == "val":
                 write_needs(self.pipeline.datamanager.needs, self.base_dir)
+        self._limit_gaussians()
         torch.manual_seed(self.config.machine.seed)
         if self._run_state is not None:
             restore_run_state(self.pipeline, self._run_state)
+
+    def _limit_gaussians(self) -> None:
+        """Set the cap of densification from the device's memory, and log what training will take."""
+        model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
+        pixels, looks = int((cameras.width * cameras.height).max()), model.appearance is not None
+        device = torch.device(self.device)
+        sizes = sizes_of(model, model.gauss_params, looks, pixels, device.type == "cuda")
+        now, wanted = model.num_points, self.config.pipeline.model.max_gaussians
+        model.strategy.most, message = plan(sizes, device, now, wanted)
+        CONSOLE.log(escape(message))
 
     def _load_checkpoint(self) -> None:
         """As nerfstudio's, but keeps the run state until everything is set up. Raises UserError for
@@ -293,7 +336,8 @@ class Lang3DXLTrainer(Trainer):
             self.optimizers.load_optimizers(state["optimizers"])
             if self.config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
-            self.grad_scaler.load_state_dict(state["scalers"])
+            if state["scalers"]:  # empty in a run without a loss scale
+                self.grad_scaler.load_state_dict(state["scalers"])
         except (*NOT_A_CHECKPOINT, AssertionError) as error:
             raise UserError(
                 f"{path} is not a checkpoint of lang3dxl ({error}): give --load-dir the "
@@ -324,15 +368,17 @@ class Lang3DXLTrainer(Trainer):
         return GuardedOptimizers(self.config.optimizers.copy(), groups, self._step_is_sound)
 
     def _step_is_sound(self, grad_scaler: GradScaler) -> bool:
+        scale = grad_scaler.get_scale()
         sound = self.guard.allows(
             self.step,
             self.pipeline.datamanager.photo_in_hand,
             self.pipeline.last_losses,
             self.optimizers.live_parameters(),
-            grad_scaler.get_scale(),
+            scale,
         )
-        # Densification accumulates the gradients of the screen positions, which are just as broken.
+        # Densification accumulates the gradients of the screen positions, just as broken, and as scaled.
         self.pipeline.model.step_is_sound = sound
+        self.pipeline.model.strategy.loss_scale = scale
         return sound
 
     def train(self) -> None:
@@ -352,6 +398,10 @@ class Lang3DXLTrainer(Trainer):
                 super().train()
         except PhotosGoneError as error:
             raise UserError(f"{error}. {self._stop_early()}") from error
+        except (RuntimeError, MemoryError) as error:
+            if not ran_out_of_memory(error):
+                raise
+            raise UserError(self._out_of_memory()) from error
         finally:
             self.config.max_num_iterations = total
             if summary := self.guard.summary():
@@ -392,6 +442,22 @@ class Lang3DXLTrainer(Trainer):
         return (
             f"Stopped after {self._last_iteration + 1} iterations with a checkpoint; to resume: the same "
             f"command with --load-dir {self.checkpoint_dir}"
+        )
+
+    def _out_of_memory(self) -> str:
+        """What happened and what helps. The interrupted step may have left half-made tensors, so the latest
+        checkpoint stays as it is."""
+        count = self.pipeline.model.num_points
+        saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
+        kept = (
+            f"{saved[-1]} is kept: --load-dir {self.checkpoint_dir} resumes there"
+            if saved
+            else "none is saved yet"
+        )
+        return (
+            f"out of memory at iteration {self.step} with {count:,} Gaussians. Three settings help: "
+            f"--pipeline.model.max-gaussians {count // 2}, --pipeline.datamanager.camera-res-scale-factor "
+            f"0.5, --pipeline.model.view-dependence off. The latest checkpoint: {kept}"
         )
 
     def _after_train(self) -> None:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
 from lang3dxl_ns.scene.camera import Camera
 
@@ -28,7 +29,8 @@ def rasterize_with_gsplat(
     near: float,
     eps2d: float,
 ) -> Rendering:
-    """See `rasterize`. Computes in float32; detached features cost a second pass."""
+    """See `rasterize`. Computes in float32; detached features cost a second pass, if there is a gradient."""
+    detach_features &= torch.is_grad_enabled()
     settings = {
         "near_plane": near,
         "eps2d": eps2d,
@@ -74,8 +76,8 @@ def _render(
         scales=gaussians.scales.float(),
         opacities=gaussians.opacities.float(),
         colors=channels.float(),
-        viewmats=camera.view_matrix.to(device).float()[None],
-        Ks=camera.intrinsics.to(device).float()[None],
+        viewmats=to_device(camera.view_matrix, device).float()[None],
+        Ks=to_device(camera.intrinsics, device).float()[None],
         width=camera.width,
         height=camera.height,
         backgrounds=background.float()[None],

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
+from lang3dxl_ns.rendering import gsplat_build
 from lang3dxl_ns.rendering.compositing import composite
 from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
 from lang3dxl_ns.rendering.gsplat_backend import rasterize_with_gsplat
@@ -52,24 +53,28 @@ def rasterize(
         absgrad: the backward pass sets `info["means2d"].absgrad` for gsplat's densification.
         near: Gaussians with centers nearer than this are left out, world units.
         eps2d: variance added on screen, pixels².
-        backend: "auto" uses gsplat for tensors on a GPU; on the CPU numba, if it is installed and the
-            environment variable LANG3DXL_CPU_KERNELS is not torch; otherwise torch (which works on any
-            device).
+        backend: "auto" uses gsplat for tensors on a GPU, or torch if gsplat can't be had; on the CPU numba,
+            if it is installed and the environment variable LANG3DXL_CPU_KERNELS is not torch; otherwise
+            torch (which works on any device).
 
     Gaussians with a NaN or infinite value, in their channels and features too, are not rendered and get no
     gradient: one would spoil every pixel of its tiles.
 
     Raises:
-        ValueError: sizes that don't fit together, a camera with a NaN or infinite value.
+        ValueError: sizes that don't fit together, a camera (on the CPU: to look at one on a GPU means to wait
+            for it) with a NaN or infinite value.
+        UserError: gsplat was asked for and can't be had.
     """
     _check_sizes(gaussians, channels, background, features)
-    if not (camera.view_matrix.isfinite().all() and camera.intrinsics.isfinite().all()):
+    parts = camera.view_matrix, camera.intrinsics
+    if not all(part.is_cuda or bool(part.isfinite().all()) for part in parts):
         raise ValueError("the camera has a NaN or infinite value: nothing can be rendered from it")
     if background is None:
         background = channels.new_zeros(channels.shape[1])
     if backend == "auto":
-        on_cpu: Backend = "numba" if takes_kernels(gaussians.means) else "torch"
-        backend = "gsplat" if gaussians.means.is_cuda else on_cpu
+        backend = _best_backend(gaussians.means)
+    elif backend == "gsplat":
+        gsplat_build.make_ready()
     # gsplat's kernels can't be launched on empty input.
     render: Callable[..., Rendering] = functools.partial(_rasterize, backend)
     if backend == "gsplat" and len(channels):
@@ -83,6 +88,12 @@ def rasterize(
     )  # fmt: skip
 
 
+def _best_backend(means: Tensor) -> Backend:
+    if means.is_cuda:
+        return "gsplat" if gsplat_build.ready() else "torch"
+    return "numba" if takes_kernels(means) else "torch"
+
+
 def _without_broken(
     gaussians: Gaussians, channels: Float[Tensor, "n c"], features: Float[Tensor, "n d"] | None
 ) -> tuple[Gaussians, Float[Tensor, "n c"], Float[Tensor, "n d"] | None]:
@@ -93,7 +104,8 @@ def _without_broken(
         if features is not None:
             total = total + features.sum(1)
         sound = torch.isfinite(total)
-    if bool(sound.all()):
+    # To ask a GPU means to wait for it, which takes longer than to clean everything.
+    if not sound.is_cuda and bool(sound.all()):
         return gaussians, channels, features
 
     def clean(values: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 
 MOST_PIXELS = 180_000_000
@@ -99,25 +100,35 @@ class Camera:
         """The same camera, without gradient."""
         return Camera(self.view_matrix.detach(), self.intrinsics.detach(), self.width, self.height)
 
+    def to(self, device: torch.device | str) -> Camera:
+        """The same camera on a device."""
+        view, intrinsics = (to_device(part, device) for part in (self.view_matrix, self.intrinsics))
+        return Camera(view, intrinsics, self.width, self.height)
+
     def at_origin(self, like: Tensor) -> tuple[Camera, Float[Tensor, "3"]]:
         """The camera in a world whose origin is the camera's position (rounded), and that position.
 
         Far from the origin (map coordinates are in the millions) R·x + t is a small difference of large
-        numbers. R·(x − position) + (R·position + t) is not, if the last bracket is computed in float64. Type
-        and device are those of `like`.
+        numbers. R·(x − position) + (R·position + t) is not, if the last bracket is computed in float64: where
+        the camera is, or on the CPU, since Apple's GPUs have none. Type and device are those of `like`.
         """
-        view = self.view_matrix.to(like.device, torch.float64)
+        view = self.view_matrix.cpu() if self.view_matrix.device.type == "mps" else self.view_matrix
+        view = view.to(torch.float64)
         place = -(view[:3, :3].T @ view[:3, 3]).detach().to(like.dtype)
-        shift = torch.eye(4).to(view)
+        shift = torch.eye(4, dtype=view.dtype, device=view.device)
         shift[:3, 3] = place
-        return Camera((view @ shift).to(like.dtype), self.intrinsics, self.width, self.height), place
+        moved = Camera((view @ shift).to(like.dtype), self.intrinsics, self.width, self.height)
+        return moved.to(like.device), to_device(place, like.device)
 
 
 def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
     """World → camera (OpenCV axes) from nerfstudio's camera → world (OpenGL axes)."""
-    rotation = (camera_to_world[:, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).T
+    right, up_and_back = camera_to_world[:, :3].split([1, 2], dim=1)
+    rotation = torch.cat([right, -up_and_back], dim=1).T
     top = torch.cat([rotation, -rotation @ camera_to_world[:, 3:]], dim=1)
-    return torch.cat([top, camera_to_world.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+    bottom = torch.zeros_like(top[:1])
+    bottom[:, 3] = 1.0
+    return torch.cat([top, bottom])
 
 
 def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:

@@ -29,7 +29,7 @@ def test_nerfstudios_rays_and_the_rasterizers_pixels_agree(pose):
     row, column = 7, 41
     rays = cameras.generate_rays(0, coords=torch.tensor([row + 0.5, column + 0.5]))
     point = rays.origins + 3.0 * rays.directions
-    camera = to_rasterizer(cameras[0:1], pose, torch.device("cpu"))
+    camera = to_rasterizer(cameras[0:1], pose)
     x, y, z = camera.view_matrix[:3, :3] @ point + camera.view_matrix[:3, 3]
     assert z > 0
     seen = camera.intrinsics @ (torch.stack([x, y, z]) / z)
@@ -38,7 +38,7 @@ def test_nerfstudios_rays_and_the_rasterizers_pixels_agree(pose):
 
 def test_a_camera_of_ours_is_the_same_one_in_nerfstudio(pose):
     camera = LENS.camera(view_matrix(pose))
-    back: Camera = to_rasterizer(view_of(camera), view_of(camera).camera_to_worlds[0], torch.device("cpu"))
+    back: Camera = to_rasterizer(view_of(camera), view_of(camera).camera_to_worlds[0])
     torch.testing.assert_close(back.view_matrix, camera.view_matrix)
     torch.testing.assert_close(back.intrinsics, camera.intrinsics)
     assert (back.width, back.height) == (64, 48)

@@ -27,7 +27,7 @@ def wall(opacity=0.99):
     gaussians = Gaussians(means, quats, torch.full((count, 3), 0.2), torch.full((count,), opacity))
 
     def composite(camera, features):
-        view = to_rasterizer(camera, camera.camera_to_worlds[0], torch.device("cpu"))
+        view = to_rasterizer(camera, camera.camera_to_worlds[0])
         return rasterize(gaussians, view, features).image
 
     return SimpleNamespace(means=means, num_points=count, composite=composite)

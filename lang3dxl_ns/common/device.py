@@ -1,0 +1,63 @@
+"""The device to compute on, a warning about GPUs that torch can't use, copies that don't wait for the GPU."""
+
+from __future__ import annotations
+
+import functools
+import glob
+import shutil
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from lang3dxl_ns.common.console import say
+
+_INSTALL = "https://pytorch.org/get-started/locally"
+Moved = TypeVar("Moved", bound=Tensor)
+
+
+def to_device(tensor: Moved, device: torch.device | str) -> Moved:
+    """Copy to a device. A copy to a GPU doesn't wait for the work that is queued there, as `Tensor.to` does:
+    CUDA stages ordinary memory before it returns, so the source may be dropped or changed at once."""
+    return tensor.to(device, non_blocking=torch.device(device).type == "cuda")  # type: ignore[return-value]
+
+
+def best_device() -> str:
+    """ "cuda" if torch can use a GPU, else "cpu"; then says so if there is a GPU."""
+    if torch.cuda.is_available():
+        return "cuda"
+    warn_of_unused_gpu()
+    return "cpu"
+
+
+@functools.cache
+def warn_of_unused_gpu() -> None:
+    """Say once per process if this machine has a GPU that torch can't use."""
+    if (trouble := unused_gpu()) is not None:
+        say(f"Warning: {trouble}. Everything runs on the CPU now, many times slower.")
+
+
+def unused_gpu() -> str | None:
+    """Why torch can't use this machine's GPU, with the remedy; None if it can, or if there is none."""
+    if torch.cuda.is_available():
+        return None
+    nvidia = bool(shutil.which("nvidia-smi") or glob.glob("/dev/nvidia[0-9]*"))
+    if nvidia and torch.version.cuda is None:
+        built = "for AMD's" if torch.version.hip else "without CUDA"
+        return f"there is an NVIDIA GPU, but this torch is built {built}: install its CUDA build ({_INSTALL})"
+    if nvidia:
+        return (
+            f"there is an NVIDIA GPU, but torch can't use it ({_reason()}): update NVIDIA's driver, or "
+            f"install the torch build for the driver's CUDA version ({_INSTALL})"
+        )
+    if glob.glob("/dev/kfd") and torch.version.hip is None:
+        return f"there is an AMD GPU, but this torch has no ROCm: install its ROCm build ({_INSTALL})"
+    return None
+
+
+def _reason() -> str:
+    try:
+        torch.cuda.init()
+    except Exception as error:
+        return str(error).strip().splitlines()[0].rstrip(".")
+    return "it sees no device: check CUDA_VISIBLE_DEVICES"

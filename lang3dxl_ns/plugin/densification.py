@@ -1,0 +1,62 @@
+"""Densification: gsplat's default strategy with a cap, and statistics that don't wait for the GPU."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from gsplat.strategy.ops import remove
+from torch import Tensor
+
+_BEYOND = 1.1
+"""Growth may exceed the cap by this factor before the least opaque Gaussians make room."""
+
+
+@dataclass
+class Densification(DefaultStrategy):
+    """gsplat's densification by screen-space gradient, up to a number of Gaussians."""
+
+    most: int = 0
+    """Number of Gaussians not to exceed; 0: no limit."""
+    loss_scale: float = 1.0
+    """Factor in the latest step's gradients, under mixed precision."""
+
+    def _update_state(
+        self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False
+    ) -> None:
+        """Add a step's gradients, as gsplat does, but unscaled, and without picking the visible Gaussians,
+        whose number the host would have to wait for."""
+        means2d = info[self.key_for_gradient]
+        gradient: Tensor = (means2d.absgrad if self.absgrad else means2d.grad) / self.loss_scale
+        half = info["width"] / 2.0 * info["n_cameras"], info["height"] / 2.0 * info["n_cameras"]
+        norms = torch.stack([gradient[..., i] * half[i] for i in range(2)], dim=-1).norm(dim=-1)
+        seen = info["radii"] > 0
+        for name in ("grad2d", "count"):
+            if state[name] is None:
+                state[name] = torch.zeros(norms.shape[1], device=norms.device)
+        state["grad2d"] += torch.where(seen, norms, 0.0).sum(0)
+        state["count"] += seen.sum(0)
+
+    def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:
+        """Near the cap only the Gaussians with the largest gradients grow; each becomes two."""
+        usual, room = self.grow_grad2d, int(_BEYOND * self.most) - len(params["means"])
+        gradients = state["grad2d"] / state["count"].clamp_min(1)
+        if self.most and int((gradients > usual).sum()) > room:
+            self.grow_grad2d = float(gradients.topk(room + 1).values[-1]) if room > 0 else float("inf")
+        try:
+            return super()._grow_gs(params, optimizers, state, step)
+        finally:
+            self.grow_grad2d = usual
+
+    def _prune_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> int:
+        """Beyond the cap the least opaque go."""
+        pruned = super()._prune_gs(params, optimizers, state, step)
+        excess = len(params["means"]) - self.most
+        if not self.most or excess <= 0:
+            return pruned
+        least = params["opacities"].detach().flatten().topk(excess, largest=False).indices
+        gone = torch.zeros(len(params["means"]), dtype=torch.bool, device=least.device)
+        remove(params=params, optimizers=optimizers, state=state, mask=gone.index_fill_(0, least, True))
+        return pruned + excess

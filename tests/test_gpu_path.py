@@ -1,0 +1,314 @@
+"""The GPU path on a fake GPU (fake_gpu.py): all components keep to one device, and the host rarely waits.
+
+Runs are a few steps on a tiny scene; they are made once and shared.
+"""
+
+from functools import cache
+
+import pytest
+import torch
+from conftest import make_trainer
+from fake_gpu import CUDA, GpuTensor, fake_gpu
+from scenes import write_scene
+
+from lang3dxl_ns.baselines.encoders import EncoderConfig
+from lang3dxl_ns.plugin.load_scene import load_scene
+
+EVERYTHING = {
+    "pipeline__model__encoder__name": "paper",
+    "pipeline__model__densify_grad_thresh": 1e-7,
+    "pipeline__model__feature_gradient_to_geometry": True,
+    "pipeline__model__background_color": "random",
+    "pipeline__model__view_dependence": "on",
+    "pipeline__datamanager__regions": "felzenszwalb",
+}
+LOOKS = {"pipeline__model__appearance__use": "on", "pipeline__model__camera_optimization": "on"}
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("gpu") / "scene", photos=5, points=60, size=(40, 30))
+
+
+@pytest.fixture(scope="module")
+def trained(small, tiny_clip, tiny_dense, tmp_path_factory):
+    """Trains on the GPU and returns the trainer, with `waits`: the counted waits of every step."""
+
+    def run(iterations=4, semantics=True, fake=None, **changes):
+        changes = {"machine__device_type": "cuda", "steps_per_eval_image": 0, **changes}
+        changes.setdefault("pipeline__model__sky_gaussians", 40)
+        folder = tmp_path_factory.mktemp("runs")
+        with fake_gpu(**fake or {}) as gpu:
+            trainer = make_trainer(small, tiny_clip, tiny_dense, folder, iterations, semantics, **changes)
+            trainer.setup()
+            trainer.waits = []
+            count_steps(trainer, gpu)
+            trainer.train()
+        assert all(parameter.device == CUDA for parameter in trainer.pipeline.model.parameters())
+        return trainer
+
+    return run
+
+
+def count_steps(trainer, gpu) -> None:
+    """Each step and the callbacks after it (densification's statistics) in one count."""
+    step, callbacks = trainer.train_iteration, trainer.callbacks
+
+    def counted(number):
+        with gpu.counting() as before:
+            result = step(number)
+        with gpu.counting() as after:
+            for callback in callbacks:
+                callback.run_callback_at_location(number, AFTER)
+        trainer.waits.append(before + after)
+        return result
+
+    from nerfstudio.engine.callbacks import TrainingCallbackLocation
+
+    AFTER = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+    trainer.train_iteration = counted
+    trainer.callbacks = [c for c in callbacks if AFTER not in c.where_to_run]
+    assert len(trainer.callbacks) < len(callbacks)
+
+
+@pytest.fixture(scope="module")
+def default(trained):
+    """A finished run of the default settings."""
+    return trained(iterations=6, pipeline__model__densify_until=0.0)
+
+
+@pytest.fixture(scope="module")
+def densified(trained):
+    return cache(lambda **changes: trained(iterations=6, **EVERYTHING | changes))
+
+
+def own(waits) -> int:
+    """Waits that are the package's; gsplat has one of its own in every pass."""
+    return waits.total() - waits["gsplat"]
+
+
+# ── training ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_default_step_waits_twice_beside_gsplat(default):
+    """For the Gaussians in view, of which the look is computed, and for the guard, which decides whether the
+    optimizers may step."""
+    waits = {"aten.nonzero": 1, "aten._local_scalar_dense": 1, "gsplat": 1}
+    assert default.waits[1:] == [waits] * 5
+
+
+def test_a_step_of_everything_waits_twice_beside_gsplat(trained):
+    shift = {"pipeline__model__appearance__opacity_shift": True, "pipeline__model__densify_until": 0.0}
+    trainer = trained(**EVERYTHING | LOOKS | shift, mixed_precision=True)
+    assert {(own(waits), waits["gsplat"]) for waits in trainer.waits[1:]} == {(2, 2)}
+    assert torch.isfinite(torch.stack([loss.cpu() for loss in trainer.pipeline.last_losses.values()])).all()
+
+
+def test_densification_grows_and_stays_on_the_gpu(densified):
+    model = densified().pipeline.model
+    assert model.num_points > 100
+    assert {len(p) for p in model.gauss_params.values()} == {model.num_points}
+
+
+def test_gradients_of_densification_do_not_depend_on_the_loss_scale(densified):
+    """GradScaler multiplies the loss by 65,536, and the strategy's threshold must not notice."""
+    threshold = {"pipeline__model__densify_grad_thresh": 3e-3}
+    counts = [
+        densified(use_grad_scaler=scaled, **threshold).pipeline.model.num_points for scaled in (False, True)
+    ]
+    assert counts[0] == counts[1]
+    assert counts[0] != densified().pipeline.model.num_points
+
+
+@pytest.mark.parametrize("capability", [(8, 6), (7, 5)])
+def test_mixed_precision_is_bfloat16_without_a_scale_where_the_gpu_has_it(trained, capability):
+    trainer = trained(2, mixed_precision=True, semantics=False, fake={"capability": capability})
+    assert trainer.grad_scaler.is_enabled() is (capability < (8, 0))
+    wanted = torch.float16 if capability < (8, 0) else torch.bfloat16
+    assert torch.get_autocast_dtype("cuda") == wanted
+
+
+def test_cudnn_does_not_tune_for_every_size(default):
+    assert torch.backends.cudnn.benchmark is False
+
+
+def test_code_maps_are_decoded_at_five_sizes(default):
+    model = default.pipeline.model
+    sizes = set()
+    for model.step in range(200):
+        sizes.add(model._random_size())
+    assert len(sizes) == 5
+    assert (min(sizes), max(sizes)) == model.config.decode_size
+
+
+@pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "langsplat", "direct", "lifting"])
+def test_every_encoder_trains(trained, name):
+    encoder = EncoderConfig(name, autoencoder_steps=5)
+    trained(2, pipeline__model__encoder=encoder, pipeline__model__densify_until=0.0)
+
+
+@pytest.mark.parametrize("preset", ["default", "official", "paper"])
+def test_every_preset_of_the_field_trains(trained, preset):
+    trained(1, pipeline__model__encoder__name="paper", pipeline__model__semantic_field__preset=preset)
+
+
+def test_a_cap_holds_and_the_least_opaque_go(trained):
+    trainer = trained(
+        6, semantics=False, pipeline__model__densify_grad_thresh=1e-7, pipeline__model__max_gaussians=110
+    )
+    model = trainer.pipeline.model
+    assert model.num_points == 110
+    assert len(model.strategy_state["grad2d"]) == 110
+
+
+def test_a_resumed_run_goes_on(trained):
+    first = trained(4, semantics=False, mixed_precision=True)
+    again = trained(6, semantics=False, mixed_precision=True, load_dir=first.checkpoint_dir)
+    assert again.first_iteration == 4
+    before, after = (t.pipeline.model.gauss_params["features_dc"].detach().cpu() for t in (first, again))
+    assert not torch.equal(before, after[: len(before)])
+
+
+def test_the_torch_rasterizer_renders_on_the_gpu_without_gsplat(trained, monkeypatch):
+    monkeypatch.setattr("fake_gpu.gsplat_stand_in", lambda *_, **__: pytest.fail("gsplat was called"))
+    trained(2, semantics=False, pipeline__model__rasterizer="torch")
+
+
+# ── after training ──────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_evaluation(default):
+    with fake_gpu():
+        metrics = default.pipeline.get_average_eval_image_metrics()
+    assert metrics["psnr"] > 0 and metrics["clip_l1"] > 0
+
+
+def test_a_photo_of_a_query_waits_for_its_answer_alone(default):
+    """Rendering and maps wait for nothing (but gsplat); scores and places are read at the end."""
+    with fake_gpu() as gpu:
+        scene = load_scene(default.base_dir / "config.yml")
+        assert scene.device == CUDA
+        prompts = scene.prompts("tower; window")
+        queries = scene.queries(prompts)
+        camera = scene.camera(scene.file.photos[0].name)
+        scene.match(prompts, camera)
+        with gpu.counting() as waits:
+            view = scene._render(camera, scene.engine.carried(queries))
+            scene.engine.maps(view.carried, queries)
+        assert waits == {"gsplat": 1}
+        with gpu.counting() as waits:
+            (match, _) = scene.match(prompts, camera)
+        assert {name: count for name, count in waits.items() if name != "copy to cuda"} == {
+            "gsplat": 1,
+            "tolist": 2,
+        }
+        assert match.relevancy.device == CUDA
+        assert len(scene.find("tower")) == 1
+
+
+def test_export(default, tmp_path):
+    from lang3dxl_ns.query.splat_file import write_splats
+
+    with fake_gpu():
+        scene = load_scene(default.base_dir / "config.yml")
+        scores = scene.query_gaussians("tower")
+        assert write_splats(tmp_path / "tower.ply", scene.gaussians, None, scores) == len(scores)
+
+
+def test_a_conversation_in_the_viewer(default):
+    from contextlib import nullcontext
+
+    from lang3dxl_ns.plugin.cameras import view_of
+    from lang3dxl_ns.plugin.viewer.session import Conversation
+    from lang3dxl_ns.plugin.viewer.splats import in_light
+
+    pipeline = default.pipeline
+    model = pipeline.model.eval()
+    with fake_gpu():
+        session = Conversation(
+            model, pipeline.scene_file, default.base_dir, nullcontext(), lambda: False, lambda: None,
+            lambda: {"rgb"}, lambda _: None,
+        )  # fmt: skip
+        session.ask("tower", foreground="window")
+        model.answers = session
+        camera = pipeline.scene_file.photos[0].camera
+        outputs = model.get_outputs_for_camera(view_of(camera))
+        assert all(value.device == CUDA for value in outputs.values())
+        gaussians, colors = in_light(model, camera, None)
+        assert gaussians.means.device == colors.device == CUDA
+        model.answers = None
+
+
+def test_numerics():
+    from lang3dxl_ns.numerics import losses
+    from lang3dxl_ns.numerics.command import measure_all
+
+    with fake_gpu():
+        rows = measure_all(list(losses.cases(quick=True, device="cuda"))[:4], quick=True, device="cuda")
+    assert [row.misses for row in rows if row.misses] == []
+
+
+# ── the fake finds bugs ─────────────────────────────────────────────────────────────────────────────────
+
+
+def bug_tensor_on_the_cpu(model):
+    colors = model._colors
+    model._colors = lambda g, center: colors(g, center) * torch.ones(3)
+
+
+def bug_index_of_a_cpu_tensor(model):
+    means = torch.zeros(model.num_points, 3)
+    model._colors = lambda g, center: means[(g["means"][:, 0] > 0).nonzero()[:, 0]]
+
+
+def bug_numpy(model):
+    colors = model._colors
+    model._colors = lambda g, center: torch.as_tensor(colors(g, center).detach().numpy())
+
+
+def bug_cpu_generator(model):
+    generator, colors = torch.Generator(), model._colors
+    noise = lambda: torch.rand(model.num_points, 3, generator=generator, device=model.device)  # noqa: E731
+    model._colors = lambda g, center: colors(g, center) + noise()
+
+
+@pytest.mark.parametrize(
+    ("plant", "error"),
+    [
+        (bug_tensor_on_the_cpu, "same device"),
+        (bug_index_of_a_cpu_tensor, "same device"),
+        (bug_numpy, "convert cuda:0 device type tensor to numpy"),
+        (bug_cpu_generator, "generator"),
+    ],
+)
+def test_planted_bugs_are_found(default, monkeypatch, plant, error):
+    model = default.pipeline.model
+    monkeypatch.setattr(model, "_colors", model._colors)  # so that it is restored
+    plant(model)
+    with fake_gpu(), pytest.raises((RuntimeError, TypeError), match=error):
+        model.get_outputs_for_camera(default.pipeline.datamanager.train_dataset.cameras[0:1])
+
+
+@pytest.mark.parametrize(
+    ("operation", "reason"),
+    [
+        (lambda x: float(x.sum()), "aten._local_scalar_dense"),
+        (lambda x: x[x > 1], "aten.index by a mask or the CPU's indices"),
+        (lambda x: x[[0, 1]], "aten.index by a mask or the CPU's indices"),
+        (lambda x: x.nonzero(), "aten.nonzero"),
+        (lambda x: x.cpu(), "copy to cpu"),
+        (lambda x: torch.ones(3).to(x), "copy to cuda"),
+        (lambda x: torch.tensor([1.0], device="cuda"), "copy to cuda"),
+        (lambda x: x.tolist(), "tolist"),
+        (lambda x: (x + 1).sum(), None),
+        (lambda x: torch.ones(3).to("cuda", non_blocking=True), None),
+        (lambda x: x[1:] * torch.tensor(2.0), None),
+    ],
+)
+def test_every_wait_is_counted(operation, reason):
+    with fake_gpu() as gpu:
+        x = torch.arange(3.0).to("cuda", non_blocking=True)
+        assert isinstance(x, GpuTensor)
+        with gpu.counting() as waits:
+            operation(x)
+    assert waits == ({} if reason is None else {reason: 1})
