@@ -5,15 +5,14 @@ from __future__ import annotations
 import ctypes
 import os
 import shutil
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 
@@ -21,16 +20,8 @@ PACKAGES = ("nerfstudio", "torch", "gsplat", "transformers", "pycolmap", "numpy"
 LEAST_MEMORY = 4e9
 LEAST_DISK = 10e9
 """Bytes: encoders of one or two gigabytes, targets of eight megabytes per photo, and a run."""
-
-_PROBE = """
-import torch
-from gsplat import rasterization
-means, quats = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
-k = torch.tensor([[[50.0, 0.0, 16.0], [0.0, 50.0, 16.0], [0.0, 0.0, 1.0]]])
-scene = means, quats, torch.full((1, 3), 0.1), torch.ones(1), torch.ones(1, 3), torch.eye(4)[None], k
-_, alpha, _ = rasterization(*(tensor.cuda() for tensor in scene), 32, 32)
-assert float(alpha.max()) > 0.5, "a Gaussian in front of the camera was not drawn"
-"""
+GSPLAT = "gsplat's CUDA kernels"
+NOT_BUILT = "not built yet: before the first training, or now with lang3dxl doctor --build"
 
 
 @dataclass(frozen=True)
@@ -48,30 +39,68 @@ class Finding:
 class Doctor:
     """Check this machine: versions, devices, gsplat's build, disk, memory and weights, and say what to do.
 
-    Nothing is downloaded or changed, except that gsplat caches the kernels it builds. Exits with status 1
-    if something prevents a run.
+    Nothing is downloaded or changed, unless --build asks for gsplat's kernels. Exits with status 1 if
+    something prevents a run.
     """
 
     data: Path | None = None
     """Folder of photos, to check its disk too."""
-    build_seconds: float = 60.0
-    """Time limit for gsplat to build or load its CUDA kernels. The first build takes many minutes."""
+    build: bool = False
+    """Build gsplat's CUDA kernels now (minutes), instead of before the first training."""
+    arch: str = ""
+    """Compute capability to build for, such as 8.6; default: this machine's GPUs."""
 
     def main(self) -> None:
-        problems = 0
-        for finding in findings(self.data, self.build_seconds):
-            problems += finding.verdict == "problem"
+        found = []
+        for finding in findings(self.data):
+            found.append(finding)
             print(f"[{finding.verdict:^7}] {finding.what}: {finding.found}")
             if finding.remedy:
                 print(f"{'':10}{finding.remedy}")
+        if self.build:
+            build_now(self.arch)
+        problems = sum(finding.verdict == "problem" for finding in found)
         if problems:
-            sys.exit(f"{problems} problem(s) found")
+            sys.exit(f"Verdict: {problems} problem(s) found, see above")
+        print(f"Verdict: {verdict(found)}")
 
 
-def findings(data: Path | None = None, build_seconds: float = 60.0) -> Iterator[Finding]:
+def verdict(found: list[Finding]) -> str:
+    """One sentence on what a training would use."""
+    by_name = {finding.what: finding for finding in found}
+    if "device cuda:0" not in by_name:
+        return "ready; everything runs on the CPU"
+    if all(finding.verdict == "ok" for finding in found if finding.what.startswith(GSPLAT)):
+        built = by_name[GSPLAT].found != NOT_BUILT
+        return "ready; the GPU renders with gsplat" + ("" if built else ", which is built first, in minutes")
+    return "works, but slowly: the GPU renders with torch until gsplat can be built (see above)"
+
+
+def build_now(arch: str = "") -> None:
+    """Build and load gsplat's kernels for a compute capability, by default this machine's.
+
+    Raises UserError if something is missing.
+    """
+    from lang3dxl_ns.rendering import gsplat_build
+
+    arch = arch or gsplat_build.device_arch()
+    if not arch:
+        raise UserError("torch sees no GPU to build for: name a compute capability, such as --arch 8.6")
+    folder = gsplat_build.build_folder(arch)
+    library = gsplat_build.build(gsplat_build.gsplat_extension(), folder, arch)
+    names = [name for name in dir(gsplat_build.load(library)) if not name.startswith("_")]
+    print(f"gsplat's kernels for {arch}: {len(names)} functions in {library}, built in {built_in(folder)}")
+
+
+def built_in(folder: Path) -> str:
+    """Seconds that a build took, and the memory of its largest compiler."""
+    return (folder / "done").read_text().strip()
+
+
+def findings(data: Path | None = None) -> Iterator[Finding]:
     """Runs all checks, yielding each result."""
     yield from versions()
-    yield from devices(build_seconds)
+    yield from devices()
     yield memory()
     yield from disks(data)
     yield from weights()
@@ -116,65 +145,60 @@ def _against(name: str, found: str, wanted: str) -> Finding:
     return Finding(name, "problem", f"{found}, needs {wanted}", f"pip install '{name}{wanted}'")
 
 
-def devices(build_seconds: float) -> Iterator[Finding]:
-    """GPUs and gsplat's kernels; without a GPU, the CPU rasterizer is used."""
+def devices() -> Iterator[Finding]:
+    """GPUs, and what gsplat needs; without a GPU, the CPU rasterizer is used."""
     cores = f"CPU, {os.cpu_count()} cores"
     slower = (
         "training and queries run on the CPU, slower: read photos small "
         "(--pipeline.datamanager.camera-res-scale-factor 0.25)"
     )
-    if not _has_driver():  # then skip importing torch, which takes seconds
+    if not _has_gpu():  # then skip importing torch, which takes seconds
         yield Finding("device", "note", cores, slower)
         return
     import torch
 
-    if not torch.cuda.is_available():
-        # A driver without a GPU visible to torch is a problem; no GPU at all is not.
-        mistaken = shutil.which("nvidia-smi") is not None
-        remedy = (
-            "nvidia-smi is there, but torch sees no GPU: install the torch build that fits the driver "
-            "(https://pytorch.org/get-started/locally)"
-        )
-        yield Finding("device", "problem" if mistaken else "note", cores, remedy if mistaken else slower)
+    from lang3dxl_ns.common.device import unused_gpu
+
+    trouble = unused_gpu()
+    if trouble is not None or not torch.cuda.is_available():
+        yield Finding("device", "problem" if trouble else "note", cores, trouble or slower)
         return
     for i in range(torch.cuda.device_count()):
         gpu = torch.cuda.get_device_properties(i)
-        yield Finding(f"device cuda:{i}", "ok", f"{gpu.name}, {gpu.total_memory / 1e9:.1f} GB")
-    yield gsplat_build(_PROBE, build_seconds)
+        found = f"{gpu.name}, {gpu.total_memory / 1e9:.1f} GB, compute capability {gpu.major}.{gpu.minor}"
+        yield Finding(f"device cuda:{i}", "ok", found)
+    yield from gsplat_findings()
 
 
-def _has_driver() -> bool:
-    """Whether NVIDIA's driver is installed, judged by its program or library."""
-    if shutil.which("nvidia-smi"):
+def gsplat_findings() -> Iterator[Finding]:
+    """Whether gsplat's kernels are built; if not, everything that building them needs."""
+    import torch
+
+    from lang3dxl_ns.rendering import gsplat_build
+
+    if torch.version.hip is not None:
+        yield Finding(GSPLAT, "note", "for NVIDIA's GPUs", "this GPU renders with torch, many times slower")
+        return
+    folder = gsplat_build.build_folder(gsplat_build.device_arch())
+    if gsplat_build.built(folder):
+        yield Finding(GSPLAT, "ok", f"built in {folder}")
+        return
+    yield Finding(GSPLAT, "ok", NOT_BUILT)
+    for need in gsplat_build.needs(folder):
+        fine = need.found is not None
+        what, remedy = f"{GSPLAT}, {need.what}", "" if fine else need.remedy
+        yield Finding(what, "ok" if fine else "note", need.found or "missing", remedy)
+
+
+def _has_gpu() -> bool:
+    """Whether an NVIDIA driver is installed, judged by its program or library, or an AMD one."""
+    if shutil.which("nvidia-smi") or Path("/dev/kfd").exists():
         return True
     try:
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
         return False
     return True
-
-
-def gsplat_build(probe: str, seconds: float) -> Finding:
-    """Renders a Gaussian with gsplat in a separate process with a time limit."""
-    start = time.monotonic()
-    what = "gsplat's CUDA kernels"
-    try:
-        done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, timeout=seconds)
-    except subprocess.TimeoutExpired:
-        remedy = (
-            "the first build takes many minutes: give it time (lang3dxl doctor --build-seconds 1800), or "
-            "install a prebuilt wheel (https://docs.gsplat.studio/whl)"
-        )
-        return Finding(what, "note", f"not built within {seconds:.0f} s", remedy)
-    if done.returncode == 0:
-        return Finding(what, "ok", f"work, after {time.monotonic() - start:.0f} s")
-    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-    compiler = shutil.which("nvcc") or os.environ.get("CUDA_HOME")
-    remedy = (
-        "install a prebuilt wheel (https://docs.gsplat.studio/whl), or the CUDA toolkit of "
-        f"torch's version for nvcc{'' if compiler else ', which is missing'}"
-    )
-    return Finding(what, "problem", last, remedy)
 
 
 def memory() -> Finding:

@@ -18,6 +18,8 @@ _BEYOND = 1.1
 class Densification(DefaultStrategy):
     """gsplat's densification by screen-space gradient, up to a number of Gaussians."""
 
+    grow_grad2d: float = 2e-4
+    """Screen-space gradient (image = [−1, 1]) above which Gaussians grow."""
     most: int = 0
     """Number of Gaussians not to exceed; 0: no limit."""
     loss_scale: float = 1.0

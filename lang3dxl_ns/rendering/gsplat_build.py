@@ -140,7 +140,7 @@ def needs(folder: Path | None = None) -> list[Need]:
     there = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     free, memory = shutil.disk_usage(there).free, machine_memory()
     compiler = shutil.which(os.environ.get("CXX", "g++"), path=search_path())
-    where = toolkit and f"{toolkit.release} in {toolkit.home}"
+    where = None if toolkit is None else f"{toolkit.release} in {toolkit.home}"
     room = f"{free / 1e9:.1f} GB free" if os.access(there, os.W_OK) and free > BUILD_BYTES else None
     trouble = "not writable" if not os.access(there, os.W_OK) else f"only {free / 1e9:.1f} GB free"
     nvcc_remedy = (
@@ -275,7 +275,8 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
     library = folder / f"{extension.name}.so"
     if process.returncode != 0 or not library.is_file():
         raise UserError(f"building {extension.name} failed: {_reason(log)} (the whole output: {log})")
-    (folder / "done").write_text(f"{time.monotonic() - start:.0f} s\n")
+    # Also the mark of a complete build.
+    (folder / "done").write_text(f"{time.monotonic() - start:.0f} s with {environment['MAX_JOBS']} job(s)\n")
     return library
 
 

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
-from lang3dxl_ns.rendering import gsplat_build
 from lang3dxl_ns.rendering.compositing import composite
 from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
 from lang3dxl_ns.rendering.gsplat_backend import rasterize_with_gsplat
@@ -73,7 +73,7 @@ def rasterize(
         background = channels.new_zeros(channels.shape[1])
     if backend == "auto":
         backend = _best_backend(gaussians.means)
-    elif backend == "gsplat":
+    elif backend == "gsplat" and gaussians.means.is_cuda:
         gsplat_build.make_ready()
     # gsplat's kernels can't be launched on empty input.
     render: Callable[..., Rendering] = functools.partial(_rasterize, backend)

@@ -1,0 +1,196 @@
+"""The build of gsplat's kernels: what it needs, what interrupts it, and one real build of a small source."""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.rendering import gsplat_build
+from lang3dxl_ns.rendering.gsplat_build import Extension, Need, Toolkit, build, find_toolkit
+
+SOURCE = """
+#include <Python.h>
+#include <cub/cub.cuh>
+
+__global__ void twice(float *x) { x[threadIdx.x] *= 2; }
+
+static PyObject *scratch(PyObject *, PyObject *count) {
+  size_t bytes = 0;
+  cub::DeviceScan::InclusiveSum(nullptr, bytes, (int *)nullptr, (int *)nullptr, (int)PyLong_AsLong(count));
+  return PyLong_FromSize_t(bytes);
+}
+
+static PyMethodDef methods[] = {{"scratch", scratch, METH_O, nullptr}, {nullptr}};
+static PyModuleDef module = {PyModuleDef_HEAD_INIT, "tiny", nullptr, -1, methods};
+PyMODINIT_FUNC PyInit_tiny() { return PyModule_Create(&module); }
+"""
+TOOLKIT = find_toolkit(torch.version.cuda or "0")
+
+
+@pytest.fixture
+def tiny(tmp_path) -> Extension:
+    source = tmp_path / "tiny.cu"
+    source.write_text(SOURCE)
+    return Extension("tiny", [source])
+
+
+@pytest.fixture
+def fake_compiler(monkeypatch):
+    """Replaces the compiler by Python code that is given the build's folder as sys.argv[1]."""
+    monkeypatch.setattr(gsplat_build, "find_toolkit", lambda _: Toolkit(Path("/nowhere"), "13.2", False))
+    monkeypatch.setattr(gsplat_build, "needs", lambda _=None: [])
+
+    def install(code: str) -> None:
+        head = "import json, sys, pathlib; f = pathlib.Path(json.loads(sys.argv[1])['build_directory'])\n"
+        monkeypatch.setattr(gsplat_build, "_COMPILE", head + code)
+
+    return install
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(TOOLKIT is None, reason="needs pip install 'lang3dxl-ns[cuda]'")
+def test_cub_is_compiled_linked_and_loaded(tiny, tmp_path):
+    """About 20 seconds of processor time."""
+    library = build(tiny, tmp_path / "build", "8.6")
+    assert gsplat_build.load(library, "tiny").scratch(10_000) >= 0
+    before = library.stat().st_mtime_ns
+    assert build(tiny, tmp_path / "build", "8.6").stat().st_mtime_ns == before
+
+
+def test_the_environments_compiler_comes_before_the_systems(tmp_path, monkeypatch):
+    def toolkit(folder: Path, release: str) -> Path:
+        for place in ("bin/nvcc", "include/cuda_runtime.h", "include/cub/cub.cuh"):
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            (folder / place).touch()
+        (folder / "bin/nvcc").write_text(f"#!/bin/sh\necho release {release}, V1\n")
+        (folder / "bin/nvcc").chmod(0o755)
+        return folder
+
+    pip, system = toolkit(tmp_path / "pip", "13.2"), toolkit(tmp_path / "system", "13.0")
+    old = toolkit(tmp_path / "old", "12.4")
+    monkeypatch.setattr(gsplat_build, "_toolkit_places", lambda _: [(pip, True), (system, False)])
+    assert find_toolkit("13.2") == Toolkit(pip, "13.2", True)
+    shutil.rmtree(pip / "include")
+    assert find_toolkit("13.2") == Toolkit(system, "13.0", False)
+    monkeypatch.setattr(gsplat_build, "_toolkit_places", lambda _: [(old, False)])
+    assert find_toolkit("13.2") is None
+
+
+def test_what_is_missing_is_named_with_its_remedy(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(gsplat_build, "needs", lambda _: [Need("ninja", None, "pip install ninja")])
+    with pytest.raises(UserError, match="ninja is missing: pip install ninja"):
+        build(tiny, tmp_path / "build", "8.6")
+    assert not (tmp_path / "build").exists()
+
+
+def test_a_machine_without_compilers_lacks_them(monkeypatch, tmp_path):
+    monkeypatch.setattr(shutil, "which", lambda *_, **__: None)
+    monkeypatch.setattr(gsplat_build, "_toolkit_places", lambda _: [])
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1e8))
+    monkeypatch.setattr(gsplat_build, "machine_memory", lambda: 2e9)
+    missing = {n.what.partition(",")[0] for n in gsplat_build.needs(tmp_path) if n.found is None}
+    assert missing >= {"C++ compiler", "ninja", "memory", "disk"}
+    assert any(name.startswith("nvcc") for name in missing)
+
+
+def test_a_failed_build_is_one_line_and_keeps_its_log(tiny, tmp_path, fake_compiler):
+    fake_compiler("print('fine'); print('tiny.cu(3): error: expected a \\';\\''); sys.exit(1)")
+    with pytest.raises(UserError, match=r"tiny.cu\(3\): error: expected") as error:
+        build(tiny, tmp_path / "build", "8.6")
+    assert "\n" not in str(error.value)
+    assert "fine" in (tmp_path / "build" / "build.log").read_text()
+
+
+def test_a_half_built_folder_is_completed(tiny, tmp_path, fake_compiler):
+    """A library without the mark of completeness may be cut off."""
+    folder = tmp_path / "build"
+    fake_compiler("(f / 'one.o').touch(); (f / 'tiny.so').write_text('half'); sys.exit(1)")
+    with pytest.raises(UserError, match="failed"):
+        build(tiny, folder, "8.6")
+    assert gsplat_build.built(folder, "tiny") is None
+    (folder / "lock").touch()  # of an older torch, which would wait for its holder
+    fake_compiler(
+        "assert (f / 'one.o').exists() and not (f / 'lock').exists(); (f / 'tiny.so').write_text('whole')"
+    )
+    assert build(tiny, folder, "8.6").read_text() == "whole"
+    assert gsplat_build.built(folder, "tiny") is not None
+
+
+def test_two_builds_at_once_share_one(tiny, tmp_path, fake_compiler):
+    fake_compiler("import time; time.sleep(1); open(f / 'count', 'a').write('x'); (f / 'tiny.so').touch()")
+    threads = [threading.Thread(target=build, args=(tiny, tmp_path / "build", "8.6")) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (tmp_path / "build" / "count").read_text() == "x"
+
+
+def test_ctrl_c_ends_the_compilers_too(tiny, tmp_path, fake_compiler, monkeypatch):
+    fake_compiler("import os, time; (f / 'pid').write_text(str(os.getpid())); time.sleep(60)")
+
+    def interrupted(process, folder, sources):
+        while not (folder / "pid").is_file() or not (folder / "pid").read_text():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(gsplat_build, "_watch", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        build(tiny, tmp_path / "build", "8.6")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "build" / "pid").read_text()), 0)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tiny, tmp_path, fake_compiler):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"can't be built in .*file"):
+        build(tiny, tmp_path / "file" / "build", "8.6")
+
+
+def test_without_gsplat_torch_renders_and_says_so(monkeypatch, capsys):
+    def fail() -> None:
+        raise UserError("ninja is missing: pip install ninja")
+
+    monkeypatch.setattr(gsplat_build, "make_ready", fail)
+    gsplat_build.ready.cache_clear()
+    assert not gsplat_build.ready()
+    assert not gsplat_build.ready()
+    gsplat_build.ready.cache_clear()
+    told = capsys.readouterr().out
+    assert told.count("pip install ninja") == 1
+    assert "many times slower" in told
+
+
+def test_a_loaded_build_is_gsplats(tmp_path):
+    """gsplat looks for its compiled module before it builds its own."""
+    code = """
+import sys, types, gsplat
+kernels = types.ModuleType("gsplat.csrc")
+gsplat.csrc = sys.modules["gsplat.csrc"] = kernels
+from gsplat.cuda._backend import _C
+from lang3dxl_ns.rendering import gsplat_build
+gsplat_build.make_ready()  # has nothing to do
+print(_C is kernels)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("True")
+
+
+def test_many_sources_are_united_once(tmp_path):
+    sources = [tmp_path / f"{i}.cu" for i in range(20)] + [tmp_path / "ext.cpp"]
+    for i, source in enumerate(sources):
+        source.write_text("x" * i)
+    units = gsplat_build._united(sources, tmp_path)
+    assert len(units) == gsplat_build.UNITS + 1
+    named = "".join(unit.read_text() for unit in units[:-1])
+    assert all(f'"{source}"' in named for source in sources[:-1])
+    before = [unit.stat().st_mtime_ns for unit in units]
+    assert [unit.stat().st_mtime_ns for unit in gsplat_build._united(sources, tmp_path)] == before
