@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.query.places import STRONG
 from lang3dxl_ns.query.visibility import VisibleGaussians
 
@@ -43,37 +45,44 @@ def rank_views(
     count as the match, so that four lukewarm windows don't outrank the one rose window. Where no peak
     reaches the threshold, the scene's median relevancy takes its place: the views that come closest lead.
     """
-    peaks = {name: _peak(view, scores) for name, view in views.items()}
-    areas = {name: view.share((scores > threshold).float()) for name, view in views.items()}
-    top = max(peaks.values(), default=0.0)
-    low = threshold if top > threshold else float(scores.median())
+    if not views:
+        return {}
+    # Numbers stay on the device until the end: a GPU would be waited for at each.
+    peaks = torch.stack([_peak(view, scores) for view in views.values()])
+    top = peaks.amax()
+    low = torch.where(top > threshold, threshold, scores.median())
     level = low + STRONG * (top - low)
-    ranks = {}
-    for name, view in views.items():
-        rows, shares = view.rows.long(), view.pixels.float() / view.size
-        strong = scores[rows] > level
-        size = min(float(shares[strong].sum()) / LARGE, 1.0) ** 0.5
-        closeness = min(max(peaks[name] - low, 0.0) / max(top - low, 1e-9), 1.0)
-        excess = (scores[rows] - low) * shares * strong
-        centered = float((excess * _centeredness(view, means)).sum() / excess.sum().clamp_min(1e-12))
-        ranks[name] = ViewRank(areas[name], peaks[name], closeness * size * centered)
-    return ranks
+    closeness = ((peaks - low) / (top - low).clamp_min(1e-9)).clamp(0, 1)
+    rows = []
+    for view in views.values():
+        values, shares = scores[view.rows], view.pixels.float() / view.size
+        strong = (values > level) * shares
+        size = (strong.sum() / LARGE).clamp_max(1.0).sqrt()
+        excess = (values - low) * strong
+        centered = (excess * _centeredness(view, means)).sum() / excess.sum().clamp_min(1e-12)
+        rows.append(torch.stack([((values > threshold) * shares).sum(), size * centered]))
+    areas, fitness = torch.stack(rows).unbind(1)
+    figures = torch.stack([areas, peaks, closeness * fitness], dim=1).tolist()
+    return {name: ViewRank(*row) for name, row in zip(views, figures, strict=True)}
 
 
-def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> float:
+def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, ""]:
     """Mean relevancy of the most relevant share `PEAK` of a view."""
     order = scores[view.rows].argsort(descending=True)
     shares = view.pixels.float()[order] / view.size
     before = shares.cumsum(0) - shares
     counted = (PEAK - before).clamp_min(0).minimum(shares)
-    return float((scores[view.rows][order] * counted).sum()) / PEAK
+    return (scores[view.rows][order] * counted).sum() / PEAK
 
 
 def _centeredness(view: VisibleGaussians, means: Float[Tensor, "n 3"]) -> Float[Tensor, " m"]:
     """1 for Gaussians in the middle half of a view, falling to `RIM` at its rim."""
     camera = view.camera
-    pose, k = camera.view_matrix.to(means), camera.intrinsics.to(means)
+    pose = to_device(camera.view_matrix.to(means.dtype), means.device)
     points = means[view.rows] @ pose[:3, :3].T + pose[:3, 3]
-    pixels = points[:, :2] / points[:, 2:] * k[[0, 1], [0, 1]] + k[:2, 2]
-    off = (2 * pixels / pixels.new_tensor([camera.width, camera.height]) - 1).abs().amax(1)
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    x, y = (points[:, axis] / points[:, 2] for axis in (0, 1))
+    off = torch.maximum(
+        (2 * (x * fx + cx) / camera.width - 1).abs(), (2 * (y * fy + cy) / camera.height - 1).abs()
+    )
     return 1 - (1 - RIM) * ((off - 0.5) / 0.5).nan_to_num(1.0).clamp(0, 1)

@@ -38,10 +38,6 @@ class VisibleGaussians:
         """Pixels of the view."""
         return self.camera.width * self.camera.height
 
-    def share(self, values: Float[Tensor, " n"]) -> float:
-        """Mean of the Gaussians' values over the view."""
-        return float((values[self.rows] * self.pixels.float()).sum()) / self.size
-
     def distance(self, means: Float[Tensor, "n 3"]) -> float:
         """Median depth of the visible Gaussians, world units; NaN if there are none."""
         view = self.camera.view_matrix.to(means)
