@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 import time
 import zipfile
 import zlib
@@ -40,7 +41,8 @@ from lang3dxl_ns.scene.camera import Camera
 
 NOT_A_CHECKPOINT = (
     *(OSError, EOFError, RuntimeError, pickle.UnpicklingError),
-    *(LookupError, TypeError, ValueError, AttributeError),
+    *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError),
+    *(MemoryError, struct.error),
 )
 """Exceptions raised on reading a file that is not a checkpoint."""
 NOT_FINISHED = "this run has no semantics yet: they are learned when training ends; resume it (--load-dir)"

@@ -112,7 +112,10 @@ def _scale_range(
     config: PreparationConfig, reconstruction: Reconstruction, sizes: dict[str, float]
 ) -> ScaleRange:
     if config.scale_preset is not None:
-        smallest, largest = load_preset(config.scale_preset)["scale_range"]
+        settings = load_preset(config.scale_preset)
+        if "scale_range" not in settings:
+            raise UserError(f"the preset {config.scale_preset} has no scale-range: choose a scene's")
+        smallest, largest = settings["scale_range"]
         return ScaleRange(
             smallest, largest, f"crops of {smallest}–{largest} world units ({config.scale_preset})"
         )

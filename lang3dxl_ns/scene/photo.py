@@ -148,6 +148,8 @@ def _seen(columns: Float32[Array, "h w"], rows: Float32[Array, "h w"]) -> Bool[A
     """
     height, width = columns.shape
     inside = (columns > -0.5) & (columns < width - 0.5) & (rows > -0.5) & (rows < height - 0.5)
+    if min(height, width) < 2:  # too narrow to turn over
+        return inside
     (column_dy, column_dx), (row_dy, row_dx) = np.gradient(columns), np.gradient(rows)
     return inside & (column_dx * row_dy > column_dy * row_dx)
 

@@ -14,7 +14,7 @@ from scenes import write_scene
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import lang3dxl
-from lang3dxl_ns.plugin.load_scene import load_scene
+from lang3dxl_ns.plugin.load_scene import load_scene, read_checkpoint
 from lang3dxl_ns.plugin.open_run import open_run
 from lang3dxl_ns.plugin.saved_config import TRUST_VARIABLE, check_command_line, read_config
 
@@ -169,6 +169,13 @@ def test_checkpoints_of_other_methods_and_shapes_are_named(copy, state):
     for opening in (load_scene, open_run):
         with pytest.raises(UserError, match=r"checkpoint"):
             opening(copy / "config.yml")
+
+
+@pytest.mark.parametrize("content", [b"G", b"\x80\x02J", b"M", b"\x80\x02]q\xff", b"PK\x03\x04"])
+def test_bytes_that_end_in_the_middle_of_a_pickle_are_no_checkpoint(tmp_path, content):
+    (tmp_path / "step-000000001.ckpt").write_bytes(content)
+    with pytest.raises(UserError, match="not a checkpoint of lang3dxl"):
+        read_checkpoint(tmp_path / "step-000000001.ckpt")
 
 
 def test_a_checkpoint_that_would_fill_the_memory_is_refused(copy):

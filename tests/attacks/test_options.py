@@ -5,6 +5,7 @@ from copy import deepcopy
 
 import pytest
 
+from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -88,6 +89,12 @@ def test_a_prompt_needs_something_to_compete_with():
     for negatives in ((), ("",), (" ", "")):
         with pytest.raises(UserError, match="--negatives is empty"):
             TextConfig(negatives=negatives)
+
+
+def test_a_preset_that_is_no_scene_has_no_crops(scene, tiny_clip, tmp_path):
+    options = ["--clip", str(tiny_clip), "--dense", "none", "--cache-dir", str(tmp_path)]
+    with pytest.raises(SystemExit, match="the preset synonyms/architecture has no scale-range"):
+        main(["prepare", "--data", str(scene), "--scale-preset", "synonyms/architecture", *options])
 
 
 def test_what_makes_sense_passes():

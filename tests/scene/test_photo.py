@@ -333,3 +333,11 @@ def test_labels_are_undistorted_with_the_photo_and_never_mixed(tmp_path):
     assert photo.undistort_labels(labels[::2, ::2]).shape == (45, 60)  # of any size
     straight = with_lens(photo, distortion=())
     assert torch.equal(straight.undistort_labels(labels), labels)
+
+
+@pytest.mark.parametrize("size", [(1, 16), (16, 1), (1, 1)])
+def test_a_distorted_photo_of_one_pixel_is_read(tmp_path, size):
+    Image.new("RGB", size, (9, 9, 9)).save(tmp_path / "a.png")
+    lens = Lens(*size, 20.0, 21.0, size[0] / 2, size[1] / 2, (0.1, 0.0, 0.0, 0.0))
+    photo = Photo("a.png", tmp_path / "a.png", None, lens)
+    assert photo.read().shape == (size[1], size[0], 3) and photo.read_mask().all()
