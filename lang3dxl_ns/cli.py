@@ -48,7 +48,10 @@ COMMANDS = {
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),
     "needs": ("commands.needs:Needs", "Which optional components a scene needs, and why."),
     "query": ("commands.query:Query", "Search a trained scene for texts: heat maps, masks, relevancy maps."),
-    "export": ("commands.query:Export", "Write the Gaussians that match a text as a PLY file."),
+    "export": (
+        "commands.query:Export",
+        "Write a scene, or what matches a text, as a splat file or a web page.",
+    ),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (
         "demo.landmark.demo_scene:DemoScene",

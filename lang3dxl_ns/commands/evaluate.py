@@ -121,7 +121,10 @@ class EvaluatePool:
         for path in self.reports:
             name, results = _read_results(path)
             if name in scenes:
-                raise UserError(f"{path} is a second report of the scene {name}: give one for each scene")
+                raise UserError(
+                    f"{path} is a second report of the scene {name}: give one for each scene; two "
+                    f"scenes of one name are told apart by lang3dxl evaluate run … --scene NAME"
+                )
             scenes[name] = results
         protocols = {name: results["protocol"] for name, results in scenes.items()}
         for key in ("layout", "scored_at"):
@@ -184,6 +187,8 @@ def _read_results(path: Path) -> tuple[str, dict[str, Any]]:
         if not isinstance(results["protocol"], dict):
             raise ValueError("it does not say what was scored")
         return str(content.get("scene") or content["experiment_name"]), results
+    except FileNotFoundError as error:
+        raise UserError(f"there is no {path}: name the scores.json of a report") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path} is not a report of `lang3dxl evaluate` or `ns-eval` ({error!r}): make it again"

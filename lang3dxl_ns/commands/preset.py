@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from lang3dxl_ns.common.presets import train_flags
+from lang3dxl_ns.common.presets import scene_presets, train_flags
 
 
 @dataclass
@@ -18,8 +18,11 @@ class Preset:
     ns-train lang3dxl --data FOLDER $(lang3dxl preset holyscenes/milano)
     """
 
-    name: Annotated[str, tyro.conf.Positional]
-    """Such as holyscenes/milano."""
+    name: Annotated[str, tyro.conf.Positional] = ""
+    """Such as holyscenes/milano; without a name, lists them all."""
 
     def main(self) -> None:
+        if not self.name:
+            print("\n".join(scene_presets()))
+            return
         print(shlex.join(train_flags(self.name)))

@@ -21,6 +21,7 @@ from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.splat_file import check_splat_name
 from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.web.write_page import write_page
 from lang3dxl_ns.scene.camera import Camera
 
 
@@ -137,17 +138,22 @@ def _view_report(name: str, matches: list[Match]) -> dict:
 
 @dataclass(kw_only=True)
 class Export:
-    """Write the Gaussians that match a text to a splat file that ordinary viewers open.
-
-    In the model's frame.
+    """Write the Gaussians that match a text to a splat file that ordinary viewers open (--out), in the
+    model's frame; or a web page to walk through the scene, with a button for each text (--web).
     """
 
     run: tyro.conf.Positional[Path | None] = None
     """Folder of the run, or its config.yml (default: the newest under outputs/)."""
-    text: str | None = None
-    """One prompt to look for (default: write everything)."""
-    out: Path
+    text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """Text to look for (default: write everything); with --web, repeat the flag or separate with `;`."""
+    out: Path | None = None
     """The .ply or .spz file to write."""
+    web: Path | None = None
+    """Folder for a web page that any static server can serve."""
+    title: str = ""
+    """Of the page (default: name of the photos' folder)."""
+    credit: str = ""
+    """Line on the page about the photos: who took them, and their licence."""
     all: bool = False
     """Write all Gaussians; with --text a .ply has their relevancy as a property."""
     look: str | None = None
@@ -157,8 +163,18 @@ class Export:
     def main(self) -> None:
         from lang3dxl_ns.plugin.load_scene import load_scene
 
-        make_folder(self.out.parent)
-        check_splat_name(self.out)
+        if (self.out is None) == (self.web is None):
+            raise UserError("give one of --out FILE.ply and --web FOLDER")
+        if self.out is not None:
+            make_folder(self.out.parent)
+            check_splat_name(self.out)
+            if len(self.text) > 1:
+                raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.run, settings=self.settings)
-        count = scene.export(self.out, self.text, everything=self.all, look=self.look)
-        say(f"Wrote {count} of {len(scene.gaussians['means'])} Gaussians to {self.out}")
+        if self.web is not None:
+            size = write_page(scene, self.web, self.text, self.title, self.credit, self.look)
+            say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
+        if self.out is not None:
+            text = self.text[0] if self.text else None
+            count = scene.export(self.out, text, everything=self.all, look=self.look)
+            say(f"Wrote {count} of {len(scene.gaussians['means'])} Gaussians to {self.out}")

@@ -31,6 +31,11 @@ def load_preset(name: str) -> dict[str, Any]:
     return settings
 
 
+def scene_presets() -> list[str]:
+    """Names of the presets that describe a scene."""
+    return sorted(f"holyscenes/{path.stem}" for path in FOLDER.glob("holyscenes/*.yaml"))
+
+
 def train_flags(name: str) -> list[str]:
     """Flags of `ns-train lang3dxl` that train a scene as published: crop range, iterations, schedule.
 
@@ -38,6 +43,6 @@ def train_flags(name: str) -> list[str]:
     """
     settings = load_preset(name)
     if "train" not in settings:
-        raise UserError(f"{name} is not a scene preset: choose another, such as holyscenes/milano")
+        raise UserError(f"{name} is not a scene preset: choose one of {', '.join(scene_presets())}")
     flags = {"pipeline.datamanager.scale-preset": name} | settings["train"]
     return [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]

@@ -229,9 +229,9 @@ class Scene:
         confining = self.prompts(self.config.foreground) if self.config.foreground else []
         return self.queries([*prompts, *confining]), len(confining)
 
-    def query_gaussians(self, text: str) -> Float[Tensor, " n"]:
+    def query_gaussians(self, text: str | Prompt) -> Float[Tensor, " n"]:
         """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo."""
-        prompts = self.prompts(text)
+        prompts = self.prompts([text])
         if len(prompts) > 1:
             raise UserError(f"{text!r} are {len(prompts)} prompts: score Gaussians for one at a time")
         return self._of_gaussians(prompts)[0]

@@ -12,7 +12,7 @@ def test_new_texts_and_frames_are_timed(monkeypatch):
     scene, encoded = painted_scene(), []
     prompts = scene.prompts
     monkeypatch.setattr(scene, "prompts", lambda text: encoded.append(text) or prompts(text))
-    benchmark = QueryBenchmark(load_config=Path("config.yml"), out=Path("out"), size=(64, 48), repeats=2)
+    benchmark = QueryBenchmark(run=Path("config.yml"), out=Path("out"), size=(64, 48), repeats=2)
     figures = benchmark.measure(scene)
     assert (figures["width"], figures["height"]) == (64, 48)
     assert all(figures[name] > 0 for name in ("text_ms", "frame_0_ms", "frame_1_ms", "frame_4_ms"))

@@ -4,7 +4,7 @@ import pytest
 
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.presets import FOLDER, load_preset, train_flags
+from lang3dxl_ns.common.presets import FOLDER, load_preset, scene_presets, train_flags
 from lang3dxl_ns.preparation.physical_scale import physical_scales
 
 
@@ -51,3 +51,9 @@ def test_training_takes_the_flags_of_every_scene(capsys):
             assert until * iterations == pytest.approx(30_000, abs=1)
         else:
             assert flags[2:] == train_flags("holyscenes/milano")[2:]
+
+
+def test_without_a_name_the_scenes_are_listed(capsys):
+    cli.main(["preset"])
+    assert capsys.readouterr().out.split() == scene_presets()
+    assert all(train_flags(name) for name in scene_presets())
