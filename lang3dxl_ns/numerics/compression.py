@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import torch
@@ -22,7 +22,7 @@ FIT = {"float32": Bounds(0.5, 0.05)}
 def cases(quick: bool, device: str) -> Iterator[Case]:
     """Features of a few kinds of things, one of them rare; masses and sizes of all magnitudes."""
     note = f"decoded, against the features; a kind on {RARE:.1%} of the Gaussians counts as much as all"
-    problems = {
+    problems: dict[str, Callable[[], Problem]] = {
         "one material": partial(_problem, kinds=1),
         "12 kinds": _problem,
         "features of 1e4": partial(_problem, size=1e4),

@@ -55,7 +55,7 @@ class AnsweringModel(SplatfactoModel):
         """As splatfacto renders, but the camera stays where it is: its size is read without waiting for a
         GPU."""
         self.set_crop(obb_box)
-        return self.get_outputs(camera)
+        return self.get_outputs(camera)  # type: ignore[return-value]
 
     def _rendered(self, camera: Cameras, obb_box: OrientedBox | None) -> dict[str, Tensor]:
         """The rendering; reused if the same view gets another prompt or display."""

@@ -271,12 +271,9 @@ class Lang3DXLModel(AnsweringModel):
         """The camera for the rasterizer, refined in training, and its pose (on the model's device). The
         former stays on the CPU unless it is refined: there, reading its size takes no time."""
         pose = camera.camera_to_worlds[0]
-        if (
-            self.training
-            and self.camera_optimizer.config.mode != "off"
-            and "cam_idx" in (camera.metadata or {})
-        ):
-            index, pose = camera.metadata["cam_idx"], to_device(pose, self.device)
+        metadata = camera.metadata or {}
+        if self.training and self.camera_optimizer.config.mode != "off" and "cam_idx" in metadata:
+            index, pose = metadata["cam_idx"], to_device(pose, self.device)
             # A slice, since an index would be copied to the GPU first.
             change = self.camera_optimizer(slice(index, index + 1))[0]
             pose = torch.cat([change[:, :3] @ pose[:, :3], pose[:, 3:] + change[:, 3:]], dim=1)

@@ -99,6 +99,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
 def make_strategy(config: Lang3DXLModelConfig) -> Densification:
     """Densification with the run's schedule."""
     steps = config.total_steps
+    assert config.densify_grad_thresh is not None  # chosen by the length of the run
     return Densification(
         prune_opa=config.cull_alpha_thresh,
         grow_grad2d=config.densify_grad_thresh,
