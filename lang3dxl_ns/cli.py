@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import tyro
 
 from lang3dxl_ns.common.checks import disk_trouble
+from lang3dxl_ns.common.console import silence_libraries
 from lang3dxl_ns.common.errors import UserError
 
 BENCHMARKS = {
@@ -68,6 +69,7 @@ COMMANDS = {
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `lang3dxl` command."""
     words = sys.argv[1:] if arguments is None else arguments
+    silence_libraries()
     try:
         with _terminable():
             choice = _choice(COMMANDS, words)

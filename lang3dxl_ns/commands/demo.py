@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich import get_console
+from rich.markdown import Markdown
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.reports import (
@@ -80,6 +82,8 @@ class Demo:
 
     def _run(self, out: Path) -> None:
         stages = Stages(out / _STAGES)
+        if (out / "scene" / "scene.json").exists():
+            say("scene: kept from an earlier command")
         with stages.stage("scene"):
             scene = self._scene(out)
         config = self._config(scene, out)
@@ -91,6 +95,8 @@ class Demo:
                 trainer.train()
             if trainer.interrupted:
                 raise KeyboardInterrupt
+        else:
+            say("train: skipped, the run is finished")
         with stages.stage("evaluate"):
             photos = list(trainer.pipeline.evaluate("held-out"))
             splits = {"Held-out photos": photos}
@@ -104,12 +110,11 @@ class Demo:
             from lang3dxl_ns.demo.picture import draw_picture, most_telling
 
             draw_picture(most_telling(rows, 3), folder / "report.png")
-        say = get_console().print
-        say(self.markdown(report), soft_wrap=True, highlight=False, markup=False)
-        say(f"\nReport and picture: {folder / 'report.md'}, {folder / 'report.png'}", soft_wrap=True)
+        get_console().print(Markdown(self.markdown(report)))
+        say(f"\nReport and picture: {folder / 'report.md'}, {folder / 'report.png'}")
         run = shlex.quote(os.path.relpath(out))
-        say(f"Walk through it: lang3dxl view {run}", soft_wrap=True)
-        say(f'Ask it:          lang3dxl query {run} --text "windows" --out found', soft_wrap=True)
+        say(f"Walk through it: lang3dxl view {run}")
+        say(f'Ask it:          lang3dxl query {run} --text "windows" --out found')
 
     def _scene(self, out: Path) -> Path:
         """The scene in `out`, generated unless it is there. Raises UserError if another one is there."""
@@ -237,6 +242,10 @@ def _split(found: dict[str, Any]) -> str:
     return f"{words}\n\n{markdown_table(['', 'rendered', 'mean feature instead'], quality)}"
 
 
+SHARES = {"scene": 0.15, "prepare": 0.3, "train": 0.45, "evaluate": 0.1}
+"""The demo's stages, and their usual shares of its time on a CPU."""
+
+
 class Stages:
     """Seconds and peak memory of the demo's stages, summed over interrupted commands."""
 
@@ -248,6 +257,7 @@ class Stages:
     def stage(self, name: str) -> Iterator[None]:
         start = time.perf_counter()
         host_peak(reset=True)
+        self._announce(name)
         try:
             yield
         finally:
@@ -255,6 +265,17 @@ class Stages:
             spent["seconds"] += time.perf_counter() - start
             spent["peak_mb"] = max(spent["peak_mb"], host_peak() / 2**20)
             write_atomically(self._path, json.dumps(self._spent, indent=1))
+
+    def _announce(self, name: str) -> None:
+        """Say which stage begins and, from the second on, about how long all that is left will take."""
+        order = list(SHARES)
+        place = order.index(name)
+        done = [stage for stage in order[:place] if stage in self._spent]
+        line = f"\n{place + 1} of {len(order)}: {name}"
+        if done:
+            pace = sum(self._spent[s]["seconds"] for s in done) / sum(SHARES[s] for s in done)
+            line += f" (about {math.ceil(pace * sum(SHARES[s] for s in order[place:]) / 60)} minutes left)"
+        say(line)
 
     def figures(self) -> dict[str, dict[str, float]]:
         return {

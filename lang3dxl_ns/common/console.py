@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -39,6 +41,22 @@ def say(*lines: str) -> None:
 
     for line in lines:
         get_console().print(printable(line), markup=False, highlight=False, soft_wrap=True)
+
+
+def silence_libraries() -> None:
+    """Silence the known warnings and progress bars of other libraries that a user can do nothing about."""
+    for message in _KNOWN_WARNINGS:
+        warnings.filterwarnings("ignore", message)
+    os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+
+
+_KNOWN_WARNINGS = (
+    r"`torch\.jit\.\w+` is deprecated",  # torchmetrics
+    r"`torch\.cuda\.amp\.GradScaler",  # nerfstudio's trainer
+    r"Detected call of `lr_scheduler\.step\(\)` before",  # nerfstudio's optimizers
+    r"Converting a tensor with requires_grad=True to a scalar",  # nerfstudio's writer
+)
+"""Beginnings of messages."""
 
 
 def some(names: Sequence[str], shown: int = 10) -> str:

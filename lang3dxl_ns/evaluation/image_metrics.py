@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from rich import get_console
 from torch import Tensor, nn
+
+from lang3dxl_ns.common.console import say
+
+ALEXNET = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
+"""The weights that LPIPS looks with, as torchvision publishes them."""
 
 
 def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
@@ -15,7 +21,8 @@ def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) ->
 
 
 class Lpips:
-    """LPIPS (AlexNet), loaded at first use; skipped if its weights are unavailable, as offline.
+    """LPIPS (AlexNet), loaded at first use; skipped unless its weights are in torch's cache: nothing is
+    downloaded without being asked.
 
     Not an nn.Module, so that AlexNet stays out of checkpoints.
     """
@@ -26,14 +33,21 @@ class Lpips:
 
     def __call__(self, target: Float[Tensor, "1 3 h w"], predicted: Float[Tensor, "1 3 h w"]) -> float | None:
         """Distance of two images in [0, 1]; None without weights."""
+        if self._metric is None and self._available and not _weights().is_file():
+            say(f"LPIPS is skipped: it needs {ALEXNET}, put into {_weights().parent}")
+            self._available = False
         if self._metric is None and self._available:
             from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
             try:
                 self._metric = LearnedPerceptualImagePatchSimilarity(normalize=True)
-            except (OSError, RuntimeError) as error:  # no Internet; a damaged or intercepted download
-                get_console().log(f"LPIPS is skipped: its weights cannot be loaded ({error})")
+            except (OSError, RuntimeError) as error:  # a damaged file
+                say(f"LPIPS is skipped: its weights cannot be loaded ({error})")
                 self._available = False
         if self._metric is None:
             return None
         return float(self._metric.to(target.device)(target, predicted.clamp(0, 1)))
+
+
+def _weights() -> Path:
+    return Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET.rpartition("/")[2]

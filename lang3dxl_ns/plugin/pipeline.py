@@ -20,7 +20,7 @@ from PIL import Image
 from rich.markup import escape
 from torch import Tensor
 
-from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import host_peak, progress_bar, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
@@ -255,11 +255,19 @@ class Lang3DXLPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
+        """`scored`, for `ns-eval` and the trainer; the figures are printed as well for `ns-eval`."""
+        results = self.scored(output_path, get_std)
+        if get_std:
+            means = {n: v for n, v in results.items() if isinstance(v, float) and not n.endswith("_std")}
+            say(*(f"{name:24} {value:10.4g}" for name, value in means.items()))
+        return results
+
+    def scored(self, output_path: Path | None = None, get_std: bool = False) -> dict[str, Any]:
         """Means and totals over the evaluated photos, and `peak_memory_mb` of the process (or of the GPU, if
-        one is used), for `ns-eval` and the trainer; see `evaluation.aggregate.average`.
+        one is used); see `evaluation.aggregate.average`.
 
         output_path: folder for a picture of every photo, optional.
-        get_std: as passed by `ns-eval`; adds standard deviations, `protocol` (what was scored, and how),
+        get_std: adds standard deviations, `protocol` (what was scored, and how),
             `photos` (the figures of each), and with held-out photos the same for the scene's `test_views`.
         """
         results = self._averages(self.config.evaluated_photos, output_path, get_std)

@@ -27,6 +27,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import unused_gpu, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import ran_out_of_memory
@@ -138,6 +139,13 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.__dict__.update(state)
         if self.timestamp != "{timestamp}":
             self.pipeline.datamanager.run = self.get_base_dir()
+
+    def print_to_terminal(self) -> None:
+        """Say where the settings are; LANG3DXL_VERBOSE=1 prints all of them, as other methods do."""
+        if os.environ.get("LANG3DXL_VERBOSE") == "1":
+            super().print_to_terminal()
+        else:
+            say(f"Settings: {self.get_base_dir() / 'config.yml'} (LANG3DXL_VERBOSE=1 prints them)")
 
     def set_timestamp(self) -> None:
         """Called once before the configuration is printed and saved: settle what depends on the run, and make

@@ -232,7 +232,9 @@ def _say_what_builtin_knows() -> None:
 def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
     """The model, frozen and in float32. Missing weights are an error, not random numbers."""
     from safetensors import SafetensorError
+    from transformers.utils import logging
 
+    logging.disable_progress_bar()  # a second's work, and it would draw over ours
     try:
         model, report = model_class.from_pretrained(
             files.folder,
