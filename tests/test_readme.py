@@ -49,7 +49,7 @@ def test_questions_from_the_shell(demo_output, folder):
     assert len(asked) >= 2
     for line in asked:
         output("bash", "-c", line, cwd=folder, shell=True)
-    assert {path.name for path in (folder / "found").iterdir()} == {"query.json", "portals", "towers"}
+    assert {"query.json", "portals", "towers"} <= {path.name for path in (folder / "found").iterdir()}
     assert list((folder / "found" / "towers").glob("*.overlay.png"))
     assert (folder / "towers.ply").read_bytes().startswith(b"ply")
 
