@@ -206,20 +206,19 @@ def test_no_photo_of_a_query_is_waited_for(default):
 
 
 def test_export(default, tmp_path):
-    from lang3dxl_ns.query.splat_file import write_splats
-
     with fake_gpu():
         scene = load_scene(default.base_dir / "config.yml")
-        scores = scene.query_gaussians("tower")
-        assert write_splats(tmp_path / "tower.ply", scene.gaussians, None, scores) == len(scores)
+        count = len(scene.gaussians["means"])
+        assert scene.export(tmp_path / "tower.ply", "tower", everything=True) == count
 
 
 def test_a_conversation_in_the_viewer(default):
     from contextlib import nullcontext
 
     from lang3dxl_ns.plugin.cameras import view_of
+    from lang3dxl_ns.plugin.light import in_light
     from lang3dxl_ns.plugin.viewer.session import Conversation
-    from lang3dxl_ns.plugin.viewer.splats import in_light
+    from lang3dxl_ns.plugin.viewer.splats import splats
 
     pipeline = default.pipeline
     model = pipeline.model.eval()
@@ -235,6 +234,7 @@ def test_a_conversation_in_the_viewer(default):
         assert all(value.device == CUDA for value in outputs.values())
         gaussians, colors = in_light(model, camera, None)
         assert gaussians.means.device == colors.device == CUDA
+        assert len(splats(gaussians, colors, 1.0).centers) > 0
         model.answers = None
 
 
