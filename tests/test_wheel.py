@@ -1,0 +1,72 @@
+"""The wheel: the same bytes each time, all that a checkout has, and commands that run from it alone."""
+
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.slow
+
+
+def build(folder: Path) -> Path:
+    words = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT]
+    subprocess.run(words, check=True, timeout=500)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    return build(tmp_path_factory.mktemp("wheel"))
+
+
+def test_it_is_reproducible(wheel, tmp_path):
+    assert build(tmp_path).read_bytes() == wheel.read_bytes()
+
+
+def test_commands_run_from_it_alone(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
+
+    def run(*words: str) -> str:
+        code = (
+            "import lang3dxl_ns, sys; from lang3dxl_ns.cli import main; main(); print(lang3dxl_ns.__file__)"
+        )
+        call = [sys.executable, "-c", code, *words]
+        done = subprocess.run(
+            call, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+        assert str(tmp_path / "installed") in done.stdout
+        return done.stdout
+
+    assert "holyscenes/milano" in run("preset")
+    run(
+        "demo-scene",
+        "--out",
+        "scene",
+        "--photos",
+        "4",
+        "--test-views",
+        "0",
+        "--width",
+        "96",
+        "--height",
+        "72",
+    )
+    settings = ("--scale-range", "0.5", "1.5", "--dense-tokens", "8")
+    assert "Targets of 4 photos" in run("prepare", "--data", "scene", "--clip", "builtin", *settings)
+    page = tmp_path / "installed" / "lang3dxl_ns" / "query" / "web"
+    assert {path.name for path in page.iterdir()} >= {"index.html", "page.js", "splats.js", "LICENSES.txt"}
+
+
+def test_the_version_is_the_same_everywhere(wheel):
+    version = re.search(r'^version = "(.*)"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)[1]
+    assert f"-{version}-" in wheel.name
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"## {version}" in (ROOT / "docs" / "changelog.md").read_text()
