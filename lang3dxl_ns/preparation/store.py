@@ -120,7 +120,7 @@ class FeatureStore:
                 if _canonical(json.loads(metadata["settings"])) != _canonical(settings):
                     return False
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-                if metadata.get("checksum", "") not in ("", _checksum(tensors)):
+                if metadata.get("checksum") != _checksum(tensors):
                     raise UserError(f"{path} ({kind} of {name}) is damaged: its checksum differs")
                 return True
         except (UserError, ValueError) as error:

@@ -1,7 +1,8 @@
-"""Damaged caches of a scene: made again, whatever the damage."""
+"""Damaged caches of a scene and targets: made again, whatever the damage."""
 
 import torch
 
+from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.query.cache import load_tensors, save_tensors
 
 
@@ -18,3 +19,14 @@ def test_a_cache_with_any_damage_counts_as_absent(tmp_path):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
         found = load_tensors(path, "key")  # a flipped bit in padding changes nothing
         assert found is None or torch.equal(found[0]["rows"], tensors["rows"])
+
+
+def test_a_target_whose_checksum_is_lost_counts_as_absent(tmp_path):
+    store, made_with = FeatureStore(tmp_path), {"encoder": "a"}
+    store.write("clip", "a.jpg", {"features": torch.arange(12.0).view(3, 4)}, made_with)
+    assert store.is_current("clip", "a.jpg", made_with)
+    path = store.path("clip", "a.jpg")
+    whole = path.read_bytes()
+    assert b"checksum" in whole and b"features" in whole
+    path.write_bytes(whole.replace(b"checksum", b"checksun").replace(b"features", b"featurez"))
+    assert not store.is_current("clip", "a.jpg", made_with)
