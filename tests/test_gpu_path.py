@@ -160,6 +160,28 @@ def test_a_cap_holds_and_the_least_opaque_go(trained):
     assert len(model.strategy_state["grad2d"]) == 110
 
 
+def test_out_of_memory_ends_in_three_settings_that_help(trained, monkeypatch):
+    """The checkpoint of before stays the latest."""
+    from lang3dxl_ns.common.errors import UserError
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
+
+    step, saved = Lang3DXLTrainer.train_iteration, []
+
+    def full(self, number):
+        if number == 3:
+            saved.extend(self.checkpoint_dir.glob("*.ckpt"))
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+        return step(self, number)
+
+    monkeypatch.setattr(Lang3DXLTrainer, "train_iteration", full)
+    with pytest.raises(UserError) as error:
+        trained(4, semantics=False, steps_per_save=2)
+    told = str(error.value)
+    for setting in ("max-gaussians", "camera-res-scale-factor", "view-dependence", "--load-dir"):
+        assert setting in told
+    assert saved == list(saved[0].parent.glob("*.ckpt"))
+
+
 def test_a_resumed_run_goes_on(trained):
     first = trained(4, semantics=False, mixed_precision=True)
     again = trained(6, semantics=False, mixed_precision=True, load_dir=first.checkpoint_dir)
