@@ -40,6 +40,7 @@ def trained(small, tiny_clip, tiny_dense, tmp_path_factory):
         folder = tmp_path_factory.mktemp("runs")
         with fake_gpu(**fake or {}) as gpu:
             trainer = make_trainer(small, tiny_clip, tiny_dense, folder, iterations, semantics, **changes)
+            torch.backends.cudnn.benchmark = True  # as ns-train does
             trainer.setup()
             trainer.waits = []
             count_steps(trainer, gpu)
