@@ -274,7 +274,12 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
             raise
     library = folder / f"{extension.name}.so"
     if process.returncode != 0 or not library.is_file():
-        raise UserError(f"building {extension.name} failed: {_reason(log)} (the whole output: {log})")
+        reason = _reason(log)
+        if process.returncode < 0:
+            reason = (
+                f"signal {-process.returncode} stopped it, perhaps for lack of memory (MAX_JOBS=1 takes less)"
+            )
+        raise UserError(f"building {extension.name} failed: {reason} (the whole output: {log})")
     # Also the mark of a complete build.
     (folder / "done").write_text(f"{time.monotonic() - start:.0f} s with {environment['MAX_JOBS']} job(s)\n")
     return library

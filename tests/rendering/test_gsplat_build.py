@@ -109,6 +109,12 @@ def test_a_failed_build_is_one_line_and_keeps_its_log(tiny, tmp_path, fake_compi
     assert "fine" in (tmp_path / "build" / "build.log").read_text()
 
 
+def test_a_build_that_was_killed_says_so(tiny, tmp_path, fake_compiler):
+    fake_compiler("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
+    with pytest.raises(UserError, match="signal 9 stopped it, perhaps for lack of memory"):
+        build(tiny, tmp_path / "build", "8.6")
+
+
 def test_a_half_built_folder_is_completed(tiny, tmp_path, fake_compiler):
     """A library without the mark of completeness may be cut off."""
     folder = tmp_path / "build"
