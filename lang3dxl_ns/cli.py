@@ -23,6 +23,7 @@ from lang3dxl_ns.common.errors import UserError
 BENCHMARKS = {
     "rasterizer": ("benchmarks.rasterizer:RasterizerBenchmark", "The CPU rasterizer: time, memory, error."),
     "training": ("benchmarks.training:TrainingBenchmark", "A training step by its parts."),
+    "gpu": ("benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time and memory, in one file to send."),
     "scale": ("benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
     "real-photos": ("benchmarks.real_photos:RealPhotos", "Scenes of real photos, trained and scored."),
     "queries": ("benchmarks.queries:QueryBenchmark", "From a new text to its picture."),

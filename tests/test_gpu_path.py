@@ -261,6 +261,19 @@ def test_a_conversation_in_the_viewer(default):
         model.answers = None
 
 
+def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monkeypatch):
+    from lang3dxl_ns.benchmarks import gpu
+
+    with fake_gpu():
+        gpu.GpuBenchmark(tmp_path, quick=True).main()
+        report = (tmp_path / "gpu.md").read_text()
+        monkeypatch.setattr(gpu, "step", lambda *_: pytest.fail("measured again"))
+        (tmp_path / "gpu.md").unlink()
+        gpu.GpuBenchmark(tmp_path, quick=True).main()
+    assert (tmp_path / "gpu.md").read_text() == report
+    assert "hard cases are within their bounds" in report
+
+
 def test_numerics():
     from lang3dxl_ns.numerics import losses
     from lang3dxl_ns.numerics.command import measure_all

@@ -1,0 +1,209 @@
+"""`lang3dxl benchmark gpu`: parity, numerics, time and memory on a GPU, in one Markdown file."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.reports import (
+    command_line,
+    describe_machine,
+    interleaved_times,
+    markdown_table,
+    write_report,
+)
+from lang3dxl_ns.components.losses import rgb_loss
+from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.scene.camera import Camera
+
+STEPS = 30_000
+"""Of the run whose time is estimated."""
+_PARTS = ("render", "loss", "backward", "optimizer")
+
+
+@dataclass
+class GpuBenchmark:
+    """Measure what only a GPU can show, in about ten minutes; finished parts are kept in case it is stopped.
+
+    The Gaussians are random ones in front of the camera, with view-independent colors: times are those of
+    rasterizer, loss and optimizer, not of reading photos.
+    """
+
+    out: Path
+    """Folder for gpu.md, gpu.json and the finished parts."""
+    quick: bool = False
+    """Small sizes, to try the command."""
+
+    def main(self) -> None:
+        if not torch.cuda.is_available():
+            raise UserError("torch sees no GPU here: lang3dxl doctor says why")
+        sizes = (200, 400) if self.quick else (100_000, 300_000, 1_000_000)
+        frame = (48, 32) if self.quick else (1920, 1080)
+        photo = (48, 32) if self.quick else (1000, 700)
+        parts: dict[str, Callable[[], Any]] = {
+            "parity": lambda: parity(300 if self.quick else 20_000, photo),
+            "numerics": lambda: numerics(self.quick),
+            **{f"step-{n}": lambda n=n: step(n, photo) for n in sizes},  # type: ignore[misc]
+            **{f"frame-{q}": lambda q=q: still(sizes[-1], frame, q) for q in (0, 1, 4)},  # type: ignore[misc]
+        }
+        results = {name: self._kept(name, work) for name, work in parts.items()}
+        machine, command = describe_machine("cuda"), command_line("lang3dxl benchmark gpu", self)
+        data = {"machine": machine, "command": command, "results": results}
+        write_report(self.out, "gpu", _markdown(results, machine, command), data)
+        print(f"Wrote {self.out / 'gpu.md'}")
+
+    def _kept(self, name: str, work: Callable[[], Any]) -> Any:
+        """The part's result: from an earlier run, if it got that far."""
+        path = self.out / "parts" / f"{name}.json"
+        if not path.is_file():
+            print(f"measuring {name}", flush=True)
+            write_atomically(path, json.dumps(work()))
+        return json.loads(path.read_text())
+
+
+def cloud(count: int, size: tuple[int, int]) -> tuple[dict[str, Tensor], Camera]:
+    """Parameters of random Gaussians (as trained: logarithms, logits), and a camera that sees them; on the
+    GPU. size: width and height, pixels."""
+    draw = torch.Generator().manual_seed(0)
+    raw = {
+        "means": torch.rand(count, 3, generator=draw) * 4 - torch.tensor([2.0, 2.0, -3.0]),
+        "quats": torch.randn(count, 4, generator=draw),
+        "scales": torch.rand(count, 3, generator=draw) - 3.5 - torch.tensor(float(count)).log() / 6,
+        "opacities": torch.randn(count, generator=draw),
+        "colors": torch.randn(count, 3, generator=draw),
+    }
+    width, height = size
+    lens = torch.tensor([[0.9 * width, 0.0, width / 2], [0.0, 0.9 * width, height / 2], [0.0, 0.0, 1.0]])
+    return {name: value.cuda() for name, value in raw.items()}, Camera(torch.eye(4), lens, width, height)
+
+
+def _gaussians(raw: dict[str, Tensor]) -> Gaussians:
+    return Gaussians(raw["means"], raw["quats"], raw["scales"].exp(), raw["opacities"].sigmoid())
+
+
+def parity(count: int, size: tuple[int, int]) -> dict[str, float]:
+    """Largest and mean difference of both rasterizers' pictures, and relative ones of their gradients."""
+    found = {}
+    for backend in ("torch", "gsplat"):
+        raw, camera = cloud(count, size)
+        for value in raw.values():
+            value.requires_grad_(True)
+        image = rasterize(_gaussians(raw), camera, raw["colors"].sigmoid(), backend=backend).image  # type: ignore[arg-type]
+        gradients = torch.autograd.grad((image - 0.5).square().sum(), list(raw.values()))
+        found[backend] = (image.detach(), dict(zip(raw, gradients, strict=True)))
+    (image, gradients), (other, others) = found["torch"], found["gsplat"]
+    off = (image - other).abs()
+    errors = {"image, largest": off.max(), "image, mean": off.mean()}
+    for name, gradient in gradients.items():
+        errors[f"gradient of {name}"] = (gradient - others[name]).norm() / gradient.norm()
+    return {name: float(value) for name, value in errors.items()}
+
+
+def numerics(quick: bool) -> dict[str, Any]:
+    """How many hard cases are within their bounds (tf32 among them), and those that are not."""
+    from lang3dxl_ns.numerics import decoder, losses
+    from lang3dxl_ns.numerics.catalog import all_cases
+    from lang3dxl_ns.numerics.command import measure_all
+
+    cases = list(losses.cases(True, "cuda"))[:2] + list(decoder.cases(True, "cuda"))[:1]
+    rows = measure_all(cases if quick else list(all_cases(True, "cuda")), quick, "cuda")
+    missed = [f"{row.component}, {row.case}, {row.mode}" for row in rows if row.misses]
+    return {"rows": len(rows), "missed": missed}
+
+
+def step(count: int, size: tuple[int, int]) -> dict[str, float]:
+    """Milliseconds of a training step of the colors by part, and the peak of its memory, GB."""
+    raw, camera = cloud(count, size)
+    parameters = {name: torch.nn.Parameter(value) for name, value in raw.items()}
+    optimizer = torch.optim.Adam(parameters.values(), lr=1e-4)
+    target = torch.rand(size[1], size[0], 3, generator=torch.Generator().manual_seed(1)).cuda()
+    state: dict[str, Tensor] = {}
+
+    def render() -> None:
+        optimizer.zero_grad()
+        state["image"] = rasterize(_gaussians(parameters), camera, parameters["colors"].sigmoid()).image  # type: ignore[arg-type]
+
+    def loss() -> None:
+        state["loss"] = rgb_loss(state["image"], target)
+
+    work = {"render": render, "loss": loss, "backward": lambda: state["loss"].backward()}
+    torch.cuda.reset_peak_memory_stats()
+    seconds = times_of_parts({**work, "optimizer": lambda: optimizer.step()})
+    return {name: 1e3 * value for name, value in seconds.items()} | {
+        "memory": torch.cuda.max_memory_allocated() / 1e9
+    }
+
+
+def times_of_parts(parts: dict[str, Callable[[], object]], repeats: int = 20) -> dict[str, float]:
+    """Median seconds of each part of a step; the first three steps are warm-up."""
+    times: dict[str, list[float]] = {name: [] for name in parts}
+    for number in range(repeats + 3):
+        for name, work in parts.items():
+            torch.cuda.synchronize()
+            start = time.perf_counter()
+            work()
+            torch.cuda.synchronize()
+            if number >= 3:
+                times[name].append(time.perf_counter() - start)
+    return {name: median(found) for name, found in times.items()}
+
+
+@torch.no_grad()
+def still(count: int, size: tuple[int, int], prompts: int) -> dict[str, float]:
+    """Milliseconds of a frame with heat maps of some prompts, and the peak of its memory, GB."""
+    raw, camera = cloud(count, size)
+    heat = raw["colors"][:, :1].sigmoid().expand(-1, prompts).contiguous() if prompts else None
+    torch.cuda.reset_peak_memory_stats()
+    gaussians, colors = _gaussians(raw), raw["colors"].sigmoid()
+    frame = lambda: rasterize(gaussians, camera, colors, features=heat, render_depth=True)  # noqa: E731
+    seconds = median(interleaved_times({"frame": frame}, repeats=20)["frame"])
+    return {"frame": 1e3 * seconds, "memory": torch.cuda.max_memory_allocated() / 1e9}
+
+
+def _markdown(results: dict[str, Any], machine: str, command: str) -> str:
+    steps = {name.removeprefix("step-"): value for name, value in results.items() if name.startswith("step-")}
+    rows, total = [], 0.0
+    for count, found in steps.items():
+        total = sum(found[part] for part in _PARTS)
+        figures = [*(f"{found[part]:.2f}" for part in _PARTS), f"{total:.2f}", f"{found['memory']:.2f}"]
+        rows.append([f"{int(count):,}", *figures])
+    frames = [
+        [name.removeprefix("frame-"), f"{found['frame']:.2f}", f"{found['memory']:.2f}"]
+        for name, found in results.items()
+        if name.startswith("frame-")
+    ]
+    measured, missed = results["numerics"]["rows"], results["numerics"]["missed"]
+    return f"""# On a GPU
+
+`{command}`
+{machine}.
+
+## Training step, milliseconds
+
+Colors of random Gaussians. 30,000 steps at the largest size: {STEPS * total / 6e4:.0f} minutes.
+
+{markdown_table(["Gaussians", *_PARTS, "step", "memory (GB)"], rows)}
+
+## Frame, milliseconds
+
+{markdown_table(["prompts", "frame", "memory (GB)"], frames)}
+
+## gsplat against torch
+
+{markdown_table(["difference", ""], [[k, f"{v:.2e}"] for k, v in results["parity"].items()])}
+
+## Numerics
+
+{measured - len(missed)} of {measured} hard cases are within their bounds.
+{"".join(f"{chr(10)}- {name}" for name in missed)}
+"""
