@@ -99,8 +99,8 @@ def parity(count: int, size: tuple[int, int]) -> dict[str, float]:
         for value in raw.values():
             value.requires_grad_(True)
         image = rasterize(_gaussians(raw), camera, raw["colors"].sigmoid(), backend=backend).image  # type: ignore[arg-type]
-        gradients = torch.autograd.grad((image - 0.5).square().sum(), list(raw.values()))
-        found[backend] = (image.detach(), dict(zip(raw, gradients, strict=True)))
+        slopes = torch.autograd.grad((image - 0.5).square().sum(), list(raw.values()))
+        found[backend] = (image.detach(), dict(zip(raw, slopes, strict=True)))
     (image, gradients), (other, others) = found["torch"], found["gsplat"]
     off = (image - other).abs()
     errors = {"image, largest": off.max(), "image, mean": off.mean()}
