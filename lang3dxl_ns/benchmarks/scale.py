@@ -20,7 +20,7 @@ from lang3dxl_ns.common.reports import (
 )
 
 if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainerConfig
+    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 
 _alone = partial(in_own_process, preload=("lang3dxl_ns.methods", "pycolmap", "transformers"))
 

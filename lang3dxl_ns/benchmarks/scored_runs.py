@@ -27,9 +27,9 @@ from lang3dxl_ns.common.reports import host_peak, in_own_process, write_atomical
 if TYPE_CHECKING:
     from lang3dxl_ns.evaluation.scores import MapScorer
     from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
-    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainerConfig
+    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 
-_LIBRARIES = ("lang3dxl_ns.plugin.trainer", "lang3dxl_ns.methods")
+_LIBRARIES = ("lang3dxl_ns.plugin.trainer_config", "lang3dxl_ns.methods")
 """Imports of a run's process, preloaded because they take ten seconds."""
 _TIMED_PHOTOS = 3
 _UNWANTED = ("num_rays_per_sec", "fps")

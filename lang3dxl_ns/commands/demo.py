@@ -33,7 +33,8 @@ from lang3dxl_ns.demo.landmark.labels import CATEGORIES
 if TYPE_CHECKING:
     from lang3dxl_ns.demo.picture import PictureRow
     from lang3dxl_ns.plugin.pipeline import EvaluatedPhoto
-    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer, Lang3DXLTrainerConfig
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
+    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 
 RUN = Path("run", "lang3dxl", "demo")
 """The run's folder inside the demo's folder."""

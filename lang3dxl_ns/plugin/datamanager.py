@@ -3,48 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-import tyro
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
-    FullImageDatamanagerConfig,
 )
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markdown import Markdown
 from rich.markup import escape
 from torch import Tensor
 
-from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.timing import part
-from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.plugin.data_folder import parser_for
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
+from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.plugin.run_dataparser import recorded_scene
 from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
-from lang3dxl_ns.preparation.encoders import BUILTIN
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
-from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
 from lang3dxl_ns.scene.camera import scaled_size
@@ -52,40 +45,8 @@ from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.novel_views import NovelViews, read_novel_views
 from lang3dxl_ns.scene.photo import Photo
 
-
-@dataclass
-class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
-    """Photos and their targets. `--pipeline.datamanager.clip none` trains colors only."""
-
-    _target: type = field(default_factory=lambda: Lang3DXLDataManager)
-    dataparser: AnnotatedDataParserUnion = field(default_factory=PhotoCollectionDataParserConfig)
-    """Source of photos and cameras."""
-    cache_dir: Path | None = None
-    """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
-    cache_gb: float | None = None
-    """Memory for decoded photos and their targets, in gigabytes; least recently used ones are evicted.
-    Default: a quarter of the machine's memory."""
-    read_ahead: int = 4
-    """Photos read ahead of the training step, in addition to that memory."""
-    run: tyro.conf.Suppress[Path | None] = None
-    """Folder of the run whose config.yml this comes from; set when that is read."""
-
-    def check(self) -> None:
-        """Raises UserError for invalid options, before any work."""
-        super().check()
-        check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
-
-    def settle_targets(self, learned: bool) -> None:
-        """Dense features and regions are for semantics `learned` with the scene; others have finer crops."""
-        if self.crops == "auto":
-            self.crops = "pyramid" if learned else "fine"
-        if not learned or self.clip == "none":
-            self.dense = self.regions = "none"
-        elif self.dense == "auto":
-            self.dense = BUILTIN if self.clip == BUILTIN else DENSE_MODEL
-
-
-_BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
+if TYPE_CHECKING:
+    from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
 
 
 class PhotosGoneError(UserError):
@@ -94,35 +55,6 @@ class PhotosGoneError(UserError):
 
 MOST_GONE = 0.1
 """Share of the training photos that may vanish."""
-
-
-class PhotoDataset(InputDataset):
-    """nerfstudio's dataset over `Photo`s: read, undistorted and resized on demand, pinhole cameras."""
-
-    def __init__(self, outputs: DataparserOutputs, scale: float):
-        super().__init__(outputs)
-        self.scale = scale
-        self.photos: list[Photo] = outputs.metadata["photos"]
-        lenses = [photo.lens.scaled(scale) for photo in self.photos]
-        self.cameras = to_nerfstudio(lenses, outputs.cameras.camera_to_worlds)
-
-    def read(self, index: int) -> dict[str, Tensor]:
-        """`image` [h, w, 3] uint8 and, if the photo has one, `mask` [h, w, 1] bool."""
-        photo = self.photos[index]
-        data = {"image": photo.read_uint8(self.scale)}
-        mask = photo.read_mask(self.scale)
-        if mask is not None:
-            data["mask"] = mask[..., None]
-        return data
-
-    def get_data(self, image_idx: int, image_type: str = "float32") -> dict:
-        data = self.read(image_idx)
-        if image_type == "float32":
-            data["image"] = data["image"].float() / 255
-        return {"image_idx": image_idx, **data}
-
-    def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
-        return self.photos[image_idx].read(self.scale)
 
 
 class Lang3DXLDataManager(FullImageDatamanager):
@@ -387,7 +319,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             if index in self._left_out:
                 continue
             try:
-                camera, batch = self._batch(self.train_dataset, index, self._read(self.train_dataset, index))
+                camera, batch = self.read(self.train_dataset, index)
             except UserError as reason:
                 CONSOLE.log(f"[yellow]{photo.name} is left out: {reason}")
                 continue
@@ -406,6 +338,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def fixed_indices_eval_dataloader(self) -> EvalPhotos:  # type: ignore[override]
         """All held-out photos, read one at a time."""
         return EvalPhotos(self)
+
+    def read(self, dataset: PhotoDataset, index: int) -> tuple[Cameras, dict]:
+        """Camera and batch of a photo. Raises UserError if it can't be read."""
+        return self._batch(dataset, index, self._read(dataset, index))
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of a typical photo, for nerfstudio's speed display."""
@@ -448,51 +384,6 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 batch[key] = batch[key].to(number)
         batch |= {"image_idx": index, "name": dataset.photos[index].name}
         return dataset.cameras[index : index + 1], batch
-
-
-class EvalPhotos:
-    """Photos to evaluate as (camera, batch) pairs, one photo in memory at a time; damaged ones are left out
-    and logged.
-
-    Args:
-        dataset: by default the held-out photos.
-        names: photos of it to evaluate; by default all.
-    """
-
-    def __init__(
-        self,
-        datamanager: Lang3DXLDataManager,
-        dataset: PhotoDataset | None = None,
-        names: Collection[str] | None = None,
-    ):
-        self._datamanager = datamanager
-        self.dataset = dataset or datamanager.eval_dataset
-        photos = enumerate(self.dataset.photos)
-        self._wanted = [index for index, photo in photos if names is None or photo.name in names]
-
-    def __len__(self) -> int:
-        return len(self._wanted)
-
-    def cameras(self) -> Iterator[tuple[Cameras, Photo]]:
-        """Camera and photo of each, without reading files."""
-        for index in self._wanted:
-            yield self.dataset.cameras[index : index + 1], self.dataset.photos[index]
-
-    def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
-        dataset = self.dataset
-        _ = self._datamanager.targets  # errors in preparing them must not be blamed on a photo
-        usable = False
-        for index in self._wanted:
-            photo = dataset.photos[index]
-            try:
-                item = self._datamanager._batch(dataset, index, self._datamanager._read(dataset, index))
-            except UserError as reason:
-                _log(f"{photo.name} is left out of evaluation: {reason}")
-                continue
-            usable = True
-            yield item
-        if not usable:
-            raise UserError("none of the held-out photos can be used: see the reasons above")
 
 
 def _log(message: str) -> None:

@@ -12,7 +12,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.load_scene import latest_checkpoint
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.saved_config import read_config
-from lang3dxl_ns.plugin.trainer import Lang3DXLTrainerConfig
+from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 from lang3dxl_ns.query.find_run import find_config
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from time import perf_counter
-from types import TracebackType
 from typing import Any, Literal
 
 import torch
@@ -28,12 +26,15 @@ from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
 from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resized
-from lang3dxl_ns.plugin.datamanager import EvalPhotos, Lang3DXLDataManager, Lang3DXLDataManagerConfig
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
+from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.label_limit import label_limit
 from lang3dxl_ns.plugin.lift_features import learn_from_photos
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED, describe_scene, scene_of_model
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.viewer.panel import AskPanel
 from lang3dxl_ns.query.answer import Asked
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
@@ -402,22 +403,3 @@ def _truths(truth: GroundTruth, photo: Photo, size: tuple[int, int]) -> dict[str
 
 def _peak_memory(device: torch.device | str) -> int:
     return torch.cuda.max_memory_allocated() if torch.device(device).type == "cuda" else host_peak()
-
-
-_previous_hook = sys.excepthook
-
-
-def print_user_errors_plainly() -> None:
-    """Make commands end on a `UserError` with its message alone, without a traceback."""
-    global _previous_hook
-    if sys.excepthook is not _print_user_error:
-        _previous_hook, sys.excepthook = sys.excepthook, _print_user_error
-
-
-def _print_user_error(
-    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
-) -> None:
-    if issubclass(kind, UserError):
-        CONSOLE.print(f"[bold red]Error:[/bold red] {escape(str(error))}", soft_wrap=True)
-    else:
-        _previous_hook(kind, error, traceback)

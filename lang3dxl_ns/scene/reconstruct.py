@@ -14,19 +14,20 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lang3dxl_ns.common.console import progress, say, some
+from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.reconstruction_report import ReconstructionReport
 from lang3dxl_ns.scene.reconstruction_settings import ReconstructionSettings
 from lang3dxl_ns.scene.video import extract_frames, is_video
 
@@ -37,45 +38,6 @@ _MEMORY_PER_THREAD = 1e9  # bytes, SIFT on a photo of MAX_SIZE pixels
 _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's ten may be more than there are
 _CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar, and the most work lost if killed
-
-
-@dataclass(frozen=True)
-class ReconstructionReport:
-    """Result of a reconstruction."""
-
-    photos: int
-    registered: int
-    points: int
-    error: float
-    """Mean reprojection error in pixels."""
-    cameras: int
-    mapper: str
-    left_out: dict[str, str] = field(default_factory=dict)
-    """Photos without a pose, with reasons."""
-    other_models: tuple[int, ...] = ()
-    """Sizes of further models, of photos not connected to the largest one."""
-    seconds: dict[str, float] = field(default_factory=dict)
-    """Per stage; for a resumed reconstruction, of the last attempt."""
-
-    def lines(self) -> list[str]:
-        """The report in words."""
-        found = [
-            f"{self.registered} of {self.photos} photos have a pose; {self.points} points, mean error "
-            f"{self.error:.2f} px, {self.cameras} camera{'s' * (self.cameras > 1)}, {self.mapper} mapper, "
-            f"{sum(self.seconds.values()):.0f} s"
-        ]
-        if self.other_models:
-            sizes = " and ".join(map(str, self.other_models))
-            found.append(
-                f"the photos fall into {len(self.other_models) + 1} unconnected groups: the "
-                f"largest, of {self.registered}, is used; the others have {sizes}. Add photos that connect "
-                "them, or give each group its own folder"
-            )
-        reasons: dict[str, list[str]] = {}
-        for name, why in self.left_out.items():
-            reasons.setdefault(why, []).append(name)
-        found += [f"left out, {why}: {some(names, 20)}" for why, names in reasons.items()]
-        return found
 
 
 def reconstruct(

@@ -11,14 +11,9 @@ from transformers import CLIPModel
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.demo.clip_training import train_dense
 from lang3dxl_ns.demo.clip_training.captions import ADJECTIVES, CANONICAL, CLASS, GENERIC, Caption
+from lang3dxl_ns.demo.clip_training.contrastive import caption_fit, contrastive_loss
 from lang3dxl_ns.demo.clip_training.teacher import score_teacher
-from lang3dxl_ns.demo.clip_training.train_clip import (
-    ClipTraining,
-    caption_fit,
-    contrastive_loss,
-    learning_rate,
-    train,
-)
+from lang3dxl_ns.demo.clip_training.train_clip import ClipTraining, learning_rate, train
 from lang3dxl_ns.demo.clip_training.views import render_landmark
 from lang3dxl_ns.demo.landmark.labels import CATEGORIES, ELEMENT, PART, category_masks
 from lang3dxl_ns.demo.landmark.materials import MATERIALS

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.datamanager import PhotoDataset
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.photo_cache import PhotoCache
+from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.scene.camera import view_matrix
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.geometry import sphere_around

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lang3dxl_ns.plugin.trainer import LONG_RUN, SHORT_RUN, RunAdamConfig, RunScheduleConfig
+from lang3dxl_ns.plugin.optimizers import LONG_RUN, SHORT_RUN, RunAdamConfig, RunScheduleConfig
 
 
 @pytest.mark.parametrize("steps", [10, 1000, 30_000])

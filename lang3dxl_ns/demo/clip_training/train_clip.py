@@ -20,7 +20,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 import tyro
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from torch import Tensor, nn
 
@@ -28,12 +28,16 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.demo.clip_training.captions import (
     ABSENT,
     CLASSES,
-    FIT_OF_LABEL,
-    FITS,
     GENERIC,
-    MAY_BE,
     Caption,
     draw_caption,
+)
+from lang3dxl_ns.demo.clip_training.contrastive import (
+    GENERIC_SHARE,
+    caption_fit,
+    contrastive_loss,
+    in_doubt,
+    patch_loss,
 )
 from lang3dxl_ns.demo.clip_training.crops import (
     Crops,
@@ -60,10 +64,7 @@ from lang3dxl_ns.demo.clip_training.small_clip import (
 from lang3dxl_ns.demo.clip_training.teacher import score_photos, score_teacher
 from lang3dxl_ns.demo.clip_training.views import SPLITS, LandmarkViews, ViewFolder, background_rendering
 
-_GENERIC_SHARE = 0.1  # how well a canonical phrase fits any crop, and the share of such captions
 _ABSENT_SHARE = 0.08  # of captions that fit no crop
-_DOUBT = 0.12  # share of a crop that may show a class unnamed, above which the pair is ignored
-_MISMATCH = 0.3  # fit of a caption with the right class but the wrong adjective or family
 _CAPTIONS = 48  # texts per step: fewer than crops, since they repeat
 _REPORT_EVERY, _SAVE_SECONDS = 50, 120
 
@@ -281,59 +282,6 @@ def learning_rate(step: int, progress: float, peak: float = 1.5e-3) -> float:
     return float(peak * min(1.0, (step + 1) / 60) * cosine)
 
 
-def caption_fit(
-    captions: list[Caption],
-    shares: Float[Array, "n k"],
-    materials: Int[Array, "n k"],
-    families: Int[Array, " n"],
-) -> Float[Array, "n t"]:
-    """How well each caption fits each crop: its class's share, reduced for a wrong adjective or family."""
-    classes = [caption.class_ for caption in captions]
-    everywhere = np.broadcast_to([_GENERIC_SHARE, 0.0], (len(shares), 2))  # GENERIC and ABSENT
-    fit = np.concatenate([shares @ FIT_OF_LABEL, everywhere], axis=1)[:, classes]
-    for column, caption in zip(fit.T, captions, strict=True):
-        if caption.adjective >= 0:
-            material = materials[:, caption.class_]
-            fits = (material >= 0) & FITS[caption.adjective][material]
-            column *= np.where(fits, 1.0, _MISMATCH)
-        if caption.family >= 0:
-            column *= np.where(families == caption.family, 1.0, _MISMATCH)
-    return fit
-
-
-def in_doubt(
-    captions: list[Caption], labels: Float[Array, "n l"], fit: Float[Array, "n t"]
-) -> Bool[Array, "n t"]:
-    """Crops that may show a caption's class unnamed, or are hardly labeled: ignored for this caption."""
-    hidden = labels @ MAY_BE
-    hidden = np.concatenate([hidden, np.zeros((len(labels), 2))], axis=1)[:, [c.class_ for c in captions]]
-    return ((hidden > _DOUBT) & (fit < hidden)) | (labels[:, -1:] > 0.5)
-
-
-def contrastive_loss(
-    images: Float[Tensor, "n d"],
-    texts: Float[Tensor, "t d"],
-    fit: Float[Tensor, "n t"],
-    classes: Int[Tensor, " t"],
-    scale: Float[Tensor, ""],
-    doubt: Bool[Tensor, "n t"] | None = None,
-) -> Float[Tensor, ""]:
-    """Soft cross entropy of image→text and text→image, for unit embeddings of crops and captions.
-
-    The targets are proportional to `fit`; image→text divides a class's share among its captions. Pairs in
-    `doubt` are left out.
-    """
-    logits = scale * images @ texts.T
-    if doubt is not None:
-        logits, fit = logits.masked_fill(doubt, -1e4), fit.masked_fill(doubt, 0.0)
-    shared = fit / (classes[:, None] == classes).sum(0)
-    per_image = shared / shared.sum(1, keepdim=True).clamp(min=1e-6)
-    per_text = fit / fit.sum(0, keepdim=True).clamp(min=1e-6)
-    image_loss = -(per_image * logits.log_softmax(1)).sum(1).mean()
-    text_loss = -(per_text * logits.log_softmax(0)).sum(0).mean()
-    return (image_loss + text_loss) / 2
-
-
 def _train_step(run: Run, folder: ViewFolder) -> float:
     rng = np.random.default_rng((run.config.seed, run.step))  # of the step: a resumed run draws the same
     crops = _draw_both(run, folder, rng)
@@ -370,18 +318,13 @@ def _draw_both(run: Run, folder: ViewFolder, rng: np.random.Generator) -> Crops:
     return join([draw_crops(views, half, 4, IMAGE_SIZE, rng) for views, half in halves])
 
 
-def patch_loss(logits: Float[Tensor, "n p k"], shares: Float[Tensor, "n p k"]) -> Float[Tensor, ""]:
-    """Soft cross entropy of the patches inside the view; it teaches the patch tokens their classes."""
-    return -(shares * logits.log_softmax(-1)).sum() / shares.sum().clamp(min=1.0)
-
-
 def _draw_captions(
     crops: Crops, shares: Float[Array, "n k"], materials: Int[Array, "n k"], rng: np.random.Generator
 ) -> list[Caption]:
     """Captions of some of the crops, each of a class drawn from the crop's shares, or generic."""
     captions = []
     for i in rng.choice(len(shares), min(_CAPTIONS, len(shares)), replace=False):
-        if rng.random() < _GENERIC_SHARE:
+        if rng.random() < GENERIC_SHARE:
             captions.append(draw_caption(GENERIC, -1, -1, rng))
         elif rng.random() < _ABSENT_SHARE or not shares[i].any():
             captions.append(draw_caption(ABSENT, -1, -1, rng))

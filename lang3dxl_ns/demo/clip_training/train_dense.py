@@ -18,9 +18,9 @@ import tyro
 from torch import nn
 
 from lang3dxl_ns.demo.clip_training.captions import CLASSES
+from lang3dxl_ns.demo.clip_training.contrastive import patch_loss
 from lang3dxl_ns.demo.clip_training.crops import augment, draw_crops, patch_labels
 from lang3dxl_ns.demo.clip_training.small_clip import PATCH, normalize
-from lang3dxl_ns.demo.clip_training.train_clip import patch_loss
 from lang3dxl_ns.demo.clip_training.views import ViewFolder
 
 _GRIDS = (6, 8, 12, 24)

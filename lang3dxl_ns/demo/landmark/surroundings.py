@@ -10,7 +10,8 @@ import numpy as np
 from lang3dxl_ns.demo.landmark.labels import PART
 from lang3dxl_ns.demo.landmark.materials import MASONRY, colored, make_material
 from lang3dxl_ns.demo.landmark.openings import Openings
-from lang3dxl_ns.demo.landmark.vocabulary import Builder, Point, ShapeList, ahead
+from lang3dxl_ns.demo.landmark.shape_list import Point, ShapeList
+from lang3dxl_ns.demo.landmark.vocabulary import Builder, ahead
 
 
 def place_surroundings(b: Builder, center, radius: float) -> None:

@@ -3,64 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from lang3dxl_ns.demo.landmark.labels import ELEMENT, PART
-from lang3dxl_ns.demo.landmark.materials import COVERING, MASONRY, Material, make_material
+from lang3dxl_ns.demo.landmark.materials import COVERING, MASONRY, make_material
 from lang3dxl_ns.demo.landmark.openings import Openings
-from lang3dxl_ns.demo.landmark.shapes import Box, Ellipsoid, Frustum, Polytope, Shape, gable, prism
+from lang3dxl_ns.demo.landmark.shape_list import Point, ShapeList
 
 FRONT, LEFT, BACK, RIGHT = 0.0, math.pi / 2, math.pi, -math.pi / 2
 """Facings: the façade looks along +x."""
-Point = tuple[float, float, float]
-
-
-@dataclass
-class ShapeList:
-    """Collects shapes and their materials."""
-
-    rng: np.random.Generator
-    shapes: list[Shape] = field(default_factory=list)
-    materials: list[Material] = field(default_factory=list)
-    role: dict[str, int] = field(default_factory=dict)
-    """Index into `materials` by role: "wall", "trim", "dome" …"""
-
-    def add_material(self, material: Material) -> int:
-        self.materials.append(material)
-        return len(self.materials) - 1
-
-    def chance(self, probability: float) -> bool:
-        return bool(self.rng.random() < probability)
-
-    def between(self, low: float, high: float) -> float:
-        return float(self.rng.uniform(low, high))
-
-    def pick(self, *choices: str) -> str:
-        return choices[int(self.rng.integers(len(choices)))]
-
-    # Solids. `material` is a role, `foot` the centre of the base.
-
-    def box(self, part: str, material: str, foot: Point, size: Point, yaw: float = 0.0) -> None:
-        self.shapes.append(Box(PART[part], self.role[material], foot, yaw, 0, size))
-
-    def cone(self, part: str, material: str, foot: Point, bottom: float, top: float, height: float) -> None:
-        self.shapes.append(Frustum(PART[part], self.role[material], foot, 0.0, 0, bottom, top, height))
-
-    def ellipsoid(self, part: str, material: str, centre: Point, radii: Point, cut=-1e3, end=1e3) -> None:
-        self.shapes.append(Ellipsoid(PART[part], self.role[material], centre, 0.0, 0, radii, cut, end))
-
-    def gable(
-        self, part: str, material: str, foot: Point, width: float, length: float, height: float, yaw=0.0
-    ) -> None:
-        """A gabled roof with its ridge along y (turned by yaw)."""
-        fields = gable(width, length, height)
-        self.shapes.append(Polytope(PART[part], self.role[material], foot, yaw, 0, **fields))
-
-    def prism(self, part, material, foot: Point, radius, height, sides: int, taper=0.0, yaw=0.0) -> None:
-        fields = prism(radius, height, sides, taper)
-        self.shapes.append(Polytope(PART[part], self.role[material], foot, yaw, 0, **fields))
 
 
 @dataclass

@@ -1,0 +1,126 @@
+"""Optimizers: Adam and its learning rates over a run of any length, a guard before each step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch import Tensor
+from torch.cuda.amp.grad_scaler import GradScaler
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+
+from lang3dxl_ns.components import schedules
+
+SHORT_RUN = 1_000
+"""Iterations of a run that uses the short-run rates."""
+LONG_RUN = 30_000
+"""Iterations of a run that uses the published rates."""
+
+
+def run_length_weight(iterations: int) -> float:
+    """Position of a run between the short (0) and the long one (1), on a logarithmic scale."""
+    position = math.log(max(iterations, 1) / SHORT_RUN) / math.log(LONG_RUN / SHORT_RUN)
+    return min(max(position, 0.0), 1.0)
+
+
+@dataclass
+class RunAdamConfig(AdamOptimizerConfig):
+    """Adam with a learning rate for the length of the run."""
+
+    eps: float = 1e-15
+    """As in 3D Gaussian splatting: the first gradients of codes and tables are tiny."""
+    short_lr: float | None = None
+    """Rate for runs of up to 1,000 iterations (None: the same as `lr`, which is for 30,000 and more).
+    In between, the two are interpolated on a logarithmic scale."""
+
+    def fit(self, iterations: int) -> None:
+        """Resolve `lr` for a run of this many iterations."""
+        if self.short_lr is not None:
+            self.lr = schedules.log_linear(run_length_weight(iterations), self.short_lr, self.lr)
+            self.short_lr = None
+
+    def setup(self, params) -> Optimizer:
+        return torch.optim.Adam(params, lr=self.lr, eps=self.eps, weight_decay=self.weight_decay)
+
+
+@dataclass
+class RunScheduleConfig(SchedulerConfig):
+    """A learning-rate curve in fractions of the run: warm-up (log-linear), then decay."""
+
+    _target: type = field(default_factory=lambda: RunSchedule)
+    start: float = 1.0
+    """Multiple of the rate at the first iteration."""
+    warm: float = 0.0
+    """Fraction of the run until the full rate."""
+    end: float = 1.0
+    """Multiple of the rate at the end."""
+    shape: Literal["cosine", "log-linear"] = "cosine"
+    """Shape of the decay after the warm-up."""
+    power: float = 1.0
+    """Cosine only: the fraction is first raised to this power (2 keeps the rate high longer)."""
+    until: float = 1.0
+    """Fraction of the run at which the end is reached; constant afterwards."""
+    total_steps: int = LONG_RUN
+    """Iterations of the run; set by the trainer."""
+
+
+class RunSchedule(Scheduler):
+    """Makes the scheduler of a `RunScheduleConfig`."""
+
+    config: RunScheduleConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
+        # A plain function, since LambdaLR would put a callable object's state into the checkpoint.
+        return LambdaLR(optimizer, lambda step: self.multiple(step))
+
+    def multiple(self, step: int) -> float:
+        """Multiple of the rate at an iteration, as a Python float (a NumPy one would end up in the
+        checkpoint, where torch's weights-only loader rejects it)."""
+        c = self.config
+        x = min(step / max(c.total_steps, 1) / c.until, 1.0)
+        if x < c.warm:
+            return schedules.log_linear(x / c.warm, c.start, 1.0)
+        rest = (x - c.warm) / (1.0 - c.warm) if c.warm < 1.0 else 1.0
+        if c.shape == "log-linear":
+            return schedules.log_linear(rest, 1.0, c.end)
+        return schedules.cosine_decay(rest, 1.0, c.end, c.power)
+
+
+class GuardedOptimizers(Optimizers):
+    """nerfstudio's optimizers with a guard before each step."""
+
+    def __init__(self, config: dict, param_groups: dict, allowed: Callable[[GradScaler], bool]):
+        super().__init__(config, param_groups)
+        self._allowed = allowed
+
+    def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
+        """Step, or drop all gradients and leave parameters and moments unchanged."""
+        if self._allowed(grad_scaler):
+            super().optimizer_scaler_step_some(grad_scaler, param_groups)
+            return
+        for name, parameters in self.live_parameters().items():
+            if any(parameter.grad is not None for parameter in parameters):
+                grad_scaler.unscale_(self.optimizers[name])  # records the overflow, which lowers the scale
+        self.zero_grad_all()
+
+    def live_parameters(self) -> dict[str, list[Tensor]]:
+        """The optimizers' present parameters (`parameters` are the initial ones, before densification)."""
+        return {
+            name: [parameter for group in optimizer.param_groups for parameter in group["params"]]
+            for name, optimizer in self.optimizers.items()
+        }
+
+
+def add_rows_to_state(optimizer: Optimizer) -> None:
+    """Give rows that a resumed run added to a parameter (vectors of new photos) an optimizer state of 0."""
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if value.dim() and len(value) < len(parameter):
+                added = value.new_zeros(len(parameter) - len(value), *value.shape[1:])
+                state[name] = torch.cat((value, added))

@@ -1,0 +1,155 @@
+"""Settings of a training run, fitted to its length, its data and the run that it resumes."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import TrainerConfig
+
+from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.device import unused_gpu, warn_of_unused_gpu
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.load_scene import check_checkpoint
+from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
+from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
+from lang3dxl_ns.plugin.saved_config import read_config
+from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
+from lang3dxl_ns.preparation.encoders import check_encoders
+from lang3dxl_ns.preparation.needs import read_needs
+from lang3dxl_ns.rendering import gsplat_build
+
+
+@dataclass
+class Lang3DXLTrainerConfig(TrainerConfig):
+    """Training configuration; `--max-num-iterations` alone rescales every schedule."""
+
+    _target: type = field(default_factory=lambda: Lang3DXLTrainer)
+    pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
+    max_skipped_steps: int = 20
+    """A step whose loss or gradient is not finite is skipped; after this many in a row the run stops."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """When config.yml is read: tell the data manager the run's folder, which only this class knows."""
+        self.__dict__.update(state)
+        if self.timestamp != "{timestamp}":
+            self.pipeline.datamanager.run = self.get_base_dir()
+
+    def print_to_terminal(self) -> None:
+        """Say where the settings are; LANG3DXL_VERBOSE=1 prints all of them, as other methods do."""
+        if os.environ.get("LANG3DXL_VERBOSE") == "1":
+            super().print_to_terminal()
+        else:
+            say(f"Settings: {self.get_base_dir() / 'config.yml'} (LANG3DXL_VERBOSE=1 prints them)")
+
+    def set_timestamp(self) -> None:
+        """Called once before the configuration is printed and saved: settle what depends on the run, and make
+        sure that the encoders can be had before a folder is made for it."""
+        print_user_errors_plainly()
+        check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
+        if self.pipeline.model.max_gaussians is not None:
+            check_numbers(self.pipeline.model, {"max_gaussians": (0, 1e9)}, "--pipeline.model.")
+        check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
+        self.pipeline.datamanager.check()
+        fresh = self.timestamp == "{timestamp}"
+        super().set_timestamp()
+        self.fit_to_run()
+        data = self.pipeline.datamanager
+        check_encoders(data.clip, data.dense)
+        self._check_device()
+        if fresh:
+            self._claim_folder()
+
+    def _check_device(self) -> None:
+        """Before anything is prepared: say if a GPU stays unused, and build gsplat if it is needed."""
+        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
+            raise UserError(f"torch can't use a GPU here: {unused_gpu() or 'there is none'}")
+        warn_of_unused_gpu()
+        rasterizer = self.pipeline.model.rasterizer
+        if self.machine.device_type == "cuda" and rasterizer == "auto":
+            gsplat_build.ready()
+        elif self.machine.device_type == "cuda" and rasterizer == "gsplat":
+            gsplat_build.make_ready()
+
+    def _claim_folder(self) -> None:
+        """Create a unique folder, even if two runs start in the same second."""
+        second, tries = self.timestamp, 1
+        while True:
+            try:
+                return self.get_base_dir().mkdir(parents=True)
+            except FileExistsError:
+                tries += 1
+                self.timestamp = f"{second}-{tries}"
+
+    def get_checkpoint_dir(self) -> Path:
+        """Folder of the checkpoints. Every command that loads a run calls this, so it also checks the
+        latest one. Raises UserError if that is damaged."""
+        folder = super().get_checkpoint_dir()
+        print_user_errors_plainly()
+        warn_of_unused_gpu()
+        check_checkpoint(folder)
+        return folder
+
+    def fit_to_run(self) -> None:
+        """Resolve rates, schedules and presets for this number of iterations; make paths absolute, so
+        that config.yml is complete and can be read from any folder."""
+        if self.machine.num_devices * self.machine.num_machines > 1:
+            print_user_errors_plainly()
+            raise UserError(
+                "training runs on one device: densification changes the number of parameters, which "
+                "torch's DistributedDataParallel does not support. Leave --machine.num-devices at 1; several "
+                "GPUs can prepare targets (lang3dxl prepare --workers N), or train scenes side by side"
+            )
+        iterations = self.max_num_iterations
+        for group in self.optimizers.values():
+            if isinstance(group["optimizer"], RunAdamConfig):
+                group["optimizer"].fit(iterations)
+            if isinstance(group["scheduler"], RunScheduleConfig):
+                group["scheduler"].total_steps = iterations
+        self.load_dir, self.load_checkpoint = _absolute(self.load_dir), _absolute(self.load_checkpoint)
+        if self.load_dir is not None:
+            self._follow(self.load_dir.parent)
+        elif self.load_checkpoint is not None:
+            self._follow(self.load_checkpoint.parents[1])
+        self.pipeline.model.fit_to_run(iterations)
+        self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
+        datamanager = self.pipeline.datamanager
+        datamanager.settle_targets(learned=self.pipeline.model.encoder.learns_from_renderings)
+        datamanager.data = _absolute(datamanager.data or self.data)
+        self.data = datamanager.data
+        self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)
+        if isinstance(datamanager.dataparser, PhotoCollectionDataParserConfig):
+            datamanager.dataparser.held_out = _absolute(datamanager.dataparser.held_out)
+        self.output_dir = Path(self.output_dir).expanduser().absolute()
+
+    def _follow(self, run: Path) -> None:
+        """A resumed run keeps what `auto` resolved to when it began."""
+        if not (run / "config.yml").is_file():
+            return
+        earlier: Any = read_config(run / "config.yml").pipeline
+        earlier = earlier.model
+        needs, mine = read_needs(run), self.pipeline.model
+        for part in ("semantic_field", "appearance"):
+            if getattr(mine, part).preset == "auto":
+                getattr(mine, part).preset = getattr(earlier, part).preset
+
+        def settle(owner: Any, before: Any, name: str, component: str) -> None:
+            choice = getattr(before, name)
+            if choice == "auto" and component in needs:
+                choice = "on" if needs[component] else "off"
+            if getattr(owner, name) == "auto":
+                setattr(owner, name, choice)
+
+        settle(mine.appearance, earlier.appearance, "use", "appearance")
+        settle(mine, earlier, "view_dependence", "view dependence")
+        settle(mine, earlier, "camera_optimization", "camera optimizer")
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else Path(path).expanduser().absolute()

@@ -1,0 +1,46 @@
+"""Report of a reconstruction: which photos have a pose, which were left out, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lang3dxl_ns.common.console import some
+
+
+@dataclass(frozen=True)
+class ReconstructionReport:
+    """Result of a reconstruction."""
+
+    photos: int
+    registered: int
+    points: int
+    error: float
+    """Mean reprojection error in pixels."""
+    cameras: int
+    mapper: str
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Photos without a pose, with reasons."""
+    other_models: tuple[int, ...] = ()
+    """Sizes of further models, of photos not connected to the largest one."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Per stage; for a resumed reconstruction, of the last attempt."""
+
+    def lines(self) -> list[str]:
+        """The report in words."""
+        found = [
+            f"{self.registered} of {self.photos} photos have a pose; {self.points} points, mean error "
+            f"{self.error:.2f} px, {self.cameras} camera{'s' * (self.cameras > 1)}, {self.mapper} mapper, "
+            f"{sum(self.seconds.values()):.0f} s"
+        ]
+        if self.other_models:
+            sizes = " and ".join(map(str, self.other_models))
+            found.append(
+                f"the photos fall into {len(self.other_models) + 1} unconnected groups: the "
+                f"largest, of {self.registered}, is used; the others have {sizes}. Add photos that connect "
+                "them, or give each group its own folder"
+            )
+        reasons: dict[str, list[str]] = {}
+        for name, why in self.left_out.items():
+            reasons.setdefault(why, []).append(name)
+        found += [f"left out, {why}: {some(names, 20)}" for why, names in reasons.items()]
+        return found
