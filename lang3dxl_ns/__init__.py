@@ -7,6 +7,8 @@ nerfstudio.
 from importlib import import_module
 from typing import Any
 
+from lang3dxl_ns.common.console import silence_libraries
+
 _PUBLIC = {
     "load_scene": "plugin.load_scene",
     "Scene": "query.scene",
@@ -29,4 +31,6 @@ __all__ = list(_PUBLIC)
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "load_scene":  # imports nerfstudio, whose imports warn of what a user can do nothing about
+        silence_libraries()
     return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)

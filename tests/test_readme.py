@@ -5,12 +5,15 @@ import re
 import sys
 from pathlib import Path
 
+import nbformat
 import pytest
+from nbclient import NotebookClient
 from processes import output
 
 pytestmark = pytest.mark.slow
 
-README = (Path(__file__).parents[1] / "README.md").read_text()
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
 
 
 def section(title: str) -> str:
@@ -58,3 +61,13 @@ def test_questions_from_python(demo_output, folder):
     (snippet,) = blocks("python", section("Ask it"))
     shown = "\nprint(match.relevancy.shape, match.mask.dtype, match.peak, len(places))"
     assert "torch.bool" in output(sys.executable, "-c", snippet + shown, cwd=folder, shell=True)
+
+
+def test_the_notebook_runs_from_top_to_bottom(demo_output, folder):
+    notebook = nbformat.read(ROOT / "docs" / "tour.ipynb", as_version=4)
+    client = NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}})
+    client.execute()
+    assert any(
+        "match.score" in cell.source and "best relevancy" in cell.outputs[0].text for cell in notebook.cells
+    )
+    assert (folder / "towers.ply").read_bytes().startswith(b"ply")

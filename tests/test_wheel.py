@@ -1,4 +1,4 @@
-"""The wheel: the same bytes each time, all that a checkout has, and commands that run from it alone."""
+"""Wheel and sdist: the same bytes each time, all that a checkout has, commands that run from the wheel alone."""
 
 import os
 import re
@@ -13,8 +13,8 @@ ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
 
 
-def build(folder: Path) -> Path:
-    words = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT]
+def build(folder: Path, source: Path = ROOT) -> Path:
+    words = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source]
     subprocess.run(words, check=True, timeout=500)
     (wheel,) = folder.glob("*.whl")
     return wheel
@@ -27,6 +27,16 @@ def wheel(tmp_path_factory) -> Path:
 
 def test_it_is_reproducible(wheel, tmp_path):
     assert build(tmp_path).read_bytes() == wheel.read_bytes()
+
+
+def test_the_sdist_is_reproducible_and_makes_the_same_wheel(wheel, tmp_path):
+    sources = []
+    for name in ("one", "two"):
+        words = [sys.executable, "-m", "build", "--sdist", "--outdir", tmp_path / name, ROOT]
+        subprocess.run(words, check=True, timeout=500, capture_output=True)
+        sources += (tmp_path / name).glob("*.tar.gz")
+    assert sources[0].read_bytes() == sources[1].read_bytes()
+    assert build(tmp_path / "wheel", sources[0]).read_bytes() == wheel.read_bytes()
 
 
 def test_commands_run_from_it_alone(wheel, tmp_path):

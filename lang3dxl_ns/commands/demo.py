@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import shlex
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,14 +15,13 @@ from rich.markdown import Markdown
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
-    host_peak,
     markdown_table,
     write_report,
 )
+from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
 from lang3dxl_ns.demo.landmark.labels import CATEGORIES
 
@@ -82,18 +77,17 @@ class Demo:
             sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
-        stages = Stages(out / _STAGES)
+        stages = Stages(SHARES, out / _STAGES)
         if (out / "scene" / "scene.json").exists():
             say("scene: kept from an earlier command")
         with stages.stage("scene"):
             scene = self._scene(out)
         config = self._config(scene, out)
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
-        with stages.stage("prepare"):
-            trainer.setup()
+        trainer.stages = stages
+        trainer.setup()
         if trainer.first_iteration < config.max_num_iterations:
-            with stages.stage("train"):
-                trainer.train()
+            trainer.train()
             if trainer.interrupted:
                 raise KeyboardInterrupt
         else:
@@ -243,46 +237,8 @@ def _split(found: dict[str, Any]) -> str:
     return f"{words}\n\n{markdown_table(['', 'rendered', 'mean feature instead'], quality)}"
 
 
-SHARES = {"scene": 0.15, "prepare": 0.3, "train": 0.45, "evaluate": 0.1}
+SHARES = {"scene": 0.15, "prepare": 0.3, "train": 0.35, "words": 0.1, "evaluate": 0.1}
 """The demo's stages, and their usual shares of its time on a CPU."""
-
-
-class Stages:
-    """Seconds and peak memory of the demo's stages, summed over interrupted commands."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._spent: dict[str, dict[str, float]] = json.loads(path.read_text()) if path.exists() else {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        host_peak(reset=True)
-        self._announce(name)
-        try:
-            yield
-        finally:
-            spent = self._spent.setdefault(name, {"seconds": 0.0, "peak_mb": 0.0})
-            spent["seconds"] += time.perf_counter() - start
-            spent["peak_mb"] = max(spent["peak_mb"], host_peak() / 2**20)
-            write_atomically(self._path, json.dumps(self._spent, indent=1))
-
-    def _announce(self, name: str) -> None:
-        """Say which stage begins and, from the second on, about how long all that is left will take."""
-        order = list(SHARES)
-        place = order.index(name)
-        done = [stage for stage in order[:place] if stage in self._spent]
-        line = f"\n{place + 1} of {len(order)}: {name}"
-        if done:
-            pace = sum(self._spent[s]["seconds"] for s in done) / sum(SHARES[s] for s in done)
-            line += f" (about {math.ceil(pace * sum(SHARES[s] for s in order[place:]) / 60)} minutes left)"
-        say(line)
-
-    def figures(self) -> dict[str, dict[str, float]]:
-        return {
-            kind: {name: math.ceil(10 * spent[kind]) / 10 for name, spent in self._spent.items()}
-            for kind in ("seconds", "peak_mb")
-        }
 
 
 def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer) -> PictureRow:

@@ -337,10 +337,10 @@ class Lang3DXLPipeline(VanillaPipeline):
         queries = scene.queries(scene.prompts(self.query))
         return Asked(scene.engine, queries, min_alpha=scene.config.min_alpha)
 
-    def finish_training(self) -> None:
-        """Work after the last iteration: learn semantics, if the encoder learns none from renderings."""
-        if self.model.semantic_field is not None and self.model.semantic_field.needs_lifting:
-            self.learn_words()
+    @property
+    def has_words_to_learn(self) -> bool:
+        """Whether semantics are learned after the last iteration, not from renderings."""
+        return self.model.semantic_field is not None and self.model.semantic_field.needs_lifting
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""

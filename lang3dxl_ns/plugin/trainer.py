@@ -22,6 +22,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import ran_out_of_memory
+from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.plugin.checkpoint import restore_run_state, run_state
 from lang3dxl_ns.plugin.datamanager import PhotosGoneError
 from lang3dxl_ns.plugin.load_scene import (
@@ -48,6 +49,8 @@ class Lang3DXLTrainer(Trainer):
     config: Lang3DXLTrainerConfig
     pipeline: Lang3DXLPipeline
     optimizers: GuardedOptimizers
+    stages: Stages
+    """Announced while they run: `prepare`, `train`, `words`. A longer command puts a list of its own here."""
     interrupted = False
     """Whether training was interrupted."""
     _last_iteration = -1
@@ -59,6 +62,7 @@ class Lang3DXLTrainer(Trainer):
         no scale, and no step is lost or waits for one. Older GPUs (before Ampere) take float16 with a
         scale."""
         super().__init__(config, local_rank, world_size)
+        self.stages = Stages({"prepare": 0.3, "train": 0.6, "words": 0.1})
         if self.mixed_precision:
             wide = torch.cuda.is_bf16_supported(including_emulation=False)
             torch.set_autocast_dtype("cuda", torch.bfloat16 if wide else torch.float16)
@@ -70,6 +74,10 @@ class Lang3DXLTrainer(Trainer):
         of the scene into the run's folder, so that it can be queried without the photos."""
         # nerfstudio turns this on, and photos of many sizes would then be tuned for in nearly every step.
         torch.backends.cudnn.benchmark = False
+        with self.stages.stage("prepare"):
+            self._set_up(test_mode)
+
+    def _set_up(self, test_mode: Literal["test", "val", "inference"]) -> None:
         data, self.config.data = self.config.data, None  # otherwise the viewer would write camera paths there
         try:
             super().setup(test_mode)
@@ -167,6 +175,7 @@ class Lang3DXLTrainer(Trainer):
         if self._start_step:
             CONSOLE.log(f"Resuming at iteration {self._start_step} of {total}")
         self.config.max_num_iterations = total - self._start_step
+        self.stages.begin("train")
         try:
             with self._stoppable():
                 super().train()
@@ -177,6 +186,7 @@ class Lang3DXLTrainer(Trainer):
                 raise
             raise UserError(self._out_of_memory()) from error
         finally:
+            self.stages.end()
             self.config.max_num_iterations = total
             if summary := self.guard.summary():
                 CONSOLE.log(escape(summary))
@@ -184,6 +194,7 @@ class Lang3DXLTrainer(Trainer):
     def train_iteration(self, step: int):
         result = super().train_iteration(step)
         self._last_iteration = step
+        self.stages.progress((step + 1 - self._start_step) / self.config.max_num_iterations)
         return result
 
     @contextmanager
@@ -237,8 +248,10 @@ class Lang3DXLTrainer(Trainer):
     def _after_train(self) -> None:
         """Finish and save; after an interruption print how to resume, and don't wait in the viewer."""
         self._is_ending = True
-        if not self.interrupted:
-            self.pipeline.finish_training()
+        self.stages.end()
+        if not self.interrupted and self.pipeline.has_words_to_learn:
+            with self.stages.stage("words"):
+                self.pipeline.learn_words()
         if self.interrupted:
             self.step = max(self._last_iteration, self._start_step)  # not the one that was about to begin
             self.config.viewer.quit_on_train_completion = True

@@ -21,7 +21,7 @@ _MOST_POINTS = 20_000
 """Heaviest Gaussians that are grouped: DBSCAN keeps all their neighborhoods in memory."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Box:
     """An axis-aligned box in the model's frame."""
 
@@ -29,6 +29,10 @@ class Box:
     high: tuple[float, float, float]
     share: float
     """Share of the total match weight that is connected to it, 0…1."""
+
+    def __repr__(self) -> str:
+        low, high = (tuple(round(x, 3) for x in corner) for corner in (self.low, self.high))
+        return f"Box({low} to {high}, {self.share:.0%} of the match)"
 
     @property
     def center(self) -> tuple[float, ...]:

@@ -37,7 +37,9 @@ def test_the_report_holds_precision_quality_time_and_memory(run):
             assert split[who]["mAP"] == pytest.approx(sum(values) / len(values))
         assert split["limit"]["mAP"] > 2 * split["chance"]["mAP"]
         assert split["colors"]["psnr"] > 5
-    assert set(report["seconds"]) == set(report["peak_mb"]) == {"scene", "prepare", "train", "evaluate"}
+    assert (
+        set(report["seconds"]) == set(report["peak_mb"]) == {"scene", "prepare", "train", "words", "evaluate"}
+    )
     assert report["splits"]["Test views"]["features"]["clip_l1"] > 0
     assert "2-D teacher" in (run / "report.md").read_text()
     assert (run / "report.png").stat().st_size > 10_000

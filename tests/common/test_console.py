@@ -5,7 +5,6 @@ import warnings
 import pytest
 import torch
 
-from lang3dxl_ns.commands.demo import SHARES, Stages
 from lang3dxl_ns.common.console import silence_libraries
 from lang3dxl_ns.evaluation.image_metrics import Lpips
 
@@ -33,16 +32,3 @@ def test_alexnet_is_not_downloaded_unasked(monkeypatch, tmp_path, capsys):
     picture, lpips = torch.rand(1, 3, 64, 64), Lpips()
     assert lpips(picture, picture) is None and lpips(picture, picture) is None
     assert capsys.readouterr().out.count("LPIPS is skipped") == 1  # said once
-
-
-def test_stages_say_where_they_are_and_what_is_left(tmp_path, capsys):
-    stages = Stages(tmp_path / "stages.json")
-    for name in SHARES:
-        with stages.stage(name):
-            stages._spent.setdefault(name, {"seconds": 0.0, "peak_mb": 0.0})["seconds"] += 600 * SHARES[name]
-    first, *rest = [line for line in capsys.readouterr().out.splitlines() if line]
-    assert first == "1 of 4: scene"
-    left = [600 * sum(list(SHARES.values())[i:]) / 60 for i in (1, 2, 3)]
-    assert [int(line.split("about ")[1].split()[0]) for line in rest] == [
-        pytest.approx(minutes, abs=1) for minutes in left
-    ]

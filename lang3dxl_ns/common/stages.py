@@ -1,0 +1,107 @@
+"""Stages of a long command: which one runs, the time left in all, seconds and memory of each."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.reports import host_peak
+
+_FIRST_ESTIMATE_S = 20.0
+"""Seconds of a stage before its pace is trusted."""
+
+
+class Stages:
+    """Announces the stages of a command, and estimates what is left of all of them.
+
+    Args:
+        shares: the stages in order, with their usual shares of the time.
+        path: keeps their seconds and peak memory, summed over interrupted commands; None: nothing is
+            kept, and memory is not measured, since that resets the process's peak.
+    """
+
+    def __init__(self, shares: Mapping[str, float], path: Path | None = None) -> None:
+        self._shares, self._path = dict(shares), path
+        kept = path is not None and path.exists()
+        self._spent: dict[str, dict[str, float]] = json.loads(path.read_text()) if kept and path else {}
+        self._current: str | None = None
+        self._start, self._tenths = 0.0, 0
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """A stage, announced and measured."""
+        self.begin(name)
+        try:
+            yield
+        finally:
+            self.end()
+
+    def begin(self, name: str) -> None:
+        """Announce a stage; the one before it ends."""
+        self.end()
+        self._current, self._start, self._tenths = name, time.perf_counter(), 0
+        if self._path is not None:
+            host_peak(reset=True)
+        self._announce()
+
+    def end(self) -> None:
+        """End the present stage, if there is one."""
+        if self._current is None:
+            return
+        spent = self._spent.setdefault(self._current, {"seconds": 0.0, "peak_mb": 0.0})
+        spent["seconds"] += time.perf_counter() - self._start
+        self._current = None
+        if self._path is not None:
+            spent["peak_mb"] = max(spent["peak_mb"], host_peak() / 2**20)
+            write_atomically(self._path, json.dumps(self._spent, indent=1))
+
+    def progress(self, done: float) -> None:
+        """Say, at every tenth of the present stage, about how long all that is left takes at this pace.
+
+        done: fraction of the stage, as far as this command does it.
+        """
+        elapsed = time.perf_counter() - self._start
+        if self._current is None or int(10 * done) <= self._tenths or elapsed < _FIRST_ESTIMATE_S:
+            return
+        self._tenths = int(10 * done)
+        ahead = sum(self._shares[name] for name in self._later()) / self._shares[self._current]
+        left = elapsed / done * (1 - done + ahead)
+        if self._tenths < 10:
+            say(f"{self._current}: {10 * self._tenths} % done; {_minutes(left)} left in all")
+
+    def figures(self) -> dict[str, dict[str, float]]:
+        """Seconds and peak memory (MB) by stage."""
+        return {
+            kind: {name: math.ceil(10 * spent[kind]) / 10 for name, spent in self._spent.items()}
+            for kind in ("seconds", "peak_mb")
+        }
+
+    def _later(self) -> list[str]:
+        assert self._current is not None
+        order = list(self._shares)
+        return order[order.index(self._current) + 1 :]
+
+    def _announce(self) -> None:
+        """Say which stage begins and, from the second on, about how long all that is left will take."""
+        order, later = list(self._shares), self._later()
+        place = len(order) - len(later) - 1
+        done = [stage for stage in order[:place] if stage in self._spent]
+        line = f"\n{place + 1} of {len(order)}: {order[place]}"
+        if done and self._path is not None:
+            pace = sum(self._spent[s]["seconds"] for s in done) / sum(self._shares[s] for s in done)
+            line += f" ({_minutes(pace * sum(self._shares[s] for s in order[place:]))} left)"
+        say(line)
+
+
+def _minutes(seconds: float) -> str:
+    if seconds < 90:
+        return f"about {10 * math.ceil(seconds / 10)} seconds"
+    if seconds < 5400:
+        return f"about {math.ceil(seconds / 60)} minutes"
+    return f"about {seconds / 3600:.1f} hours"

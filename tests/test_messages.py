@@ -1,0 +1,118 @@
+"""Wrong commands and calls end in one line that says what to do: those that no other test provokes."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from painted_scene import painted_scene
+from PIL import Image
+
+from lang3dxl_ns import together
+from lang3dxl_ns.cli import main
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+
+
+def report(path: Path, scene: str, layout: str = "plain", scored: bool = True) -> None:
+    """A report of `lang3dxl evaluate`, as short as it can be."""
+    results = {"photos": {}, "protocol": {"layout": layout, "scored_at": 0.5}} | (
+        {"map": 0.5} if scored else {}
+    )
+    path.write_text(json.dumps({"scene": scene, "results": results}))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """Where the commands below find what they name."""
+    (tmp_path / "label" / "dome").mkdir(parents=True)
+    Image.fromarray(np.full((8, 8), 255, np.uint8)).save(tmp_path / "label" / "dome" / "0001.png")
+    (tmp_path / "maps" / "dome").mkdir(parents=True)
+    np.save(tmp_path / "maps" / "dome" / "0001.npy", np.full((8, 8), np.nan))
+    report(tmp_path / "a.json", "a")
+    report(tmp_path / "b.json", "b", layout="holyscenes")
+    report(tmp_path / "c.json", "c", scored=False)
+    (tmp_path / "silent.json").write_text(
+        json.dumps({"scene": "d", "results": {"photos": {}, "protocol": 3}})
+    )
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+MAPS = "evaluate maps --maps maps --ground-truth label --out report"
+COMMANDS = {
+    f"{MAPS} --temperature 0": "--temperature is 0.0: give a number above 0",
+    MAPS: "holds NaN or infinity: fix the program that made it",
+    "evaluate pool --out report --reports": "name the scenes' reports after --reports",
+    "evaluate pool --out report --reports a.json b.json": "the scenes differ in layout",
+    "evaluate pool --out report --reports c.json": "no prompt was scored in c",
+    "evaluate pool --out report --reports silent.json": "it does not say what was scored",
+    "evaluate pool --out report --reports none.json": "there is no none.json",
+    "evaluate split --ground-truth label --out list --per-category 0": "--per-category is 0: give 1 or more",
+    "export": "give one of --out FILE.ply and --web FOLDER",
+    "export --out a.ply --text dome --text tower": "a splat file is of one --text",
+    "doctor --build": "name a compute capability, such as --arch 8.6",
+    "benchmark gpu --out report": "lang3dxl doctor says why",
+    "demo-scene --out s --photos 2": "--photos is 2",
+    "demo-scene --out s --test-views -1": "--test-views is -1",
+    "demo-scene --out s --seed -1": "--seed is -1",
+    "query none --text dome --out found": "none",
+}
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_commands(words, folder, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    before = set(folder.rglob("*"))
+    with pytest.raises(SystemExit) as end:
+        main(words.split())
+    (line,) = str(end.value).splitlines()
+    assert line.startswith("Error: ") and COMMANDS[words] in line
+    assert not [path for path in set(folder.rglob("*")) - before if path.is_file()]
+
+
+def holyscenes(folder: Path) -> None:
+    (folder / "domes").mkdir()
+    for name in ("0001-gt.jpg", "0002-img.jpg"):
+        Image.fromarray(np.zeros((8, 8), np.uint8)).save(folder / "domes" / name)
+
+
+def lerf_ovs(width: object = 8, outline: object = ((0, 0), (4, 0), (4, 4))) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        item = {"category": "dome", "bbox": [0, 0, 4, 4], "segmentation": outline}
+        info = {"name": "frame_1.jpg", "width": width, "height": 8}
+        (folder / "frame_1.json").write_text(json.dumps({"info": info, "objects": [item]}))
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (holyscenes, "but no .*0002-gt.jpg: add the mask, or remove the photo"),
+        (lerf_ovs(width=0), "can't have a side of 0 pixels.*fix or remove the file"),
+        (lerf_ovs(outline=[[0, 0], [4, 0]]), "has 2 points, but needs three"),
+    ],
+)
+def test_ground_truth(write, message, tmp_path):
+    write(tmp_path)
+    with pytest.raises(UserError, match=message):
+        _ = GroundTruth(tmp_path).categories
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda scene: scene.query("dome", threshold=1.5), "give a relevancy from 0 to 1"),
+        (lambda scene: scene.query_gaussians("dome; window"), "score Gaussians for one at a time"),
+        (lambda scene: scene.query('not "dome"'), "put what to find first"),
+        (lambda scene: scene.query("dome")[0].save("dome.txt"), "end it in .png or .jpg"),
+        (lambda scene: together([]), "pass the matches of a single query"),
+        (lambda scene: scene.render(np.eye(3)), r"a pose has shape \[3, 4\] or \[4, 4\]"),
+        (lambda scene: scene.render("none.jpg"), "none.jpg"),
+    ],
+)
+def test_python(wrong, message):
+    with pytest.raises(UserError, match=message):
+        wrong(painted_scene())
