@@ -1,4 +1,4 @@
-"""Wheel and sdist: the same bytes each time, all that a checkout has, commands that run from the wheel alone."""
+"""Wheel and sdist: the same bytes each time, all that a checkout has; commands run from the wheel alone."""
 
 import os
 import re
