@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.principal_basis import PrincipalBasis
 
 _LEAST_COVERAGE = 1e-4
 
@@ -39,5 +40,6 @@ class LiftedFeatures(SemanticEncoder):
         features: Float[Tensor, "n out"],
         mass: Float[Tensor, " n"],
         advance: Callable[[], None] = lambda: None,
+        basis: PrincipalBasis | None = None,
     ) -> Float[Tensor, "n d"]:
         return torch.cat([features, (mass > 0).to(features)[:, None]], dim=1)

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
 _LEAST_MASS = 1.0
@@ -42,29 +44,32 @@ def compress(
     config: CompressionConfig | None = None,
     generator: torch.Generator | None = None,
     advance: Callable[[], None] = lambda: None,
+    basis: PrincipalBasis | None = None,
 ) -> Float[Tensor, "n code"]:
-    """Codes that the field, trained along with them, decodes to these features.
+    """Codes that the field, trained along with them, decodes to these features; on the field's device.
 
     Gaussians without mass, visible in no photo, get NaN codes: unknown. The loss is the mean absolute
     difference over Gaussians sampled with probability √mass, so that small things count beside walls.
 
     Args:
-        features: CLIP features of each Gaussian, any length.
+        features: CLIP features of each Gaussian, of any length, or their coordinates in `basis`; they and
+            `mass` may lie on the CPU, whatever the field's device is.
         mass: pixels that each Gaussian fills, weighted; not negative.
         field: a field without dense features, in its initial state; trained in place.
         generator: source of the batches, on the CPU.
         advance: called after each step.
     """
     config = config or CompressionConfig()
-    seen = mass > 0
-    codes = features.new_full((len(features), field.code_dim), torch.nan)
+    seen, place = mass > 0, field.output_mean
+    codes = place.new_full((len(features), field.code_dim), torch.nan)
     if not seen.any():
         return codes
     known, weight = features[seen], mass[seen]
-    field.set_output_statistics(*_statistics(known, weight.sqrt()))
-    learned = nn.Parameter(_principal_codes(known, weight, field.code_dim))
-    _fit(known, weight.sqrt(), learned, field, config, generator, advance)
-    codes[seen] = learned.detach()
+    basis = None if basis is None else basis.to(place)
+    field.set_output_statistics(*_statistics(known, weight.sqrt(), basis))
+    learned = nn.Parameter(_principal_codes(known, weight, field.code_dim).to(place))
+    _fit(known, weight.sqrt(), learned, field, config, generator, advance, basis)
+    codes[seen.to(codes.device)] = learned.detach()
     return codes
 
 
@@ -76,6 +81,7 @@ def _fit(
     config: CompressionConfig,
     generator: torch.Generator | None,
     advance: Callable[[], None],
+    basis: PrincipalBasis | None,
 ) -> None:
     groups = [
         {"params": [codes], "lr": config.code_rate},
@@ -88,8 +94,11 @@ def _fit(
     with torch.enable_grad():
         for _ in range(config.steps):
             draws = torch.rand(config.batch, generator=generator, dtype=torch.float64) * chances[-1]
-            rows = torch.searchsorted(chances, draws).clamp_max(len(chances) - 1).to(codes.device)
-            loss = (field.decode_clip(codes[rows]) - features[rows]).abs().mean()
+            rows = torch.searchsorted(chances, draws).clamp_max(len(chances) - 1)
+            wanted = to_device(features[rows.to(features.device)], codes.device)
+            if basis is not None:
+                wanted = basis.features(wanted)
+            loss = (field.decode_clip(codes[rows.to(codes.device)]) - wanted).abs().mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -98,12 +107,18 @@ def _fit(
 
 
 def _statistics(
-    features: Float[Tensor, "n c"], weight: Float[Tensor, " n"]
-) -> tuple[Float[Tensor, " c"], Float[Tensor, " c"]]:
-    """Weighted mean and standard deviation per channel, the latter at least 1 % of the channels' average."""
+    features: Float[Tensor, "n c"], weight: Float[Tensor, " n"], basis: PrincipalBasis | None
+) -> tuple[Float[Tensor, " clip"], Float[Tensor, " clip"]]:
+    """Weighted mean and standard deviation per channel of CLIP, the latter at least 1 % of their average."""
     share = (weight / weight.sum())[:, None]
     mean = (share * features).sum(0)
-    std = (share * (features - mean).square()).sum(0).sqrt()
+    if basis is None:
+        variance = (share * (features - mean).square()).sum(0)
+    else:
+        covariance = ((share * (features - mean)).T @ (features - mean)).to(basis.axes)
+        variance = ((basis.axes @ covariance) * basis.axes).sum(1).clamp_min(0)
+        mean = basis.features(mean.to(basis.mean))
+    std = variance.sqrt()
     return mean, std.clamp_min(float(0.01 * std.mean()))
 
 
@@ -127,6 +142,7 @@ class CompressedField(SemanticField):
 
     per_gaussian = True
     needs_lifting = True
+    gathered_channels = 128
 
     def __init__(
         self, config: SemanticFieldConfig, clip_dim: int, compression: CompressionConfig | None = None
@@ -152,9 +168,10 @@ class CompressedField(SemanticField):
         features: Float[Tensor, "n clip"],
         mass: Float[Tensor, " n"],
         advance: Callable[[], None] = lambda: None,
+        basis: PrincipalBasis | None = None,
     ) -> Float[Tensor, "n code"]:
         generator = torch.Generator().manual_seed(0)
-        fresh = SemanticField(self.config, self.clip_dim, generator=generator).to(features.device)
-        codes = compress(features, mass, fresh, self.compression, generator, advance)
+        fresh = SemanticField(self.config, self.clip_dim, generator=generator).to(self.output_mean.device)
+        codes = compress(features, mass, fresh, self.compression, generator, advance, basis)
         self.load_state_dict(fresh.state_dict())
         return codes

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lang3dxl_ns.components.principal_basis import PrincipalBasis
+
 
 class SemanticEncoder(nn.Module, ABC):
     """Interface of the semantic field and of the baselines.
@@ -35,6 +37,8 @@ class SemanticEncoder(nn.Module, ABC):
     """Whether carried values are decoded per Gaussian before compositing, or per pixel after it."""
     needs_lifting = False
     """Whether the codes are computed from the photos after training instead of learned."""
+    gathered_channels: int | None = None
+    """Principal components of CLIP features to gather, if those are wider; None: the features themselves."""
 
     @abstractmethod
     def initial_codes(
@@ -69,11 +73,13 @@ class SemanticEncoder(nn.Module, ABC):
         features: Float[Tensor, "n clip+dense"],
         mass: Float[Tensor, " n"],
         advance: Callable[[], None] = lambda: None,
+        basis: PrincipalBasis | None = None,
     ) -> Float[Tensor, "n code"]:
         """Codes for features gathered onto the Gaussians, if the encoder `needs_lifting`.
 
         mass: pixels that each Gaussian fills; 0 for those visible in no photo. advance: called
-        `learning_steps` times during the work.
+        `learning_steps` times during the work. basis: what the features are coordinates in, if they are wider
+        than `gathered_channels`.
         """
         raise NotImplementedError
 

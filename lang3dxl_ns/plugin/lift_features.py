@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from lang3dxl_ns.components.losses import resize
+from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.rendering.gathering import gather
 
@@ -28,17 +29,23 @@ def learn_from_photos(
     """
     encoder = model.semantic_field
     assert encoder is not None
+    basis, width = None, len(model.clip_mean)
+    if encoder.gathered_channels is not None and encoder.gathered_channels < width:
+        targets = model.kwargs["metadata"]["clip_targets"]
+        basis, width = PrincipalBasis.of(targets(), encoder.gathered_channels), encoder.gathered_channels
 
     def views():
         for camera, batch in photos:
-            height, width = batch["image"].shape[:2]
+            size = batch["image"].shape[:2]
             mask = batch["mask"][..., 0] if "mask" in batch else None
-            pixels = pixel_features(batch["clip_target"], batch.get("dense_target"), mask, (height, width))
+            clip = batch["clip_target"]
+            clip = clip if basis is None else basis.to(clip).coordinates(clip)
+            pixels = pixel_features(clip, batch.get("dense_target"), mask, size)
             yield partial(model.composite, camera), pixels
 
-    width = len(model.clip_mean) + len(model.dense_mean)
+    width += len(model.dense_mean)
     features, mass = gather(model.num_points, views(), width, model.means.detach())
-    codes = encoder.learn_gaussians(features, mass, advance)
+    codes = encoder.learn_gaussians(features, mass, advance, basis)
     model.gauss_params["codes"] = Parameter(codes, requires_grad=False)
 
 

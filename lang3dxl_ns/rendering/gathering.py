@@ -12,8 +12,16 @@ Composite = Callable[[nn.Parameter], Float[Tensor, "h w c"]]
 """Composites values of Gaussians, [n, c], in one view."""
 
 
+MEMORY = 1e9
+"""Bytes for the channels gathered at a time: of the Gaussians and of the pixels, values and gradients."""
+
+
 def gather(
-    count: int, views: Iterable[tuple[Composite, Float[Tensor, "h w c+1"]]], width: int, like: Tensor
+    count: int,
+    views: Iterable[tuple[Composite, Float[Tensor, "h w c+1"]]],
+    width: int,
+    like: Tensor,
+    memory: float = MEMORY,
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
     """Mean over all pixels p of all views, weighted by a Gaussian's contribution, Σ w(g, p) F(p) / Σ w(g, p),
     and its mass Σ w(g, p) in pixels. Gaussians never visible have mass and mean 0.
@@ -27,13 +35,19 @@ def gather(
             last channel is 1 on the foreground; all channels are 0 elsewhere.
         width: channels of F without the last one.
         like: gives number type and device.
+        memory: bytes to work in, beside the result, which lies on the CPU if it is larger than these.
     """
-    sums = like.new_zeros(count, width + 1)
+    place = like.device if 4 * count * (width + 1) <= memory else torch.device("cpu")
+    sums = torch.zeros(count, width + 1, dtype=like.dtype, device=place)
     for composite, pixels in views:
-        with torch.enable_grad():
-            probe = nn.Parameter(like.new_zeros(count, width + 1))
-            (gradient,) = torch.autograd.grad(composite(probe), probe, pixels.to(like))
-        sums += gradient
+        numbers = 2 * (count + pixels[..., 0].numel())  # per channel
+        channels = max(int(memory / 4 / numbers), 1)
+        for start in range(0, width + 1, channels):
+            part = pixels[..., start : start + channels].to(like)
+            with torch.enable_grad():
+                probe = nn.Parameter(like.new_zeros(count, part.shape[-1]))
+                (gradient,) = torch.autograd.grad(composite(probe), probe, part)
+            sums[:, start : start + channels] += gradient.to(place)
     features, mass = sums[:, :-1], sums[:, -1]
     seen = mass > 0
     return torch.where(seen[:, None], features / torch.where(seen, mass, 1.0)[:, None], 0.0), mass

@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, compress
+from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
 CHANNELS = 24
@@ -95,3 +96,18 @@ def test_learning_again_begins_anew():
     encoder.learn_gaussians(features.flip(0)[:300], torch.ones(300))
     again = encoder.learn_gaussians(features, torch.ones(len(features)))
     assert torch.equal(first, again)
+
+
+def test_coordinates_in_a_basis_compress_like_the_features():
+    features, _ = clusters([300] * 8)
+    mass = torch.ones(len(features))
+    basis = PrincipalBasis.of([features], 10)
+    trained = field()
+    coordinates = basis.coordinates(features)
+    codes = compress(coordinates, mass, trained, QUICK, torch.Generator().manual_seed(0), basis=basis)
+    assert agreement(features, codes, trained).mean() > 0.98
+    whole, expected = compressed(features, mass)
+    torch.testing.assert_close(trained.output_mean, expected.output_mean)
+    # All variance lies in the basis but for the noise of 14 channels.
+    torch.testing.assert_close(trained.output_std, expected.output_std, atol=0.02, rtol=0.02)
+    assert agreement(features, whole, expected).mean() - agreement(features, codes, trained).mean() < 0.005

@@ -1,5 +1,7 @@
 """Laws of gathering pixels onto Gaussians."""
 
+from functools import partial
+
 import torch
 
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
@@ -63,6 +65,32 @@ def test_a_lifted_feature_is_the_mean_of_the_pixels_weighted_by_the_contribution
     torch.testing.assert_close(lifted, expected)
     torch.testing.assert_close(mass, masses)
     assert (lifted[-1] == 0).all()  # never seen
+
+
+def test_the_memory_given_changes_nothing():
+    """Channels are gathered a few at a time where memory is short, and the result moves to the CPU."""
+    generator = torch.Generator().manual_seed(2)
+    views = [
+        (
+            lambda carried, camera=camera: composite(camera, carried),
+            torch.rand(SIZE, SIZE, 8, generator=generator, dtype=torch.float64),
+        )
+        for camera in cameras()
+    ]
+    like = torch.zeros(1, dtype=torch.float64)
+    expected = gather(5, views, 7, like)
+    widths = []
+
+    def watched(carried, work):
+        widths.append(carried.shape[1])
+        return work(carried)
+
+    watching = [(partial(watched, work=work), pixels) for work, pixels in views]
+    numbers = 2 * (5 + SIZE * SIZE)
+    found = gather(5, watching, 7, like, memory=3 * 4 * numbers)
+    assert widths == [3, 3, 2] * len(views)
+    for mine, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, other)
 
 
 def test_where_all_pixels_agree_the_rendered_feature_is_theirs_at_any_coverage():
