@@ -12,6 +12,7 @@ from fake_gpu import CUDA, GpuTensor, fake_gpu
 from scenes import write_scene
 
 from lang3dxl_ns.baselines.encoders import EncoderConfig
+from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.plugin.load_scene import load_scene
 
 EVERYTHING = {
@@ -261,6 +262,16 @@ def test_a_conversation_in_the_viewer(default):
         model.answers = None
 
 
+def test_words_are_learned_where_memory_is_short(trained, monkeypatch):
+    """Wide features as principal components, a few channels at a time, sums on the CPU."""
+    monkeypatch.setattr(CompressedField, "gathered_channels", 5)
+    monkeypatch.setattr("lang3dxl_ns.rendering.gathering.MEMORY", 2.0)
+    model = trained(iterations=3).pipeline.model
+    codes = model.gauss_params["codes"]
+    assert codes.device == CUDA and codes.shape == (model.num_points, 3)
+    assert codes.isfinite().all(1).cpu().any()
+
+
 def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monkeypatch):
     from lang3dxl_ns.benchmarks import gpu
 
@@ -322,6 +333,23 @@ def test_planted_bugs_are_found(default, monkeypatch, plant, error):
     plant(model)
     with fake_gpu(), pytest.raises((RuntimeError, TypeError), match=error):
         model.get_outputs_for_camera(default.pipeline.datamanager.train_dataset.cameras[0:1])
+
+
+def test_a_planted_wait_is_counted(default, monkeypatch):
+    model, colors = default.pipeline.model, default.pipeline.model._colors
+    camera = default.pipeline.datamanager.train_dataset.cameras[0:1]
+
+    def impatient(g, center):
+        assert float(g["means"].sum()) < 1e9
+        return colors(g, center)
+
+    found = []
+    for planted in (colors, impatient):
+        monkeypatch.setattr(model, "_colors", planted)
+        with fake_gpu() as gpu, gpu.counting() as waits:
+            model.get_outputs_for_camera(camera)
+        found.append(own(waits))
+    assert found[1] == found[0] + 1
 
 
 @pytest.mark.parametrize(

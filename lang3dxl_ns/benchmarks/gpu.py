@@ -22,12 +22,25 @@ from lang3dxl_ns.common.reports import (
     markdown_table,
     write_report,
 )
+from lang3dxl_ns.components.compression import CompressedField, CompressionConfig
 from lang3dxl_ns.components.losses import rgb_loss
+from lang3dxl_ns.components.principal_basis import PrincipalBasis
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering.gathering import gather
 from lang3dxl_ns.scene.camera import Camera
 
 STEPS = 30_000
 """Of the run whose time is estimated."""
+CLIP = 512
+"""Channels of the features whose cost is measured."""
+_WORDS = {
+    "gather a photo (ms)": "gather",
+    "compress (s)": "compress",
+    "ask a text (ms)": "ask",
+    "memory (GB)": "memory",
+}
 _PARTS = ("render", "loss", "backward", "optimizer")
 
 
@@ -54,6 +67,7 @@ class GpuBenchmark:
             "parity": lambda: parity(300 if self.quick else 20_000, photo),
             "numerics": lambda: numerics(self.quick),
             **{f"step-{n}": lambda n=n: step(n, photo) for n in sizes},  # type: ignore[misc]
+            **{f"words-{n}": lambda n=n: words(n, photo, 5 if self.quick else 1_000) for n in sizes},  # type: ignore[misc]
             **{f"frame-{q}": lambda q=q: still(sizes[-1], frame, q) for q in (0, 1, 4)},  # type: ignore[misc]
         }
         results = {name: self._kept(name, work) for name, work in parts.items()}
@@ -144,6 +158,37 @@ def step(count: int, size: tuple[int, int]) -> dict[str, float]:
     }
 
 
+def words(count: int, size: tuple[int, int], steps: int) -> dict[str, float]:
+    """What semantics of 512 channels cost: milliseconds to gather a photo and to ask a text, seconds to
+    compress, and the peak of memory, GB."""
+    raw, camera = cloud(count, size)
+    gaussians, draw = _gaussians(raw), torch.Generator().manual_seed(2)
+    axes, _ = torch.linalg.qr(torch.randn(CLIP, CompressedField.gathered_channels, generator=draw))
+    basis = PrincipalBasis(torch.zeros(CLIP), axes)
+    pixels = torch.rand(size[1], size[0], axes.shape[1] + 1, generator=draw).cuda()
+    views = [(lambda carried: rasterize(gaussians, camera, carried).image, pixels)]
+    torch.cuda.reset_peak_memory_stats()
+    photo = lambda: gather(count, views, axes.shape[1], raw["means"])  # noqa: E731
+    seconds = {"gather": median(interleaved_times({"gather": photo}, repeats=3)["gather"])}
+    features, mass = photo()
+    field = CompressedField(SemanticFieldConfig("default"), CLIP, CompressionConfig(steps=steps)).cuda()
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    codes = field.learn_gaussians(features, mass, basis=basis)
+    torch.cuda.synchronize()
+    seconds["compress"] = time.perf_counter() - start
+    known = GaussianFeatures.of(field, codes)
+    text = torch.nn.functional.normalize(torch.randn(CLIP, 1, generator=draw), dim=0).cuda()
+    ask = lambda: known.rows.float() @ (text if known.head is None else known.head @ text)  # noqa: E731
+    seconds["ask"] = median(interleaved_times({"ask": ask}, repeats=20)["ask"])
+    return {
+        "gather": 1e3 * seconds["gather"],
+        "compress": seconds["compress"],
+        "ask": 1e3 * seconds["ask"],
+        "memory": torch.cuda.max_memory_allocated() / 1e9,
+    }
+
+
 def times_of_parts(parts: dict[str, Callable[[], object]], repeats: int = 20) -> dict[str, float]:
     """Median seconds of each part of a step; the first three steps are warm-up."""
     times: dict[str, list[float]] = {name: [] for name in parts}
@@ -182,6 +227,11 @@ def _markdown(results: dict[str, Any], machine: str, command: str) -> str:
         for name, found in results.items()
         if name.startswith("frame-")
     ]
+    learned = [
+        [f"{int(name.removeprefix('words-')):,}", *(f"{found[key]:.2f}" for key in _WORDS.values())]
+        for name, found in results.items()
+        if name.startswith("words-")
+    ]
     measured, missed = results["numerics"]["rows"], results["numerics"]["missed"]
     return f"""# On a GPU
 
@@ -193,6 +243,12 @@ def _markdown(results: dict[str, Any], machine: str, command: str) -> str:
 Colors of random Gaussians. 30,000 steps at the largest size: {STEPS * total / 6e4:.0f} minutes.
 
 {markdown_table(["Gaussians", *_PARTS, "step", "memory (GB)"], rows)}
+
+## Words
+
+CLIP of {CLIP} channels, {CompressedField.gathered_channels} of them gathered.
+
+{markdown_table(["Gaussians", *_WORDS], learned)}
 
 ## Frame, milliseconds
 

@@ -21,7 +21,7 @@ def gather(
     views: Iterable[tuple[Composite, Float[Tensor, "h w c+1"]]],
     width: int,
     like: Tensor,
-    memory: float = MEMORY,
+    memory: float | None = None,
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
     """Mean over all pixels p of all views, weighted by a Gaussian's contribution, Σ w(g, p) F(p) / Σ w(g, p),
     and its mass Σ w(g, p) in pixels. Gaussians never visible have mass and mean 0.
@@ -35,8 +35,9 @@ def gather(
             last channel is 1 on the foreground; all channels are 0 elsewhere.
         width: channels of F without the last one.
         like: gives number type and device.
-        memory: bytes to work in, beside the result, which lies on the CPU if it is larger than these.
+        memory: bytes to work in (default `MEMORY`), beside the result, which is on the CPU if it is larger.
     """
+    memory = memory or MEMORY
     place = like.device if 4 * count * (width + 1) <= memory else torch.device("cpu")
     sums = torch.zeros(count, width + 1, dtype=like.dtype, device=place)
     for composite, pixels in views:

@@ -141,8 +141,14 @@ def needs(folder: Path | None = None) -> list[Need]:
     free, memory = shutil.disk_usage(there).free, machine_memory()
     compiler = shutil.which(os.environ.get("CXX", "g++"), path=search_path())
     where = None if toolkit is None else f"{toolkit.release} in {toolkit.home}"
-    room = f"{free / 1e9:.1f} GB free" if os.access(there, os.W_OK) and free > BUILD_BYTES else None
-    trouble = "not writable" if not os.access(there, os.W_OK) else f"only {free / 1e9:.1f} GB free"
+    trouble = None
+    if not os.access(there, os.W_OK):
+        trouble = "not writable"
+    elif re.search(r"\s", str(folder.absolute())):
+        trouble = "a space in its name, which the compilers' rules can't hold"
+    elif free <= BUILD_BYTES:
+        trouble = f"only {free / 1e9:.1f} GB free"
+    room = None if trouble else f"{free / 1e9:.1f} GB free"
     nvcc_remedy = (
         f"{INSTALL} (or a system CUDA toolkit {cuda}, with CUDA_HOME at it)"
         if cuda.startswith("13.")
@@ -156,7 +162,11 @@ def needs(folder: Path | None = None) -> list[Need]:
         Need("Python.h", str(header) if header.is_file() else None, apt),
         Need("ninja", shutil.which("ninja", path=search_path()), "pip install ninja"),
         Need("memory", f"{memory / 1e9:.1f} GB" if memory >= JOB_BYTES else None, "a build takes 3.5 GB"),
-        Need(f"disk, {folder}", room, f"{trouble}: free half a gigabyte, or set TORCH_EXTENSIONS_DIR"),
+        Need(
+            f"disk, {folder}",
+            room,
+            f"{trouble}: free half a gigabyte, or set TORCH_EXTENSIONS_DIR",
+        ),
     ]
 
 

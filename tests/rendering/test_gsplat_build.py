@@ -101,6 +101,13 @@ def test_a_machine_without_compilers_lacks_them(monkeypatch, tmp_path):
     assert any(name.startswith("nvcc") for name in missing)
 
 
+@pytest.mark.parametrize(("name", "trouble"), [("plain", None), ("two words", "a space in its name")])
+def test_a_folder_with_a_space_is_refused_before_the_compiler_trips_over_it(name, trouble, tmp_path):
+    (disk,) = (need for need in gsplat_build.needs(tmp_path / name) if need.what.startswith("disk"))
+    assert (disk.found is None) is (trouble is not None)
+    assert trouble is None or (trouble in disk.remedy and "TORCH_EXTENSIONS_DIR" in disk.remedy)
+
+
 def test_a_failed_build_is_one_line_and_keeps_its_log(tiny, tmp_path, fake_compiler):
     fake_compiler("print('fine'); print('tiny.cu(3): error: expected a \\';\\''); sys.exit(1)")
     with pytest.raises(UserError, match=r"tiny.cu\(3\): error: expected") as error:
