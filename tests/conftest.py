@@ -54,6 +54,17 @@ def scene(tmp_path_factory) -> Path:
     return write_scene(tmp_path_factory.mktemp("scene"), photos=12, points=400, mixed=True)
 
 
+@pytest.fixture(scope="module")
+def two_steps(tmp_path_factory, tiny_clip, tiny_dense):
+    """The trainer of a finished run of two steps, whose files tests may damage copies of."""
+    root = tmp_path_factory.mktemp("run")
+    data = write_scene(root / "scene", photos=4, points=60)
+    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=2)
+    trainer.setup()
+    trainer.train()
+    return trainer
+
+
 @pytest.fixture
 def train(tiny_clip, tiny_dense, tmp_path):
     """Train like `ns-train lang3dxl`, in this process; returns the trainer."""

@@ -24,7 +24,7 @@ import transformers
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
-from lang3dxl_ns.rendering.compositing import _Compositing
+from lang3dxl_ns.rendering.compositing import Compositing
 
 aten = torch.ops.aten
 CUDA = torch.device("cuda", 0)
@@ -346,7 +346,7 @@ def fake_gpu(memory: int = MEMORY, capability: tuple[int, int] = (8, 9)) -> Iter
         load = classmethod(_load_pretrained)
         stack.enter_context(mock.patch.object(transformers.PreTrainedModel, "from_pretrained", load))
         stack.enter_context(mock.patch("gsplat.rasterization", gsplat_stand_in))
-        stack.enter_context(mock.patch.object(_Compositing, "backward", staticmethod(_stand_in_backward)))
+        stack.enter_context(mock.patch.object(Compositing, "backward", staticmethod(_stand_in_backward)))
         stack.enter_context(mock.patch("lang3dxl_ns.rendering.gsplat_build.make_ready"))
         stack.enter_context(mock.patch("lang3dxl_ns.rendering.gsplat_build.ready", return_value=True))
         stack.enter_context(_conversions(True))
@@ -432,7 +432,7 @@ def gsplat_stand_in(
     return image[None], drawn.alpha[None], drawn.info
 
 
-_backward = _Compositing.backward
+_backward = Compositing.backward
 
 
 def _stand_in_backward(ctx, *gradients):

@@ -36,22 +36,23 @@ def composite(
     *,
     detached_channels: Float[Tensor, "n d"] | None = None,
     absgrad: bool = False,
+    by: type[torch.autograd.Function] | None = None,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]:
     """Composite screen ellipses front to back over black: image, detached image, alpha.
 
     Pixels, conics and variances as in `Splats`. gsplat's rules: alpha at most 0.999, skipped below 1/255;
     a pixel stops before its transmittance reaches 1e-4. The gradient of the detached image reaches only
     `detached_channels`. `absgrad`: the backward pass sets `means2d.absgrad`, the sums of the absolute pixel
-    gradients.
+    gradients. by: what computes it; default torch.
     """
     if detached_channels is None:
         detached_channels = channels.new_empty(len(channels), 0)
-    return _Compositing.apply(
+    return (by or Compositing).apply(
         means2d, conics, opacities, channels, detached_channels, variances, depths, width, height, absgrad
     )
 
 
-class _Compositing(torch.autograd.Function):
+class Compositing(torch.autograd.Function):
     """Composites the depth order in segments to bound memory; only the last segment's rows are kept."""
 
     @staticmethod

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -20,28 +19,9 @@ PARTS_PER_THREAD = 8
 """Tiles may stop early, by an unknown amount: small parts spread the rest over the threads."""
 
 
-def composite(
-    means2d: Float[Tensor, "*one n 2"],
-    conics: Float[Tensor, "n 3"],
-    variances: Float[Tensor, "n 2"],
-    depths: Float[Tensor, " n"],
-    opacities: Float[Tensor, " n"],
-    channels: Float[Tensor, "n c"],
-    width: int,
-    height: int,
-    *,
-    detached_channels: Float[Tensor, "n d"] | None = None,
-    absgrad: bool = False,
-) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w d"], Float[Tensor, "h w 1"]]:
-    """See `compositing.composite`."""
-    if detached_channels is None:
-        detached_channels = channels.new_empty(len(channels), 0)
-    return _Compositing.apply(
-        means2d, conics, opacities, channels, detached_channels, variances, depths, width, height, absgrad
-    )
+class FusedCompositing(torch.autograd.Function):
+    """What `compositing.composite` computes, in compiled kernels."""
 
-
-class _Compositing(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any,

@@ -121,9 +121,10 @@ def _without_broken(
 def _kernels(backend: Backend) -> tuple[Callable[..., Splats], Callable[..., Any]]:
     """Projection and compositing."""
     if backend == "numba":
-        from lang3dxl_ns.rendering import fused_compositing, fused_projection
+        from lang3dxl_ns.rendering.fused_compositing import FusedCompositing
+        from lang3dxl_ns.rendering.fused_projection import project as fused_project
 
-        return fused_projection.project, fused_compositing.composite
+        return fused_project, functools.partial(composite, by=FusedCompositing)
     return project, composite
 
 

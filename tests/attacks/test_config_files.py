@@ -7,9 +7,7 @@ import zipfile
 import pytest
 import torch
 import yaml
-from conftest import make_trainer
 from nerfstudio.configs.method_configs import all_methods
-from scenes import write_scene
 
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
@@ -35,20 +33,10 @@ TRAPS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, tiny_clip, tiny_dense):
-    root = tmp_path_factory.mktemp("run")
-    data = write_scene(root / "scene", photos=4, points=60)
-    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=2)
-    trainer.setup()
-    trainer.train()
-    return trainer.base_dir
-
-
 @pytest.fixture
-def copy(run, tmp_path):
+def copy(two_steps, tmp_path):
     """A run folder to damage."""
-    return shutil.copytree(run, tmp_path / "run")
+    return shutil.copytree(two_steps.base_dir, tmp_path / "run")
 
 
 def trapped(folder, text):

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import make_trainer
-from scenes import write_scene
 
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common import files
@@ -23,19 +21,9 @@ from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.workers import Workers
 
 
-@pytest.fixture(scope="module")
-def trainer(tmp_path_factory, tiny_clip, tiny_dense):
-    root = tmp_path_factory.mktemp("run")
-    data = write_scene(root / "scene", photos=4, points=60)
-    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=2)
-    trainer.setup()
-    trainer.train()
-    return trainer
-
-
 @pytest.fixture
-def run(trainer, tmp_path):
-    return shutil.copytree(trainer.base_dir, tmp_path / "run")
+def run(two_steps, tmp_path):
+    return shutil.copytree(two_steps.base_dir, tmp_path / "run")
 
 
 def refuse(number):
@@ -61,18 +49,18 @@ def full_after(count, error):
 @pytest.mark.parametrize(
     "error", [OSError(errno.ENOSPC, "No space left"), RuntimeError("PytorchStreamWriter failed writing file")]
 )
-def test_a_full_disk_leaves_no_half_checkpoint_and_training_goes_on(trainer, monkeypatch, error, capsys):
-    before = sorted(trainer.checkpoint_dir.iterdir())
+def test_a_full_disk_leaves_no_half_checkpoint_and_training_goes_on(two_steps, monkeypatch, error, capsys):
+    before = sorted(two_steps.checkpoint_dir.iterdir())
     monkeypatch.setattr(torch, "save", full_after(100, error))
-    monkeypatch.setattr(trainer, "_is_ending", False)
-    trainer.save_checkpoint(500)
-    assert sorted(trainer.checkpoint_dir.iterdir()) == before
-    assert not list(trainer.base_dir.rglob("*.partial"))
+    monkeypatch.setattr(two_steps, "_is_ending", False)
+    two_steps.save_checkpoint(500)
+    assert sorted(two_steps.checkpoint_dir.iterdir()) == before
+    assert not list(two_steps.base_dir.rglob("*.partial"))
     assert "Training continues" in " ".join(capsys.readouterr().out.split())
-    monkeypatch.setattr(trainer, "_is_ending", True)
+    monkeypatch.setattr(two_steps, "_is_ending", True)
     with pytest.raises(UserError, match=r"step-000000500\.ckpt can't be written .* GB are free"):
-        trainer.save_checkpoint(500)
-    assert not list(trainer.base_dir.rglob("*.partial"))
+        two_steps.save_checkpoint(500)
+    assert not list(two_steps.base_dir.rglob("*.partial"))
 
 
 # ── asking and exporting ────────────────────────────────────────────────────────────────────────────────
