@@ -162,7 +162,12 @@ def _run(func: Any, args: tuple, kwargs: dict) -> Any:
     args, kwargs = tree_unflatten([lowered(leaf) for leaf in leaves], spec)
     if kwargs.get("pin_memory"):
         kwargs["pin_memory"] = False
-    return tree_map(lifted, func(*args, **kwargs))
+    result = func(*args, **kwargs)
+    for original, plain in originals.values():  # squeeze_ and the like, which change a tensor's own shape
+        if original.shape != plain.shape:
+            with torch._C._DisableTorchDispatch():
+                original.set_(plain.untyped_storage(), plain.storage_offset(), plain.size(), plain.stride())
+    return tree_map(lifted, result)
 
 
 def _result_on_gpu(func: Any, kwargs: dict, tensors: list) -> bool:
