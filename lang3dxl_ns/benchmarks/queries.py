@@ -70,13 +70,13 @@ class QueryBenchmark:
         start = clock()
         engine = scene.engine
         decode = 1e3 * (clock() - start)
-        scene.doubts.of(scene.queries(scene.prompts("house")))  # the unrelated words, once per scene
+        scene.thresholds(scene.prompts("house"))  # asks for the unrelated words, once per scene
         texts = iter([f"{size} {thing}" for thing in _THINGS for size in _SIZES])
 
         def new_text() -> None:
-            queries = scene.queries(scene.prompts(next(texts)))
-            engine.carried(queries)
-            scene.doubts.of(queries)
+            prompts = scene.prompts(next(texts))
+            engine.carried(scene.queries(prompts))
+            scene.thresholds(prompts)
 
         text = median(once(new_text) for _ in range(len(_SIZES)))
         camera = _camera(scene.file.photos[0].camera, *self.size)

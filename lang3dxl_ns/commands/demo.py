@@ -101,7 +101,8 @@ class Demo:
         report |= stages.figures()
         folder = config.get_base_dir()
         write_report(folder, "report", self.markdown(report), report)
-        if rows := [row for row in (_picture_row(photo, trainer) for photo in photos) if row.truth]:
+        thresholds = trainer.pipeline.match_thresholds()
+        if rows := [row for row in (_picture_row(p, trainer, thresholds) for p in photos) if row.truth]:
             from lang3dxl_ns.demo.picture import draw_picture, most_telling
 
             draw_picture(most_telling(rows, 3), folder / "report.png")
@@ -241,7 +242,7 @@ SHARES = {"scene": 0.15, "prepare": 0.3, "train": 0.35, "words": 0.1, "evaluate"
 """The demo's stages, and their usual shares of its time on a CPU."""
 
 
-def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer) -> PictureRow:
+def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, thresholds: dict[str, float]) -> PictureRow:
     from lang3dxl_ns.demo.picture import PictureRow
 
     real, rendered = photo.images["img"].cpu().chunk(2, dim=1)
@@ -257,4 +258,5 @@ def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer) -> PictureRow:
         codes=codes.cpu().numpy(),
         relevancy={prompt: m.cpu().numpy() for prompt, m in photo.field_maps.items()},
         truth={prompt: mask for prompt, mask in truth.items() if mask.any()},
+        thresholds=thresholds,
     )

@@ -59,26 +59,24 @@ class Query:
         prompts = scene.prompts(self.text)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
         views, best = [], [-1.0] * len(prompts)
-        where, doubts = [""] * len(prompts), [1.0] * len(prompts)
+        where, doubts, levels = [""] * len(prompts), [1.0] * len(prompts), [1.0] * len(prompts)
         with progress_bar() as bar:
             for name, place, asked in bar.track(self._places(scene, prompts), description="rendering"):
                 matches = scene.match([prompts[i] for i in asked], place)
                 for i, match in zip(asked, matches, strict=True):
                     write_match(match, folders[i] / name)
-                    doubts[i] = match.doubt
+                    doubts[i], levels[i] = match.doubt, match.threshold
                     if match.score > best[i]:
                         best[i], where[i] = match.score, f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
                 if len(matches) > 1:
                     save_picture(together(matches), shared / f"{name}.png")
                 views.append(_view_report(name, matches))
-        report = {
-            "threshold": self.settings.threshold,
-            "texts": [_text_report(scene, *one) for one in zip(prompts, doubts, folders, strict=True)],
-            "views": views,
-        }
+        texts = zip(prompts, doubts, levels, folders, strict=True)
+        report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
         write_atomically(self.out / "query.json", json.dumps(report, indent=2, ensure_ascii=False) + "\n")
-        for prompt, doubt, folder, score, place in zip(prompts, doubts, folders, best, where, strict=True):
-            closest = "" if score > self.settings.threshold else " (no match; this view comes closest)"
+        found = zip(prompts, doubts, levels, folders, best, where, strict=True)
+        for prompt, doubt, level, folder, score, place in found:
+            closest = "" if score > level else " (no match; this view comes closest)"
             say(f"{prompt.text}: {score:.2f} at {place}; {folder}{closest}")
             if advice := doubtful(prompt.text, doubt):
                 say(f"  {advice}")
@@ -117,12 +115,13 @@ def write_match(match: Match, stem: Path) -> None:
     match.save(stem.with_name(f"{stem.name}.npy"))
 
 
-def _text_report(scene: Scene, prompt: Prompt, doubt: float, folder: Path) -> dict:
+def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, folder: Path) -> dict:
     return {
         "text": prompt.text,
         "negatives": list(prompt.negatives),
         "synonyms": scene.synonyms(prompt),
         "doubt": doubt,
+        "threshold": threshold,
         "folder": folder.name,
     }
 

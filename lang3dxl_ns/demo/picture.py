@@ -26,6 +26,8 @@ class PictureRow:
     """By prompt, 0…1."""
     truth: Mapping[str, Bool[Array, "mh mw"]]
     """By prompt; prompts without truth are not shown."""
+    thresholds: Mapping[str, float]
+    """Relevancy above which pixels match, by prompt."""
 
 
 def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
@@ -71,9 +73,10 @@ def _draw_prompt(axis, prompt: str, row: PictureRow) -> None:
     gray = row.rendering.mean(axis=2)
     axis.imshow(gray, cmap="gray", extent=extent, vmin=0, vmax=1)
     score = row.relevancy[prompt]
-    high = max(float(score.max()), 0.5 + 1e-6)
-    opacity = 0.75 * np.clip((score - 0.5) / (high - 0.5), 0, 1) ** 0.5
-    axis.imshow(score, cmap="turbo", extent=extent, vmin=0.5, vmax=high, alpha=opacity)
+    low = row.thresholds[prompt]
+    high = max(float(score.max()), low + 1e-6)
+    opacity = 0.75 * np.clip((score - low) / (high - low), 0, 1) ** 0.5
+    axis.imshow(score, cmap="turbo", extent=extent, vmin=low, vmax=high, alpha=opacity)
     axis.contour(
         row.truth[prompt].astype(float),
         levels=[0.5],

@@ -40,6 +40,7 @@ from lang3dxl_ns.query.answer import Asked
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
+from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.scene.photo import Photo
 
 QUERY_VARIABLE = "LANG3DXL_QUERY"
@@ -331,11 +332,20 @@ class Lang3DXLPipeline(VanillaPipeline):
         if self.test_mode != "val" and self.query:
             self.model.answers = _Answers(self._asked())
 
+    def match_thresholds(self) -> dict[str, float]:
+        """Relevancy above which places match each scored prompt, by the scene."""
+        prompts = [] if self.scorer is None else self.scorer.truth.categories
+        if not prompts or self.model.carried is None:
+            return {}
+        scene = scene_of_model(self.model, self.scene_file, None)
+        return dict(zip(prompts, scene.thresholds([Prompt(text) for text in prompts]), strict=True))
+
     def _asked(self) -> Asked:
         scene = scene_of_model(self.model, self.scene_file, self.datamanager.config.run)
         CONSOLE.log(f"Looking for {escape(self.query)}")
-        queries = scene.queries(scene.prompts(self.query))
-        return Asked(scene.engine, queries, min_alpha=scene.config.min_alpha)
+        prompts = scene.prompts(self.query)
+        queries, thresholds = scene.queries(prompts), scene.thresholds(prompts)
+        return Asked(scene.engine, queries, min_alpha=scene.config.min_alpha, thresholds=thresholds)
 
     @property
     def has_words_to_learn(self) -> bool:

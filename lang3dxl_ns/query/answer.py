@@ -11,16 +11,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.query.engine import QueryEngine
-from lang3dxl_ns.query.heat_maps import overlay
+from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.threshold import EVEN, matches_any
 
 
 @dataclass(frozen=True)
 class Display:
     """How matches are displayed."""
 
-    threshold: float = 0.5
-    """Relevancy above which a pixel matches."""
+    threshold: float | None = None
+    """Relevancy above which a pixel matches; None: each prompt's own, by the scene."""
     opacity: float = 0.7
     """Opacity of the heat map over the image, 0…1."""
     color_map: str = "turbo"
@@ -42,6 +43,8 @@ class Asked:
     """How many of the last queries restrict where the others may match; these are not displayed."""
     min_alpha: float = 0.3
     """Coverage below which a pixel shows nothing."""
+    thresholds: tuple[float, ...] = ()
+    """Relevancy above which each query matches, of the scene; empty: `EVEN` for all."""
     highest: float | None = None
     """Relevancy for the color map's last color; None: the highest of each view."""
     display: Display = field(default_factory=Display)
@@ -63,20 +66,23 @@ class Asked:
         if self.engine is None or rendered is None or not len(self.queries):
             return {"overlay": image}
         maps = self.engine.maps(rendered, self.queries) * (alpha >= self.min_alpha)
+        own = self.thresholds or (EVEN,) * len(maps)
         if self.confining:
             maps, within = maps.tensor_split([-self.confining])
-            maps = maps * (within.amax(0) > 0.5)
-        return relevancy_outputs(image, maps.unbind(), self.display, self.highest)
+            maps = maps * matches_any(within, own[len(maps) :])
+        asked = self.display.threshold
+        thresholds = own[: len(maps)] if asked is None else (asked,) * len(maps)
+        return relevancy_outputs(image, maps.unbind(), self.display, thresholds, self.highest)
 
 
 def relevancy_outputs(
     image: Float[Tensor, "h w 3"],
     maps: Sequence[Float[Tensor, "h w"]],
     display: Display,
+    thresholds: Sequence[float],
     highest: float | None = None,
 ) -> dict[str, Float[Tensor, "h w k"]]:
     """`overlay` and `relevancy_0` … from the relevancy maps of one or more prompts."""
-    best = torch.stack(list(maps)).amax(0)
-    d = display
-    pictures = {"overlay": overlay(image, best, d.threshold, d.opacity, d.color_map, highest)}
+    best, _, lowest = strongest(torch.stack(list(maps)), thresholds)
+    pictures = {"overlay": overlay(image, best, lowest, display.opacity, display.color_map, highest)}
     return pictures | {f"relevancy_{i}": one[..., None] for i, one in enumerate(maps)}

@@ -47,14 +47,12 @@ class Doubts:
     ) -> None:
         self._relevancy, self._queries = relevancy, queries
 
-    def of(self, queries: Queries) -> list[float]:
-        """For each prompt the share of texts, itself among them, that fit the scene at least as well as it
-        does: (1 + #{u ≥ prompt}) / (1 + 60). At most x with a probability of x for an absent thing."""
+    def of(self, relevancy: Float[Tensor, "q n"]) -> list[float]:
+        """For each prompt, from the relevancy of all Gaussians to it, the share of texts, itself among them,
+        that fit the scene at least as well: (1 + #{u ≥ prompt}) / (1 + 60). At most x with a probability of x
+        for an absent thing."""
         unrelated = self._unrelated
-        return [
-            (1 + int((unrelated >= peak).sum())) / (1 + len(unrelated))
-            for peak in peaks(self._relevancy(queries))
-        ]
+        return [(1 + int((unrelated >= peak).sum())) / (1 + len(unrelated)) for peak in peaks(relevancy)]
 
     @cached_property
     def _unrelated(self) -> Float[Tensor, " u"]:

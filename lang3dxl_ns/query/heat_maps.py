@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int64, UInt8
 from numpy import ndarray as Array
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
@@ -53,6 +53,16 @@ def _colors(name: str) -> Float[Tensor, "256 3"]:
     return torch.tensor(colormaps[name](torch.linspace(0, 1, 256).numpy())[:, :3], dtype=torch.float32)
 
 
+def strongest(
+    maps: Float[Tensor, "q ..."], thresholds: Sequence[float]
+) -> tuple[Float[Tensor, "..."], Int64[Tensor, "..."], float]:
+    """The highest relevancy of the prompts that match a place, 0 where none does; which prompt that is; and
+    the lowest threshold, from which the result can be displayed."""
+    levels = maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))
+    best, which = torch.where(maps > levels, maps, 0.0).max(0)
+    return best, which, min(thresholds)
+
+
 PROMPT_COLORS = (
     *((230, 25, 75), (0, 130, 200), (245, 130, 48), (60, 180, 75), (145, 30, 180)),
     *((70, 240, 240), (240, 50, 230), (210, 245, 60), (170, 110, 40), (128, 0, 0)),
@@ -65,15 +75,14 @@ _FONT_SHARE = 32
 def tinted(
     image: Float[Tensor, "h w 3"],
     maps: Float[Tensor, "q h w"],
-    thresholds: Float[Tensor, " q"],
+    thresholds: Sequence[float],
     opacity: float = 0.7,
 ) -> Float[Tensor, "h w 3"]:
     """The image with each prompt's matches in its own color: that of the most relevant where several match,
     stronger with relevancy."""
-    excess = torch.where(maps > thresholds[:, None, None], maps, 0.0)
-    best, which = excess.max(0)
+    best, which, lowest = strongest(maps, thresholds)
     colors = torch.tensor([PROMPT_COLORS[i % len(PROMPT_COLORS)] for i in range(len(maps))]).to(image) / 255
-    strength = opacity * (best > 0) * (0.5 + 0.5 * heat(best, float(thresholds.min())))
+    strength = opacity * (best > 0) * (0.5 + 0.5 * heat(best, lowest))
     return torch.lerp(image, colors[which], strength[..., None].to(image))
 
 

@@ -118,7 +118,7 @@ def together(matches: Sequence[Match], opacity: float = 0.7) -> UInt8[Array, "h+
     if not matches or any(match.view.image.shape != matches[0].view.image.shape for match in matches):
         raise UserError("one picture shows the prompts of one view: pass the matches of a single query")
     maps = torch.stack([match.relevancy for match in matches])
-    thresholds = maps.new_tensor([match.threshold for match in matches])
+    thresholds = [match.threshold for match in matches]
     picture = as_bytes(tinted(matches[0].view.image, maps, thresholds, opacity))
     return with_legend(picture, [match.prompt.text for match in matches], PROMPT_COLORS)
 
@@ -152,6 +152,8 @@ class Found:
     """Around the strongest connected match; None if nothing matches."""
     doubt: float
     """As in `Match`."""
+    threshold: float
+    """Relevancy above which Gaussians match."""
     closest: list[Viewpoint] = field(default_factory=list)
     """The same ranking, also of views in which nothing matches."""
 

@@ -17,8 +17,8 @@ class QueryConfig:
     """Synonyms, their combination, canonical phrases."""
     temperature: float = TEMPERATURE
     """Softmax temperature of the relevancy; changes neither the ranking of Gaussians nor what matches."""
-    threshold: float = 0.5
-    """Relevancy above which a pixel matches."""
+    threshold: float | None = None
+    """Relevancy above which a pixel matches (default: what stands out in the scene, at most 0.5)."""
     min_alpha: float = 0.3
     """Coverage below which a pixel can't match."""
     foreground: str = ""

@@ -28,6 +28,7 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.splat_file import GaussianArrays, write_gaussians
 from lang3dxl_ns.query.text import Prompt, TextEncoder, parse_prompts
+from lang3dxl_ns.query.threshold import match_thresholds, matches_any
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_longer_side
 
@@ -133,7 +134,8 @@ class Scene:
             place: a photo's name (matches are restricted to its foreground), a camera or a pose; None: for
                 each prompt the training view that shows it best.
             size: of the longer side in pixels, as for `camera`.
-            threshold: relevancy above which a pixel matches; default: the settings', 0.5.
+            threshold: relevancy above which a pixel matches; default: the settings', or by the scene
+                (`match_thresholds`).
 
         Raises UserError for an empty text or an unknown photo.
         """
@@ -161,9 +163,10 @@ class Scene:
         threshold: float | None = None,
     ) -> list[Match]:
         """Matches of parsed prompts in a view; see `query`."""
-        threshold = self._threshold(threshold)
-        queries, within = self._queries(prompts)
-        doubts = self.doubts.of(queries)[: len(prompts)]
+        confining = self._confining()
+        queries = self.queries([*prompts, *confining])
+        doubts, thresholds = self._judge([*prompts, *confining], self.engine.of_gaussians(queries))
+        thresholds = self._asked(threshold, thresholds, len(prompts))
         start = time.perf_counter()
         carried = self.engine.carried(queries)
         seconds = time.perf_counter() - start
@@ -176,9 +179,9 @@ class Scene:
         keep = view.alpha >= self.config.min_alpha
         if view.counts is not None:
             keep = keep & view.counts
-        if within:
-            maps, confining = maps.tensor_split([-within])
-            keep = keep & (confining.amax(0) > 0.5)
+        if confining:
+            maps, within = maps.tensor_split([len(prompts)])
+            keep = keep & matches_any(within, thresholds[len(prompts) :])
         maps = maps * keep
         peaks = maps.flatten(1).max(dim=1)
         scores, places = peaks.values.tolist(), peaks.indices.tolist()
@@ -190,23 +193,36 @@ class Scene:
                 doubt,
                 view,
                 relevancy,
-                relevancy > threshold,
+                relevancy > level,
                 (place % view.camera.width, place // view.camera.width),
                 score,
                 seconds,
-                threshold,
+                level,
             )
-            for prompt, doubt, relevancy, score, place in zip(
-                prompts, doubts, maps, scores, places, strict=True
+            for prompt, doubt, level, relevancy, score, place in zip(
+                prompts, doubts, thresholds, maps, scores, places, strict=False
             )
         ]
 
-    def _threshold(self, asked: float | None) -> float:
+    def _judge(
+        self, prompts: Sequence[Prompt], relevancy: Float[Tensor, "q n"]
+    ) -> tuple[list[float], tuple[float, ...]]:
+        """Doubt about prompts and the thresholds of their matches, from the relevancy of all Gaussians."""
+        doubts = self.doubts.of(relevancy)
+        return doubts, match_thresholds(relevancy, doubts, [bool(prompt.negatives) for prompt in prompts])
+
+    def thresholds(self, prompts: Sequence[Prompt]) -> tuple[float, ...]:
+        """Relevancy above which places match each prompt by the scene, whatever the settings are."""
+        return self._judge(prompts, self.engine.of_gaussians(self.queries(prompts)))[1]
+
+    def _asked(self, asked: float | None, own: tuple[float, ...], prompts: int) -> tuple[float, ...]:
+        """Thresholds, those of the first prompts replaced by what is asked for, here or in the settings."""
+        asked = self.config.threshold if asked is None else asked
         if asked is None:
-            return self.config.threshold
+            return own
         if not 0 <= asked <= 1:
             raise UserError(f"the threshold is {asked}: give a relevancy from 0 to 1")
-        return asked
+        return (asked,) * prompts + own[prompts:]
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
         """Vectors of prompts on the scene's device. A text that the scene doubts has its synonyms beside it:
@@ -221,28 +237,27 @@ class Scene:
             return synonyms
         if prompt.text not in self._doubt_alone:
             alone = self.text.plain_queries([prompt.text]).to(self.device)
-            self._doubt_alone[prompt.text] = self.doubts.of(alone)[0]
+            self._doubt_alone[prompt.text] = self.doubts.of(self.engine.of_gaussians(alone))[0]
         return synonyms if self._doubt_alone[prompt.text] > DOUBTFUL else []
 
-    def _queries(self, prompts: Sequence[Prompt]) -> tuple[Queries, int]:
-        """Vectors of the prompts, then of the foreground prompts, and the number of the latter."""
-        confining = self.prompts(self.config.foreground) if self.config.foreground else []
-        return self.queries([*prompts, *confining]), len(confining)
+    def _confining(self) -> list[Prompt]:
+        """Prompts that matches must lie on."""
+        return self.prompts(self.config.foreground) if self.config.foreground else []
 
     def query_gaussians(self, text: str | Prompt) -> Float[Tensor, " n"]:
         """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo."""
         prompts = self.prompts([text])
         if len(prompts) > 1:
             raise UserError(f"{text!r} are {len(prompts)} prompts: score Gaussians for one at a time")
-        return self._of_gaussians(prompts)[0]
+        return self._of_gaussians(prompts)[0][0]
 
     def find(
         self, text: str | Sequence[str | Prompt], most: int = 10, threshold: float | None = None
     ) -> list[Found]:
         """Matches of each prompt in the scene: the training views that show it best, and a box."""
-        prompts, threshold = self.prompts(text), self._threshold(threshold)
-        scores, doubts = self._of_gaussians(prompts), self.doubts.of(self.queries(prompts))
-        return [self._found(*one, most, threshold) for one in zip(prompts, scores, doubts, strict=True)]
+        prompts = self.prompts(text)
+        scores, doubts, thresholds = self._of_gaussians(prompts, threshold)
+        return [self._found(*one, most) for one in zip(prompts, scores, doubts, thresholds, strict=True)]
 
     def arrays(self, text: str | None = None, look: str | None = None) -> GaussianArrays:
         """All Gaussians as NumPy arrays, with their relevancy to a prompt if one is given.
@@ -269,27 +284,33 @@ class Scene:
         With a text, only those that match it, or with `everything` all of them; the PLY has their relevancy
         as a property. Colors as in `arrays`. Raises UserError if nothing matches.
         """
-        found, threshold = self.arrays(text, look), self._threshold(threshold)
-        if found.relevancy is not None and not everything:
+        found = self.arrays(text, look)
+        if text is not None and found.relevancy is not None and not everything:
+            ((threshold,),) = self._of_gaussians(self.prompts([text]), threshold)[2:]
             keep = found.relevancy > threshold
             if not keep.any():
                 raise UserError(
                     f"no Gaussian matches {text!r}: the best reaches {found.relevancy.max():.2f}; lower "
-                    f"--threshold, now {threshold}, or write all with their relevancy (--all)"
+                    f"--threshold, now {threshold:.2f}, or write all with their relevancy (--all)"
                 )
             found = found[keep]
         return write_gaussians(Path(path), found)
 
-    def _of_gaussians(self, prompts: Sequence[Prompt]) -> Float[Tensor, "q n"]:
-        queries, within = self._queries(prompts)
-        scores = self.engine.of_gaussians(queries)
-        if within:
-            scores, confining = scores.tensor_split([-within])
-            scores = scores * (confining.amax(0) > 0.5)
-        return scores
+    def _of_gaussians(
+        self, prompts: Sequence[Prompt], threshold: float | None = None
+    ) -> tuple[Float[Tensor, "q n"], list[float], tuple[float, ...]]:
+        """Relevancy of all Gaussians, 0 outside the foreground; doubts and thresholds."""
+        everything = [*prompts, *self._confining()]
+        scores = self.engine.of_gaussians(self.queries(everything))
+        doubts, thresholds = self._judge(everything, scores)
+        thresholds, count = self._asked(threshold, thresholds, len(prompts)), len(prompts)
+        scores, within = scores.tensor_split([count])
+        if len(within):
+            scores = scores * matches_any(within, thresholds[count:])
+        return scores, doubts[:count], thresholds[:count]
 
     def _found(
-        self, prompt: Prompt, scores: Float[Tensor, " n"], doubt: float, most: int, threshold: float
+        self, prompt: Prompt, scores: Float[Tensor, " n"], doubt: float, threshold: float, most: int
     ) -> Found:
         ranks = rank_views(self.visible, self.gaussians["means"], scores, threshold)
         closest = [
@@ -301,7 +322,7 @@ class Scene:
         box = None
         if viewpoints:
             box = strongest_match(self.gaussians["means"], scores, self._mass, threshold, self._gap)
-        return Found(prompt, viewpoints[:most], box, doubt, closest[:most])
+        return Found(prompt, viewpoints[:most], box, doubt, threshold, closest[:most])
 
     # ── computed once per checkpoint ────────────────────────────────────────────────────────────────
 

@@ -11,7 +11,9 @@ def row(name, *prompts, score=None):
     mask[5:15, 10:20] = True
     photo = np.full((60, 80, 3), 0.5)
     relevancy = {prompt: np.full((30, 40), 0.5) if score is None else score for prompt in prompts}
-    return PictureRow(name, photo, photo, photo, relevancy, dict.fromkeys(prompts, mask))
+    return PictureRow(
+        name, photo, photo, photo, relevancy, dict.fromkeys(prompts, mask), dict.fromkeys(prompts, 0.4)
+    )
 
 
 def test_photos_are_chosen_for_what_the_others_lack():

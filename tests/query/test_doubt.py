@@ -19,8 +19,9 @@ def scene_of(features: torch.Tensor, words: dict[str, torch.Tensor]) -> Doubts:
     def queries(texts):
         return Queries.of([vectors[text][None] for text in texts], negatives)
 
-    doubts = Doubts(lambda q: q.relevancy_of_cosines(q.cosines(features)), queries)
-    doubts.ask = lambda *texts: doubts.of(queries(texts))  # type: ignore[attr-defined]
+    relevancy = lambda q: q.relevancy_of_cosines(q.cosines(features))  # noqa: E731
+    doubts = Doubts(relevancy, queries)
+    doubts.ask = lambda *texts: doubts.of(relevancy(queries(texts)))  # type: ignore[attr-defined]
     return doubts
 
 

@@ -117,9 +117,9 @@ class BrowserViewer:
         gaussians, colors = self._in_light(self._model.look)
         if self._model.semantic_field is not None:
             conversation = self._panel.conversation
-            relevancy = conversation.of_gaussians()
-            if relevancy is not None:
-                colors = with_heat(colors, relevancy, conversation.display, conversation.highest())
+            found = conversation.of_gaussians()
+            if found is not None:
+                colors = with_heat(colors, found[0], found[1], conversation.display, conversation.highest())
         what = splats(gaussians, colors, self._scale)
         # A new name each time: a page ignores what comes for one that it shows, or still showed a moment ago.
         self._turn += 1

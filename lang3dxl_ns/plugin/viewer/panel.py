@@ -122,6 +122,7 @@ class AskPanel(ViewerControl):
         gui, appearance = self._gui, self._pipeline.model.appearance
         looks = (OWN_LOOK, *(() if appearance is None else appearance.names))
         with gui.add_folder("How it is shown"):
+            self._automatic = gui.add_checkbox("Automatic threshold", True, hint="What stands out matches")
             self._threshold = gui.add_slider("Threshold", 0.0, 1.0, 0.01, 0.5, hint="Relevancy that matches")
             self._opacity = gui.add_slider("Opacity", 0.0, 1.0, 0.05, 0.7, hint="Of the heat map")
             self._color_map = gui.add_dropdown("Colors", COLOR_MAPS)
@@ -132,7 +133,8 @@ class AskPanel(ViewerControl):
         shown: tuple[Any, ...] = (self._opacity, self._color_map, self._stretch, self._look)
         for setting in shown:
             setting.on_update(lambda _: self._take_settings())
-        self._threshold.on_update(lambda _: self._take_settings(find=True))
+        self._automatic.on_update(lambda _: self._take_settings(find=True))
+        self._threshold.on_update(lambda _: self._take_threshold())
         self._boxes.on_update(lambda _: self._draw_boxes())
 
     def _who_may_look(self) -> str:
@@ -235,11 +237,17 @@ class AskPanel(ViewerControl):
             lines.append("Only the beginning of a long text is used: CLIP reads about 60 words.")
         return "  \n".join(lines)
 
+    def _take_threshold(self) -> None:
+        if self._automatic.value:
+            self._automatic.value = False  # takes the settings
+        else:
+            self._take_settings(find=True)
+
     def _take_settings(self, find: bool = False) -> None:
         c = self.conversation
         c.display = replace(
             c.display,
-            threshold=self._threshold.value,
+            threshold=None if self._automatic.value else self._threshold.value,
             opacity=self._opacity.value,
             color_map=self._color_map.value,
         )

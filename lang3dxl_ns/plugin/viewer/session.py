@@ -19,11 +19,13 @@ from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.query.answer import NOTHING, Asked, Display
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.heat_maps import strongest
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.text import EncodeTexts, Prompt
+from lang3dxl_ns.query.threshold import matches_any
 
 
 @dataclass
@@ -47,6 +49,8 @@ class Question:
     """Prompts that matches must lie on."""
     queries: Queries = field(default=NOTHING)
     """Of the prompts, then of the foreground."""
+    thresholds: tuple[float, ...] = ()
+    """Relevancy above which places match each query, by the scene."""
 
     @property
     def confining(self) -> int:
@@ -111,10 +115,12 @@ class Conversation:
         prompts = tuple(replace(p, negatives=p.negatives + extra) for p in scene.prompts(text))
         start = time.perf_counter()
         foreground = foreground.strip()
-        queries = scene.queries([*prompts, *(scene.prompts(foreground) if foreground else ())])
+        everything = [*prompts, *(scene.prompts(foreground) if foreground else ())]
+        queries = scene.queries(everything)
         self.seconds.text = time.perf_counter() - start
         self.found = None
-        self.question = Question(prompts, foreground, queries)
+        thresholds = scene.thresholds(everything)
+        self.question = Question(prompts, foreground, queries, thresholds)
         return self.question
 
     def forget(self) -> None:
@@ -204,7 +210,7 @@ class Conversation:
             assert encoder is not None
             self._engine, self._engine_codes, self._asked = make_engine(encoder, codes.detach()), codes, None
         if self._asked is None or self._asked.queries is not question.queries:
-            return Asked(self._engine, question.queries, question.confining)
+            return Asked(self._engine, question.queries, question.confining, thresholds=question.thresholds)
         return self._asked
 
     def outputs(
@@ -219,16 +225,19 @@ class Conversation:
         self.seconds.frame = seconds + self.seconds.words
         return found
 
-    def of_gaussians(self) -> Float[Tensor, " n"] | None:
-        """Relevancy of every Gaussian to its best prompt, 0 outside the foreground; None without prompts."""
+    def of_gaussians(self) -> tuple[Float[Tensor, " n"], float] | None:
+        """Relevancy of every Gaussian to the best prompt that it matches, 0 outside the foreground, and the
+        relevancy from which to show it; None without prompts."""
         question = self.question
         if not question.prompts:
             return None
         scores = self._scene_now().engine.of_gaussians(question.queries)
         if question.confining:
             scores, within = scores.tensor_split([-question.confining])
-            scores = scores * (within.amax(0) > 0.5)
-        return scores.amax(0)
+            scores = scores * matches_any(within, question.thresholds[len(scores) :])
+        asked, own = self.display.threshold, question.thresholds[: len(scores)]
+        best, _, lowest = strongest(scores, own if asked is None else (asked,) * len(scores))
+        return best, lowest
 
     def highest(self) -> float | None:
         """Relevancy for the last color of the heat map; None: the highest shown."""
@@ -243,10 +252,9 @@ class Conversation:
         lines = [plain(line) for f in found if (line := doubtful(shortened(f.prompt.text), f.doubt))]
         if found and not any(f.viewpoints for f in found):
             words = " or ".join(plain(shortened(f.prompt.text)) for f in found)
-            lines.append(
-                f"Nothing in the scene looks like {words} by the threshold of {self.display.threshold:.2f}. "
-                f"Lower it, or try other words."
-            )
+            asked = self.display.threshold
+            level = "" if asked is None else f" by the threshold of {asked:.2f}. Lower it, or try other words"
+            lines.append(f"Nothing in the scene looks like {words}{level}.")
         return "  \n".join(lines) or None
 
     def status(self) -> str:

@@ -70,13 +70,13 @@ def rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
 def with_heat(
     colors: Float[Tensor, "n 3"],
     relevancy: Float[Tensor, " n"],
+    threshold: float,
     display: Display,
     highest: float | None = None,
 ) -> Float[Tensor, "n 3"]:
     """Colors with the heat map mixed into matching Gaussians, as `overlay` does for pixels."""
-    d = display
     picture = colors.clamp(0, 1)[None], relevancy[None]
-    return overlay(*picture, d.threshold, d.opacity, d.color_map, highest)[0]
+    return overlay(*picture, threshold, display.opacity, display.color_map, highest)[0]
 
 
 def sent(scene: viser.SceneApi, name: str, what: Splats) -> viser.GaussianSplatHandle:

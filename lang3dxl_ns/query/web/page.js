@@ -22,7 +22,7 @@ async function show(index) {
   const word = description.words[shown];
   if (word && !heats.has(shown)) heats.set(shown, new Uint8Array(await (await fetch(word.heat)).arrayBuffer()));
   const heat = word && heats.get(shown);
-  const color = new Color(), table = description.colors, half = 255 * description.threshold;
+  const color = new Color(), table = description.colors, half = word ? 255 * word.threshold : 0;
   const range = Math.max(word ? 255 * word.highest - half : 1, 1);
   splats.packedSplats.forEachSplat((i, center, scales, quaternion, opacity) => {
     color.copy(colors[i]);

@@ -65,6 +65,7 @@ def write_page(
             {
                 "text": found.prompt.text,
                 "heat": f"heat-{name}.bin",
+                "threshold": found.threshold,
                 "highest": float(scored.relevancy.max(initial=0)),
                 "view": _view(scene.file.photo(view.name).full_camera, center),
             }
@@ -80,7 +81,6 @@ def write_page(
         "far": 1e3 * start["distance"],
         "start": start,
         "words": words,
-        "threshold": scene.config.threshold,
         "colors": color(torch.linspace(0, 1, 256)).tolist(),
     }
     write_atomically(folder / "scene.json", json.dumps(description))
