@@ -12,8 +12,10 @@ from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 EVEN = 0.5
 """Relevancy where prompt and negatives fit equally well."""
 SHARE = 0.35
-"""Of the way from a prompt's median relevancy in the scene to its peak, where matches begin; chosen on
-landmarks for decisions (docs/queries.md)."""
+"""Of the way from a prompt's relevancy for what is surely something else to its peak, where matches begin;
+chosen on landmarks for decisions (docs/queries.md)."""
+_ELSE = 0.25
+"""Quantile of the Gaussians that is surely something else; above it, large things begin."""
 
 
 def match_thresholds(
@@ -32,8 +34,8 @@ def match_thresholds(
     """
     if relevancy.shape[1] == 0:
         return (EVEN,) * len(relevancy)
-    middle = relevancy.median(dim=1).values
-    levels = (middle + SHARE * (peaks(relevancy) - middle)).clamp_max(EVEN).tolist()
+    low = relevancy.kthvalue(1 + int(_ELSE * (relevancy.shape[1] - 1)), dim=1).values
+    levels = (low + SHARE * (peaks(relevancy) - low)).clamp_max(EVEN).tolist()
     strict = [doubt > DOUBTFUL or names for doubt, names in zip(doubts, named, strict=True)]
     return tuple(EVEN if one else level for one, level in zip(strict, levels, strict=True))
 

@@ -19,7 +19,7 @@ def test_what_stands_out_matches_although_negatives_fit_better():
 
 
 @pytest.mark.parametrize(("level", "peak"), [(0.0, 0.9), (0.2, 0.6), (0.4, 0.95), (0.6, 0.99), (0.0, 1.0)])
-def test_it_lies_between_median_and_peak_and_asks_for_no_more_than_even(level, peak):
+def test_it_lies_between_the_rest_and_the_peak_and_asks_for_no_more_than_even(level, peak):
     (threshold,) = match_thresholds(scene(level, peak), [0.0], [False])
     assert threshold == pytest.approx(min(level + SHARE * (peak - level), EVEN))
 
