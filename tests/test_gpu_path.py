@@ -336,7 +336,7 @@ def test_planted_bugs_are_found(default, monkeypatch, plant, error):
 
 
 def test_a_planted_wait_is_counted(default, monkeypatch):
-    model, colors = default.pipeline.model, default.pipeline.model._colors
+    model, colors = default.pipeline.model.eval(), default.pipeline.model._colors
     camera = default.pipeline.datamanager.train_dataset.cameras[0:1]
 
     def impatient(g, center):
