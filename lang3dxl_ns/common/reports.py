@@ -11,7 +11,7 @@ import platform
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from datetime import date
 from multiprocessing import get_context
@@ -197,6 +197,17 @@ def progress_bar() -> Progress:
     """A rich progress bar with the time left; add one task per benchmark."""
     columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     return Progress(*columns, speed_estimate_period=600)  # steps vary: a short window would make it jump
+
+
+def watched(items: Collection[Result], what: str, watch: Callable[[str], None] | None) -> Iterator[Result]:
+    """The items, one by one: `watch` is told which, or, if it is None, a progress bar shows it."""
+    if watch is None:
+        with progress_bar() as bar:
+            yield from bar.track(items, description=what)
+        return
+    for number, item in enumerate(items, start=1):
+        watch(f"{what}: view {number} of {len(items)}")
+        yield item
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

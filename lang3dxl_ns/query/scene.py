@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import progress_bar
+from lang3dxl_ns.common.reports import watched
 from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine
@@ -342,7 +342,11 @@ class Scene:
         path, cameras = self._cache_file("visible"), self._small_cameras
         views = load_visible(path, self._views_key, cameras, self.device) if path else None
         if views is None:
-            views = {name: self._visible(name, camera) for name, camera in self._watched(cameras)}
+            what = "measuring which Gaussians the photos show, once per checkpoint"
+            views = {
+                name: self._visible(name, camera)
+                for name, camera in watched(cameras.items(), what, self._watch)
+            }
             if path:
                 save_visible(path, views, self._views_key)
         return views
@@ -376,16 +380,6 @@ class Scene:
         means = self.gaussians["means"]
         distances = torch.tensor([view.distance(means) for view in self.visible.values()])
         return 0.03 * float(distances.nanmedian())
-
-    def _watched(self, cameras: Mapping[str, Camera]) -> Iterator[tuple[str, Camera]]:
-        what = "measuring which Gaussians the photos show, once per checkpoint"
-        if self._watch is None:
-            with progress_bar() as bar:
-                yield from bar.track(cameras.items(), description=what)
-            return
-        for i, item in enumerate(cameras.items()):
-            self._watch(f"{what}: view {i + 1} of {len(cameras)}")
-            yield item
 
     @cached_property
     def _small_cameras(self) -> dict[str, Camera]:

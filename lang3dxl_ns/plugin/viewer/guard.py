@@ -86,6 +86,20 @@ class Guard:
             f"/?{TOKEN_PARAMETER}={self.token}" if self.needs_token else ""
         )
 
+    @property
+    def who_may_look(self) -> str:
+        """Markdown about who can open the page, and how to change that."""
+        address = f"`{self.address}`"
+        if not self.needs_token:
+            others = "`--viewer.websocket-host 0.0.0.0` (in `lang3dxl view`: `--host`) opens it to others."
+            return f"Only this machine can open the viewer, at {address}. {others}"
+        if is_local(self.host):
+            return f"The viewer is public through viser's share tunnel, to anyone with its token: {address}"
+        return (
+            f"Others can open the viewer ({self.host}) at this address, token included: {address} (replace "
+            "`localhost` by this machine's name). `--viewer.websocket-host 127.0.0.1` keeps it private."
+        )
+
     def refusal(self, path: str, headers: Headers) -> Response | None:
         """The response to a refused request; None for one that may proceed."""
         try:

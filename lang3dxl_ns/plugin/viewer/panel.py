@@ -20,7 +20,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.viewer.fly_to import Stand, Tour, box_lines, flight, stand_of
 from lang3dxl_ns.plugin.viewer.frame_size import keep_frames_recognizable
 from lang3dxl_ns.plugin.viewer.frustums import draw_frustums
-from lang3dxl_ns.plugin.viewer.guard import Guard, guard_viewers, is_local
+from lang3dxl_ns.plugin.viewer.guard import Guard, guard_viewers
 from lang3dxl_ns.plugin.viewer.session import Conversation, plain, shortened
 from lang3dxl_ns.plugin.viewer.worker import Worker
 from lang3dxl_ns.query.match import Found
@@ -79,8 +79,8 @@ class AskPanel(ViewerControl):
                 self._add_settings()
                 self._status = self._gui.add_markdown("")
             with self._gui.add_folder("Who can open this page", expand_by_default=False):
-                self._gui.add_markdown(self._who_may_look())
-        CONSOLE.print(self._who_may_look().replace("`", ""), soft_wrap=True, highlight=False)
+                self._gui.add_markdown(self._guard.who_may_look)
+        CONSOLE.print(self._guard.who_may_look.replace("`", ""), soft_wrap=True, highlight=False)
         self._photos = [photo for photo in self._pipeline.scene_file.photos if photo.split == "train"]
         self.viser_server.on_client_connect(self._welcome)
         if viewer.trainer is None:
@@ -136,18 +136,6 @@ class AskPanel(ViewerControl):
         self._automatic.on_update(lambda _: self._take_settings(find=True))
         self._threshold.on_update(lambda _: self._take_threshold())
         self._boxes.on_update(lambda _: self._draw_boxes())
-
-    def _who_may_look(self) -> str:
-        host, address = self.viewer.config.websocket_host, f"`{self._guard.address}`"
-        if not self._guard.needs_token:
-            others = "`--viewer.websocket-host 0.0.0.0` (in `lang3dxl view`: `--host`) opens it to others."
-            return f"Only this machine can open the viewer, at {address}. {others}"
-        if is_local(host):
-            return f"The viewer is public through viser's share tunnel, to anyone with its token: {address}"
-        return (
-            f"Others can open the viewer ({host}) at this address, token included: {address} (replace "
-            "`localhost` by this machine's name). `--viewer.websocket-host 127.0.0.1` keeps it private."
-        )
 
     def _leave_out_logo(self) -> None:
         """nerfstudio's title bar without its logo, which is loaded from the Internet."""

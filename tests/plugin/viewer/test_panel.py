@@ -250,12 +250,13 @@ def test_boxes_are_drawn_for_what_is_found_and_can_be_left_out(panel):
     panel._boxes.value = True
 
 
-def test_the_panel_says_who_can_open_the_page(panel, viewer):
-    assert "--viewer.websocket-host 0.0.0.0" in panel._who_may_look()
-    viewer.config.websocket_host = panel._guard.host = "0.0.0.0"
-    assert "Others can open" in panel._who_may_look()
-    assert f"?token={panel._guard.token}" in panel._who_may_look()
-    viewer.config.websocket_host = panel._guard.host = "127.0.0.1"
+def test_the_panel_says_who_can_open_the_page(panel):
+    guard = panel._guard
+    assert "--viewer.websocket-host 0.0.0.0" in guard.who_may_look
+    guard.host = "0.0.0.0"
+    assert "Others can open" in guard.who_may_look
+    assert f"?token={guard.token}" in guard.who_may_look
+    guard.host = "127.0.0.1"
 
 
 def test_renders_answer_the_query_of_the_environment_and_nothing_without(trainer, monkeypatch):
