@@ -14,6 +14,7 @@ from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_
 
 _SEEN, _TEACHER = "seen_", "seen_teacher_"
 COLORS = {
+    "half_psnr": "PSNR, half image",
     "psnr": "PSNR",
     "cc_psnr": "PSNR, color-corrected",
     "clip_cosine": "CLIP cosine",

@@ -33,7 +33,16 @@ _LIBRARIES = ("lang3dxl_ns.plugin.trainer_config", "lang3dxl_ns.methods")
 """Imports of a run's process, preloaded because they take ten seconds."""
 _TIMED_PHOTOS = 3
 _UNWANTED = ("num_rays_per_sec", "fps")
-_BESIDE = ("map", "raw_map", "localization_accuracy", "cc_psnr", "clip_l1", "clip_cosine")
+_BESIDE = (
+    "map",
+    "raw_map",
+    "localization_accuracy",
+    "half_psnr",
+    "half_ssim",
+    "cc_psnr",
+    "clip_l1",
+    "clip_cosine",
+)
 """Figures beyond those of the held-out photos, besides every category's average precision."""
 
 

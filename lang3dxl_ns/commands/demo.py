@@ -205,7 +205,13 @@ half the photo's size, as published, and not masked. Test views are novel camera
 
 WHO = {"field": "", "teacher": "teacher_", "limit": "limit_", "chance": "chance_"}
 """Sources of the reported average precision, and the prefix of their figures."""
-COLORS = {"psnr": "PSNR (dB)", "cc_psnr": "PSNR with matched colors (dB)", "ssim": "SSIM"}
+COLORS = {
+    "half_psnr": "PSNR of right halves, looks fitted on the left ones (dB)",
+    "half_ssim": "SSIM of right halves",
+    "psnr": "PSNR (dB)",
+    "cc_psnr": "PSNR with matched colors (dB)",
+    "ssim": "SSIM",
+}
 FEATURES = {
     "clip_l1": "CLIP feature, L1",
     "clip_psnr": "CLIP feature, PSNR (dB)",

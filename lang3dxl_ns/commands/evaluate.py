@@ -227,6 +227,9 @@ def _scene_table(scene: str, results: Mapping[str, Any]) -> str:
 
 
 _OTHERS = (
+    "half_psnr",
+    "half_ssim",
+    "half_lpips",
     "psnr",
     "cc_psnr",
     "ssim",
@@ -236,6 +239,7 @@ _OTHERS = (
     "clip_cosine",
     "render_seconds",
     "query_seconds",
+    "fit_seconds",
     "peak_memory_mb",
 )
 

@@ -29,6 +29,7 @@ from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resize
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
+from lang3dxl_ns.plugin.half_image import PROTOCOL, half_image
 from lang3dxl_ns.plugin.label_limit import label_limit
 from lang3dxl_ns.plugin.lift_features import learn_from_photos
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED, describe_scene, scene_of_model
@@ -81,10 +82,12 @@ class EvaluatedPhoto:
 
     name: str
     metrics: dict[str, float]
-    """psnr etc., `render_seconds`, and with ground truth `query_seconds` and the figures of
-    `evaluation.aggregate.average`: `ap_{category}` etc., with the prefixes of `evaluation.aggregate`."""
+    """psnr etc., `render_seconds`, with appearance `half_psnr` etc., and with ground truth `query_seconds`
+    and the figures of `evaluation.aggregate.average`: `ap_{category}` etc., with the prefixes of
+    `evaluation.aggregate`."""
     images: dict[str, Tensor]
-    """`img` (photo beside rendering, [H, 2W, 3]) and, with semantics, `bottleneck`."""
+    """`img` (photo beside rendering, [H, 2W, 3]); with semantics `bottleneck`; with appearance `fitted`, the
+    rendering in the look of the half-image protocol."""
     field_maps: Maps
     """Relevancy by category as scored without prefix: blurred, at half the photo's size; empty without
     ground truth."""
@@ -178,8 +181,17 @@ class Lang3DXLPipeline(VanillaPipeline):
                 evaluated = self._evaluate_photo(camera, batch, photo, score)
                 for name in hidden:
                     evaluated.metrics.pop(name, None)
+                if self._fits_looks(split):
+                    fitted = half_image(self.model, camera, batch)
+                    evaluated.metrics = fitted.figures | evaluated.metrics
+                    evaluated.images["fitted"] = fitted.rendering
                 yield evaluated
         self.train()
+
+    def _fits_looks(self, split: Split) -> bool:
+        """Whether the half-image protocol applies: photos may have looks, and those of the split are not
+        known from training."""
+        return self.model.appearance is not None and split != "seen"
 
     def _photos_of(self, split: Split) -> EvalPhotos:
         if split == "held-out":
@@ -296,7 +308,13 @@ class Lang3DXLPipeline(VanillaPipeline):
         scorer = self._scorer_of(split)
         trained = {photo.name for photo in self.datamanager.train_dataset.photos}
         seen, masked = (sum(p.name in trained for p in evaluated), sum(p.masked for p in evaluated))
-        photos = {"split": split, "evaluated_photos": len(evaluated), "seen_in_training": seen}
+        photos: dict[str, Any] = {
+            "split": split,
+            "evaluated_photos": len(evaluated),
+            "seen_in_training": seen,
+        }
+        if self._fits_looks(split):
+            photos["colors"] = PROTOCOL
         mask = f"predictions are 0 outside the foreground masks of {masked} of {len(evaluated)} photos"
         if scorer is None:
             return photos
