@@ -17,10 +17,14 @@ TOTALS = {
     "iou": "miou",
     "f1": "mean_f1",
     "balanced_accuracy": "mean_balanced_accuracy",
+    "pixel_accuracy": "mpa",
+    "precision": "mp",
     "smooth_located": "smooth_localization_accuracy",
     "smooth_iou": "smooth_miou",
+    "smooth_pixel_accuracy": "smooth_mpa",
+    "smooth_precision": "smooth_mp",
 }
-"""Measures whose total is the mean over all pairs of a photo and a category, as for LERF-OVS."""
+"""Measures whose total is the mean over all pairs of a photo and a category, as for LERF-OVS and PT-OVS."""
 Figures = Mapping[str, float]
 """Of one photo: psnr etc., and `{prefix}{measure}_{category}`."""
 

@@ -36,9 +36,9 @@ _VOTERS = 7
 def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) -> dict[str, float]:
     """All measures of a map; empty if the object isn't in the photo, where average precision is undefined.
 
-    `ap`: average precision. `iou`, `f1`, `balanced_accuracy`: of the pixels above 0.5. `located`: 1 if
-    the highest pixel lies in a box, or on the mask if there are no boxes, else 0 (LERF's accuracy).
-    smooth: adds `smooth_located` and `smooth_iou`, LangSplat's measures.
+    `ap`: average precision. Those of `overlap`: of the pixels above 0.5. `located`: 1 if the highest pixel
+    lies in a box, or on the mask if there are no boxes, else 0 (LERF's accuracy). smooth: adds
+    `smooth_located` and the `overlap` of LangSplat's mask, `smooth_iou` etc.
     """
     precision = average_precision(score, truth.mask)
     if precision is None:
@@ -47,13 +47,15 @@ def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) ->
     if smooth:
         mean = uniform_filter(score.astype(np.float64), SMOOTHING, mode="mirror")
         scores["smooth_located"] = located(mean, truth)
-        scores["smooth_iou"] = overlap(smooth_mask(score, mean), truth.mask)["iou"]
+        smoothed = overlap(smooth_mask(score, mean), truth.mask)
+        scores |= {f"smooth_{name}": smoothed[name] for name in ("iou", "pixel_accuracy", "precision")}
     return scores
 
 
 def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, float]:
-    """Intersection over union, F1 and balanced accuracy of a mask. The truth must have a positive; if it has
-    no negative, balanced accuracy is the share found."""
+    """Intersection over union, F1, balanced accuracy, pixel accuracy (share of pixels judged right) and
+    precision (0 if nothing is found) of a mask. The truth must have a positive; if it has no negative,
+    balanced accuracy is the share found."""
     both, missed = np.count_nonzero(found & truth), np.count_nonzero(truth & ~found)
     extra = np.count_nonzero(found & ~truth)
     negatives = truth.size - both - missed
@@ -62,6 +64,8 @@ def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, f
         "iou": both / (both + missed + extra),
         "f1": 2 * both / (2 * both + missed + extra),
         "balanced_accuracy": sum(recalls) / len(recalls),
+        "pixel_accuracy": 1 - (missed + extra) / truth.size,
+        "precision": both / max(both + extra, 1),
     }
 
 

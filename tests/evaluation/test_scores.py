@@ -53,6 +53,8 @@ def test_all_measures_agree_with_scikit_learn(seed):
     assert found["iou"] == pytest.approx(metrics.jaccard_score(true, mask))
     assert found["f1"] == pytest.approx(metrics.f1_score(true, mask))
     assert found["balanced_accuracy"] == pytest.approx(metrics.balanced_accuracy_score(true, mask))
+    assert found["pixel_accuracy"] == pytest.approx(metrics.accuracy_score(true, mask))
+    assert found["precision"] == pytest.approx(metrics.precision_score(true, mask))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -84,7 +86,13 @@ def test_overlap_by_hand():
         "iou": pytest.approx(2 / 4),
         "f1": pytest.approx(4 / 6),
         "balanced_accuracy": pytest.approx((2 / 3 + 4 / 5) / 2),
+        "pixel_accuracy": pytest.approx(6 / 8),
+        "precision": pytest.approx(2 / 3),
     }
+
+
+def test_a_mask_that_finds_nothing_has_no_precision():
+    assert overlap(np.zeros((2, 2), bool), np.eye(2, dtype=bool))["precision"] == 0
 
 
 def test_an_object_that_fills_the_photo_has_a_balanced_accuracy():
@@ -203,7 +211,7 @@ def test_nothing_is_found_outside_the_foreground():
 def test_a_perfect_map_scores_one_and_absent_categories_are_left_out(mask):
     maps = {"domes": torch.from_numpy(mask).float(), "windows": torch.rand(40, 60)}
     truths = {"domes": Truth(mask), "windows": Truth(np.zeros_like(mask))}
-    perfect = dict.fromkeys(("ap", "iou", "f1", "balanced_accuracy", "located"), 1.0)
+    perfect = {"ap", "iou", "f1", "balanced_accuracy", "pixel_accuracy", "precision", "located"}
     assert score_maps(maps, truths) == {f"{name}_domes": 1.0 for name in perfect}
     assert set(score_maps(maps, truths, "teacher_")) == {f"teacher_{name}_domes" for name in perfect}
 

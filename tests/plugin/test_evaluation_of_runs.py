@@ -94,6 +94,7 @@ def test_labels_in_json_are_scored_at_the_photos_size_by_langsplats_measures(eva
     write_labels(truth, "photo_000", [box], width=width, height=height)
     results = evaluate(ground_truth=truth)
     assert {"smooth_localization_accuracy", "smooth_miou", "localization_accuracy"} <= set(results)
+    assert {"mpa", "mp", "smooth_mpa", "smooth_mp"} <= set(results)
     assert results["protocol"]["layout"] == "lerf_ovs"
 
 
