@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -36,14 +36,16 @@ _ROUND_OFF = 1e-9  # of a window; smaller coverage is rounding error, not a pixe
 class DownsamplerConfig:
     """How a decoded map is reduced to the target grid."""
 
-    kernel: KernelName = "pyramid"
+    kernel: KernelName | Literal["auto"] = "auto"
     """Fixed part of the weights. pyramid: nested squares from the smallest crop to the largest, growing by
     √2, favoring small ones (the published system's kernel). footprint: the exact crops of every scale and
     the resize of their grids, equally weighted. box: the cell alone, as in the paper's formula; much too
-    narrow for targets that are a mean over scales."""
-    hidden: int = 16
-    """Width of the network that predicts the weights; 0 keeps the fixed kernel and builds no network. The
-    published system has 512, about thirty times as slow on a CPU as 16."""
+    narrow for targets that are a mean over scales. auto: box with the semantic field's preset `paper`,
+    otherwise pyramid."""
+    hidden: int | None = None
+    """Width of the network that predicts the weights; 0 keeps the fixed kernel and builds no network. None:
+    512, as published, with the semantic field's presets `paper` and `official`; else 16, which is about
+    thirty times as fast on a CPU."""
     logit_bound: float | None = 10.0
     """Logits w become b·tanh(w/b), so that no pixel outweighs another by more than exp(2b). None leaves them
     unbounded and takes a slower path that is stable for any logits."""
@@ -51,6 +53,15 @@ class DownsamplerConfig:
     """How features and target are brought to one grid. The other choices are the paper's ablations: features
     resized to the target's grid ("w/o AD (LR)"), or the target to the features' size ("w/o AD (HR)"),
     bilinear; the settings above then have no effect."""
+
+    def resolved(self, preset: str | None = None) -> DownsamplerConfig:
+        """The settings without `auto` and None, for the semantic field's preset."""
+        kernel, hidden = self.kernel, self.hidden
+        if kernel == "auto":
+            kernel = "box" if preset == "paper" else "pyramid"
+        if hidden is None:
+            hidden = 512 if preset in ("paper", "official") else 16
+        return replace(self, kernel=kernel, hidden=hidden)
 
 
 class SeparableKernel(NamedTuple):
@@ -72,7 +83,9 @@ class AttenuatedDownsampler(nn.Module):
         self, config: DownsamplerConfig, channels: int, *, generator: torch.Generator | None = None
     ) -> None:
         super().__init__()
-        self.config = config
+        self.config = config = config.resolved()
+        assert config.kernel != "auto" and config.hidden is not None  # resolved
+        self.kernel: KernelName = config.kernel
         learned = config.hidden and config.match == "attenuated"
         self.network = _weight_network(channels, config.hidden, generator) if learned else None
 
@@ -123,7 +136,7 @@ class AttenuatedDownsampler(nn.Module):
         logits: Float[Tensor, "h w"] | None,
     ) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
         h, w, _ = features.shape
-        kernel = separable_kernel(self.config.kernel, (h, w), grid, sides, features.dtype, features.device)
+        kernel = separable_kernel(self.kernel, (h, w), grid, sides, features.dtype, features.device)
         inside = features.new_ones(h, w) if mask is None else mask.to(features.dtype)
         share = apply_kernel(kernel, inside[..., None]).squeeze(-1)
         if logits is None:

@@ -42,7 +42,8 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     warm_up: float = 0.0
     """Fraction of the run that trains colors only, before the semantic losses start."""
     feature_gradient_to_geometry: bool = False
-    """Let the semantic losses also move Gaussians and opacities, as in the authors' code."""
+    """Let the semantic losses also move Gaussians and change opacities. In the authors' code they move
+    Gaussians too, but their gradient stops at the opacity."""
     view_dependence: Literal["auto", "on", "off"] = "auto"
     """Colors that depend on the viewing direction (spherical harmonics of `sh_degree`); off leaves one
     color and a quarter of the numbers per Gaussian. `auto`: by the scene's measured needs."""
@@ -86,6 +87,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
         if self.semantic_field.preset == "auto":
             # Compression is a direct regression of a thousand steps, whatever the run's length.
             self.semantic_field.preset = "short" if short or self.encoder.name == "lang3dxl" else "default"
+        self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
         if self.appearance.preset == "auto":
             self.appearance.preset = "short" if short else "paper"
         if self.densify_grad_thresh is None:

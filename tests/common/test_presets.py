@@ -47,6 +47,8 @@ def test_training_takes_the_flags_of_every_scene(capsys):
             assert config.pipeline.datamanager.scale_preset == f"holyscenes/{path.stem}"
             start = 5_000 if path.stem == "badshahi" else 2_000
             assert config.pipeline.model.densify_from * iterations == pytest.approx(start, abs=1)
+            model = config.pipeline.model
+            assert (model.densify_grad_thresh, model.densify_size_thresh) == (2e-4, 0.22)
             until = config.optimizers["means"]["scheduler"].until
             assert until * iterations == pytest.approx(30_000, abs=1)
         else:

@@ -339,6 +339,17 @@ def test_a_soft_mask_weighs_pixels_once():
 # ------------------------------------------------------------------ the module
 
 
+@pytest.mark.parametrize(
+    ("preset", "kernel", "hidden"),
+    [(None, "pyramid", 16), ("short", "pyramid", 16), ("paper", "box", 512), ("official", "pyramid", 512)],
+)
+def test_published_presets_have_the_published_downsampler(preset, kernel, hidden):
+    found = DownsamplerConfig().resolved(preset)
+    assert (found.kernel, found.hidden) == (kernel, hidden)
+    asked = DownsamplerConfig("footprint", 8)
+    assert asked.resolved(preset) == asked
+
+
 def test_without_hidden_width_there_is_nothing_to_train():
     assert list(downsampler(hidden=0).parameters()) == []
     assert (downsampler(hidden=0).logits(seeded(3, 3, 4)) == 0).all()
