@@ -14,7 +14,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
-from PIL import Image
 from rich.markup import escape
 from torch import Tensor
 
@@ -29,6 +28,7 @@ from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resize
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
+from lang3dxl_ns.plugin.evaluated_photo import EvaluatedPhoto
 from lang3dxl_ns.plugin.half_image import PROTOCOL, half_image
 from lang3dxl_ns.plugin.label_limit import label_limit
 from lang3dxl_ns.plugin.lift_features import learn_from_photos
@@ -74,27 +74,6 @@ class Lang3DXLPipelineConfig(VanillaPipelineConfig):
 
 Score = Callable[[Cameras, "EvaluatedPhoto", dict, Photo], None]
 """Adds word scores to an evaluated photo."""
-
-
-@dataclass
-class EvaluatedPhoto:
-    """An evaluated photo: its figures, and the pictures behind them."""
-
-    name: str
-    metrics: dict[str, float]
-    """psnr etc., `render_seconds`, with appearance `half_psnr` etc., and with ground truth `query_seconds`
-    and the figures of `evaluation.aggregate.average`: `ap_{category}` etc., with the prefixes of
-    `evaluation.aggregate`."""
-    images: dict[str, Tensor]
-    """`img` (photo beside rendering, [H, 2W, 3]); with semantics `bottleneck`; with appearance `fitted`, the
-    rendering in the look of the half-image protocol."""
-    field_maps: Maps
-    """Relevancy by category as scored without prefix: blurred, at half the photo's size; empty without
-    ground truth."""
-    teacher_maps: Maps
-    """The same for the photo's own CLIP target."""
-    masked: bool = False
-    """Whether the maps are restricted to a foreground mask."""
 
 
 class Lang3DXLPipeline(VanillaPipeline):
@@ -295,7 +274,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         evaluated = []
         for photo in self.evaluate(split):
             if output_path is not None:
-                _write_pictures(photo, output_path)
+                photo.write_pictures(output_path)
             photo.images, photo.field_maps, photo.teacher_maps = {}, {}, {}  # too large for all photos
             evaluated.append(photo)
         results = average([photo.metrics for photo in evaluated], get_std)
@@ -410,13 +389,6 @@ class _Answers:
         self, outputs: dict[str, Tensor], rendered: Tensor | None, seconds: float
     ) -> dict[str, Tensor]:
         return self.asked.outputs(outputs["rgb"], rendered, outputs["accumulation"][..., 0])
-
-
-def _write_pictures(evaluated: EvaluatedPhoto, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, image in evaluated.images.items():
-        pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
-        Image.fromarray(pixels).save(folder / f"{evaluated.name.replace('/', '_')}.{name}.jpg")
 
 
 def _truths(truth: GroundTruth, photo: Photo, size: tuple[int, int]) -> dict[str, Truth]:

@@ -1,0 +1,39 @@
+"""An evaluated photo: its figures, and the pictures behind them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image
+from torch import Tensor
+
+from lang3dxl_ns.evaluation.scores import Maps
+
+
+@dataclass
+class EvaluatedPhoto:
+    """An evaluated photo: its figures, and the pictures behind them."""
+
+    name: str
+    metrics: dict[str, float]
+    """psnr etc., `render_seconds`, with appearance `half_psnr` etc., and with ground truth `query_seconds`
+    and the figures of `evaluation.aggregate.average`: `ap_{category}` etc., with the prefixes of
+    `evaluation.aggregate`."""
+    images: dict[str, Tensor]
+    """`img` (photo beside rendering, [H, 2W, 3]); with semantics `bottleneck`; with appearance `fitted`, the
+    rendering in the look of the half-image protocol."""
+    field_maps: Maps
+    """Relevancy by category as scored without prefix: blurred, at half the photo's size; empty without
+    ground truth."""
+    teacher_maps: Maps
+    """The same for the photo's own CLIP target."""
+    masked: bool = False
+    """Whether the maps are restricted to a foreground mask."""
+
+    def write_pictures(self, folder: Path) -> None:
+        """Write every picture to `folder` as a JPEG named after the photo."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, image in self.images.items():
+            pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
+            Image.fromarray(pixels).save(folder / f"{self.name.replace('/', '_')}.{name}.jpg")
