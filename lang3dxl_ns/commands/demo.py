@@ -244,7 +244,7 @@ def _split(found: dict[str, Any]) -> str:
     return f"{words}\n\n{markdown_table(['', 'rendered', 'mean feature instead'], quality)}"
 
 
-SHARES = {"scene": 0.15, "prepare": 0.3, "train": 0.35, "words": 0.1, "evaluate": 0.1}
+SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluate": 0.28}
 """The demo's stages, and their usual shares of its time on a CPU."""
 
 
