@@ -13,6 +13,8 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor
 
+from lang3dxl_ns.query.answer import Asked
+
 
 class Answers(Protocol):
     """Hook called with each rendering outside training (viewer, ns-render)."""
@@ -28,6 +30,22 @@ class Answers(Protocol):
         self, outputs: dict[str, Tensor], rendered: Float[Tensor, "h w d"] | None, seconds: float
     ) -> dict[str, Tensor]:
         """Additional outputs, from the rendering's outputs, the composited values, and its seconds."""
+
+
+@dataclass
+class RenderedAnswers:
+    """The outputs that `ns-render` adds to every rendering."""
+
+    asked: Asked
+    shows_bottleneck: bool = True
+
+    def carried(self) -> Tensor | None:
+        return self.asked.carried
+
+    def outputs(
+        self, outputs: dict[str, Tensor], rendered: Tensor | None, seconds: float
+    ) -> dict[str, Tensor]:
+        return self.asked.outputs(outputs["rgb"], rendered, outputs["accumulation"][..., 0])
 
 
 class AnsweringModel(SplatfactoModel):

@@ -25,6 +25,7 @@ from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
 from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resized
+from lang3dxl_ns.plugin.answering import RenderedAnswers
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
@@ -327,7 +328,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         """Load a checkpoint; for rendering, also prepare to answer the configured prompts."""
         super().load_pipeline(loaded_state, step)
         if self.test_mode != "val" and self.query:
-            self.model.answers = _Answers(self._asked())
+            self.model.answers = RenderedAnswers(self._asked())
 
     def match_thresholds(self) -> dict[str, float]:
         """Relevancy above which places match each scored prompt, by the scene."""
@@ -373,22 +374,6 @@ class Lang3DXLPipeline(VanillaPipeline):
                 f"the checkpoint does not fit this configuration: {error}. "
                 f"Load it with the config.yml beside it, or with the options that it was trained with"
             ) from error
-
-
-@dataclass
-class _Answers:
-    """The outputs that `ns-render` adds to every rendering."""
-
-    asked: Asked
-    shows_bottleneck: bool = True
-
-    def carried(self) -> Tensor | None:
-        return self.asked.carried
-
-    def outputs(
-        self, outputs: dict[str, Tensor], rendered: Tensor | None, seconds: float
-    ) -> dict[str, Tensor]:
-        return self.asked.outputs(outputs["rgb"], rendered, outputs["accumulation"][..., 0])
 
 
 def _truths(truth: GroundTruth, photo: Photo, size: tuple[int, int]) -> dict[str, Truth]:
