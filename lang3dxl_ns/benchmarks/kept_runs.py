@@ -56,11 +56,14 @@ def _train_and_keep(
 ) -> dict[str, float]:
     write_output_to(log)
     from lang3dxl_ns.commands.evaluate import write_scores
+    from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
     from lang3dxl_ns.plugin.open_run import open_run
 
     config = run_configuration(run, settings, folder)
     config.pipeline.ground_truth, config.pipeline.evaluated_photos = truth.absolute(), "seen"
-    config.pipeline.datamanager.dataparser.eval_mode = "all"
+    parser = config.pipeline.datamanager.dataparser
+    assert isinstance(parser, PhotoCollectionDataParserConfig)
+    parser.eval_mode = "all"
     checkpoints = config.get_base_dir() / config.relative_model_dir
     latest = max(checkpoints.glob("step-*.ckpt"), default=None)
     if latest is None or int(latest.stem.removeprefix("step-")) + 1 < run.steps:

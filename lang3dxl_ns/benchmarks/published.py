@@ -76,8 +76,8 @@ class _Benchmark:
 
     def _run(self, scene: BenchmarkScene) -> Run:
         (row,) = choose_rows((FULL,), True, False)
-        steps = self.iterations or self._flags(scene).get("max-num-iterations", 30_000)
-        return Run(row, scene.data, scene.name, 0, int(steps))
+        steps = self.iterations or int(self._flags(scene).get("max-num-iterations", "30000"))
+        return Run(row, scene.data, scene.name, 0, steps)
 
     def _store(self, scene: BenchmarkScene) -> KeptRuns:
         flags = {k: v for k, v in self._flags(scene).items() if k not in _OF_THE_COMMAND}

@@ -18,7 +18,8 @@ from lang3dxl_ns.scene.photo import Photo
 
 @pytest.fixture
 def photo():
-    return 0.1 + 0.8 * torch.rand(40, 60, 3, generator=torch.Generator().manual_seed(0))
+    """A dark one: its mean is 0.35."""
+    return 0.05 + 0.6 * torch.rand(40, 60, 3, generator=torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize("tint", [(1, 1, 1), (0.6, 0.8, 1.0), (1.0, 0.7, 0.5)])
@@ -43,6 +44,11 @@ def test_darker_pixels_stay_darker_in_every_channel(photo):
     for channel in range(3):
         order = photo[..., channel].flatten().argsort()
         assert (lit[..., channel].flatten()[order].diff() >= 0).all()
+
+
+def test_photos_as_bright_as_those_that_it_knows_stay_as_taken(photo):
+    for factor in (1.3, 1.5):
+        assert torch.equal(in_known_light(factor * photo, 0.6), factor * photo)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
