@@ -26,6 +26,9 @@ BENCHMARKS = {
     "gpu": ("benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time and memory, in one file to send."),
     "scale": ("benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
     "real-photos": ("benchmarks.real_photos:RealPhotos", "Scenes of real photos, trained and scored."),
+    "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
+    "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
+    "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
     "queries": ("benchmarks.queries:QueryBenchmark", "From a new text to its picture."),
     "best-views": (
         "benchmarks.best_views:BestViews",

@@ -6,29 +6,32 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lang3dxl_ns.baselines.rows import FULL, choose_rows
+from lang3dxl_ns.baselines.rows import CHANCE, FULL, LIMIT, TEACHER, choose_rows
 from lang3dxl_ns.benchmarks.ablation import make_all
 from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
 
-_SEEN, _TEACHER = "seen_", "seen_teacher_"
 COLORS = {
     "half_psnr": "PSNR, half image",
     "psnr": "PSNR",
-    "cc_psnr": "PSNR, color-corrected",
+    "cc_psnr": "PSNR, matched colors",
+    "ssim": "SSIM",
     "clip_cosine": "CLIP cosine",
     "gaussians": "Gaussians",
     "setup_seconds": "set-up, CPU s",
     "train_seconds": "training, CPU s",
     "train_peak_mb": "memory, MB",
 }
+BOUNDS = {TEACHER: "2-D teacher", LIMIT: "limit of the geometry", CHANCE: "chance"}
+SPLITS = {"seen_": "photos that training saw", "": "held-out photos"}
+"""Prefixes of the words' figures."""
 
 
 @dataclass
 class RealPhotos:
     """Train on real photos by the README's command and score them: colors in held-out photos and, where a
-    scene has ground_truth/, words in the masked photos that training saw, beside the 2-D teacher.
+    scene has ground_truth/, words in the masked photos, beside the 2-D teacher.
 
     Finished runs are kept: the command can be interrupted and repeated at any time. Photos without a COLMAP
     model are reconstructed first.
@@ -38,8 +41,8 @@ class RealPhotos:
     """Folders of photos, with ground_truth/ or without."""
     out: Path
     """Folder for real_photos.md and the results of every run."""
-    baselines: bool = False
-    """Whether the baselines run too, on the scenes with ground truth."""
+    baselines: tuple[str, ...] = ()
+    """Baselines to run too, on the scenes with ground truth: rows of `lang3dxl benchmark ablation`."""
     iterations: int = 1_000
     """Training iterations."""
     scale: float = 0.25
@@ -54,13 +57,11 @@ class RealPhotos:
     def main(self) -> None:
         scenes = _labels(self.scene)
         settings = RunSettings(self.clip, self.dense, "auto", self.scale, 64, self.ns_train, "none")
-        systems = [row for row in choose_rows(("systems",), True, False) if row.trains and row.name != FULL]
-        full = choose_rows((FULL,), True, False)
         runs = [
             Run(row, path, label, 0, self.iterations)
             for label, path in scenes.items()
-            for row in [*full, *(systems if self.baselines and (path / "ground_truth").is_dir() else [])]
-            if row.trains
+            for row in choose_rows((FULL, *self.baselines), True, False)
+            if row.trains and (row.name == FULL or (path / "ground_truth").is_dir())
         ]
         make_all(runs, ScoredRuns(self.out, settings), self._write)
 
@@ -86,25 +87,28 @@ def tables(figures: Mapping[Run, Mapping[str, float]]) -> list[str]:
     parts = ["## Held-out photos", markdown_table(["scene", "system", *shown.values()], colors)]
     for label in dict.fromkeys(run.label for run in figures):
         mine = {run: found for run, found in figures.items() if run.label == label}
-        words = _words(mine)
-        if words:
-            parts += [f"## Words in the masked photos of {label}, average precision", words]
+        for split, photos in SPLITS.items():
+            if words := _words(mine, split):
+                parts += [f"## Words in {photos} of {label}, average precision", words]
     return parts
 
 
-def _words(figures: Mapping[Run, Mapping[str, float]]) -> str:
-    """Categories by system, and the 2-D teacher of the full method; empty without ground truth."""
-    found = [
-        key.removeprefix(f"{_SEEN}ap_") for run in figures for key in figures[run] if f"{_SEEN}ap_" in key
-    ]
-    categories = [name for name in dict.fromkeys(found) if name]
+def _words(figures: Mapping[Run, Mapping[str, float]], split: str) -> str:
+    """Categories by system, and the bounds that the full method records; empty without ground truth."""
+    photos = {
+        name.removeprefix(f"{split}ap_").removesuffix("_photos"): f"{count:.0f}"
+        for found in figures.values()
+        for name, count in found.items()
+        if name.startswith(f"{split}ap_") and name.endswith("_photos")
+    }
     rows: list[Sequence[str]] = []
     for run, values in figures.items():
-        kinds = {run.row.label: _SEEN} | ({"2-D teacher": _TEACHER} if run.row.name == FULL else {})
-        for system, prefix in kinds.items():
-            cells = [values.get(f"{prefix}ap_{name}") for name in categories]
-            rows.append([system, *map(_figure, cells), _figure(values.get(f"{prefix}map"))])
-    return markdown_table(["", *categories, "mean"], rows) if categories else ""
+        kinds = {"": run.row.label} | ({f"{name}_": BOUNDS[name] for name in BOUNDS if run.row.name == FULL})
+        for kind, system in kinds.items():
+            cells = [values.get(f"{split}{kind}ap_{name}") for name in photos]
+            rows.append([system, *map(_figure, cells), _figure(values.get(f"{split}{kind}map"))])
+    rows.append(["photos", *photos.values(), ""])
+    return markdown_table(["", *photos, "mean"], rows) if photos else ""
 
 
 def _figure(value: float | None) -> str:

@@ -9,7 +9,7 @@ import shlex
 import shutil
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -118,11 +118,7 @@ class ScoredRuns:
     def _submit(self, run: Run, log: Path) -> dict[str, float]:
         work = self.folder / f"work-{run.name.replace('/', '-')}"
         try:
-            return in_own_process(_in_process, run, self.settings, work, log, preload=_LIBRARIES)
-        except BrokenProcessPool as error:
-            raise UserError(f"killed, most likely for lack of memory (see {log})") from error
-        except (RuntimeError, MemoryError) as error:
-            raise UserError(f"{error} (see {log})") from error
+            return in_process_of_its_own(_in_process, run, self.settings, work, log)
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
@@ -135,6 +131,16 @@ class ScoredRuns:
         if run.row.name != CLIPSEG:
             del made_with["clipseg"]
         return json.loads(json.dumps(made_with))
+
+
+def in_process_of_its_own(work: Callable[..., dict[str, float]], *args: Any) -> dict[str, float]:
+    """Figures of `work(*args)`, whose last argument is its log. Raises UserError with the reason."""
+    try:
+        return in_own_process(work, *args, preload=_LIBRARIES)
+    except BrokenProcessPool as error:
+        raise UserError(f"killed, most likely for lack of memory (see {args[-1]})") from error
+    except (RuntimeError, MemoryError) as error:
+        raise UserError(f"{error} (see {args[-1]})") from error
 
 
 def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
@@ -195,12 +201,17 @@ def apply_changes(config: Any, changes: Mapping[str, Any]) -> None:
 
 
 def _in_process(run: Run, settings: RunSettings, work: Path, log: Path) -> dict[str, float]:
+    write_output_to(log)
+    work_on = _score_clipseg if run.row.name == CLIPSEG else _train_and_score
+    return work_on(run, settings, work)
+
+
+def write_output_to(log: Path) -> None:
+    """Everything that this process prints goes to a file from now on."""
     with open(log, "w") as file:
         sys.stdout.flush()
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    work_on = _score_clipseg if run.row.name == CLIPSEG else _train_and_score
-    return work_on(run, settings, work)
 
 
 def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:

@@ -66,7 +66,7 @@ class EvaluateMaps:
         photos, protocol = score_predictions(truth, self.maps, names, self.masks, self.temperature)
         results = average(list(photos.values()), with_deviation=True)
         results |= {"protocol": protocol, "photos": photos}
-        _write(self.out, self.scene or _scene_name(truth.folder.absolute()), results)
+        write_scores(self.out, self.scene or _scene_name(truth.folder.absolute()), results)
 
 
 @dataclass(kw_only=True)
@@ -99,7 +99,7 @@ class EvaluateRun:
         if self.ground_truth is not None or self.layout != "auto":
             pipeline.config.ground_truth_layout = self.layout
         results = pipeline.scored(get_std=True)
-        _write(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
+        write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
 
 @dataclass(kw_only=True)
@@ -200,7 +200,8 @@ def _scene_name(folder: Path) -> str:
     return folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
 
 
-def _write(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu") -> None:
+def write_scores(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu") -> None:
+    """Write a scene's report, scores.json and scores.md, and print it."""
     report = {"scene": scene, "machine": describe_machine(device), "results": results}
     table = _scene_table(scene, results)
     write_report(folder, REPORT, table, report)

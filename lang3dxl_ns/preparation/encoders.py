@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.light import in_known_light
 
 CLIP_OPTION = "--pipeline.datamanager.clip"
 DENSE_OPTION = "--pipeline.datamanager.dense"
@@ -98,7 +99,8 @@ def spoken(option: str) -> str:
 class ImageTextEncoder:
     """CLIP: images and texts in one space. Embeddings are projected, float32 and *not* normalized.
 
-    `dim`: channels; `crop_size`: side of the vision tower's input in pixels; `identity`: of the weights.
+    `dim`: channels; `crop_size`: side of the vision tower's input in pixels; `identity`: of the weights;
+    `brightness`: mean value of the photos that it has learned from, if it depends on that, else None.
     """
 
     def __init__(
@@ -108,14 +110,19 @@ class ImageTextEncoder:
         mean: Sequence[float],
         std: Sequence[float],
         identity: str,
+        brightness: float | None = None,
     ) -> None:
         self.dim: int = model.config.projection_dim
         self.crop_size: int = model.config.vision_config.image_size
-        self.identity = identity
+        self.identity, self.brightness = identity, brightness
         self._model, self._tokenizer = model, tokenizer
         self._device = next(model.parameters()).device
         self._mean, self._std = _channels(mean, self._device), _channels(std, self._device)
         self._context: int = model.config.text_config.max_position_embeddings
+
+    def in_known_light(self, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        """A photo as its crops should be cut from: in the light that the encoder knows."""
+        return photo if self.brightness is None else in_known_light(photo, self.brightness)
 
     # no_grad, not inference_mode: embeddings may enter autograd later, inference tensors can't
     @torch.no_grad()
@@ -197,7 +204,14 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
         processor = CLIPImageProcessor.from_pretrained(files.folder, local_files_only=True)
     else:
         processor = CLIPImageProcessor()  # fine-tuned weights are often saved alone; CLIP's own statistics
-    return ImageTextEncoder(model, tokenizer, processor.image_mean, processor.image_std, files.identity)
+    return ImageTextEncoder(
+        model,
+        tokenizer,
+        processor.image_mean,
+        processor.image_std,
+        files.identity,
+        getattr(processor, "brightness", None),  # a key of our own, in the built-in CLIP's folder
+    )
 
 
 def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, tokens: int = 64) -> DenseEncoder:

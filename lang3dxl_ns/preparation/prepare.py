@@ -272,7 +272,13 @@ def _encode(
 ) -> None:
     if task.clip and clip:
         target = build_clip_target(
-            image, task.sides, task.scales, clip.encode_images, clip.crop_size, crop_batch, task.steps
+            clip.in_known_light(image),
+            task.sides,
+            task.scales,
+            clip.encode_images,
+            clip.crop_size,
+            crop_batch,
+            task.steps,
         )
         tensors = {"features": target.features, "valid": target.valid}
         store.write(task.clip_kind, task.photo.name, tensors, task.clip)

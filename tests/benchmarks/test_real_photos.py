@@ -12,10 +12,16 @@ from lang3dxl_ns.common.errors import UserError
 FULL_ROW = next(row for row in ROWS if row.name == FULL)
 WORDS = {
     "psnr": 20.5,
+    "ssim": 0.6125,
+    "seen_ap_windows_photos": 3,
     "seen_ap_windows": 0.7,
     "seen_map": 0.7,
     "seen_teacher_ap_windows": 0.4,
     "seen_teacher_map": 0.4,
+    "seen_chance_ap_windows": 0.05,
+    "seen_limit_ap_windows": 0.95,
+    "ap_doors": 0.33,
+    "ap_doors_photos": 1,
 }
 
 
@@ -45,22 +51,32 @@ def test_every_scene_is_trained_and_those_with_truth_score_words(tmp_path, made)
     report = (tmp_path / "out" / "real_photos.md").read_text()
     assert "lang3dxl benchmark real-photos" in report
     assert "20.50" in report
-    assert report.count("## Words in the masked photos") == 1
-    assert "2-D teacher" in report
+    assert report.count("## Words in photos that training saw of castle") == 1
+    assert report.count("## Words in held-out photos of castle") == 1
+    assert "of square" not in report
 
 
 def test_baselines_run_where_words_are_scored(tmp_path, made):
-    RealPhotos(scene=scenes(tmp_path), out=tmp_path / "out", baselines=True).main()
+    RealPhotos(scene=scenes(tmp_path), out=tmp_path / "out", baselines=("paper", "lifting")).main()
     assert [name for name in made if name.startswith("square")] == ["square/full/1000-0"]
-    assert len([name for name in made if name.startswith("castle")]) >= 4
+    rows = {name.split("/")[1] for name in made if name.startswith("castle")}
+    assert rows == {FULL, "paper", "lifting"}
 
 
-def test_the_words_of_field_and_teacher_are_not_mixed_up():
-    text = "\n".join(tables({Run(FULL_ROW, Path("castle"), "castle", 0): WORDS}))
-    field = next(line for line in text.splitlines() if line.startswith("| Lang3D-XL") and "0.70" in line)
-    teacher = next(line for line in text.splitlines() if line.startswith("| 2-D teacher"))
-    assert "0.40" in teacher
-    assert "0.40" not in field
+def test_words_of_field_teacher_and_bounds_stand_in_their_own_rows():
+    seen, held_out = "\n".join(tables({Run(FULL_ROW, Path("castle"), "castle", 0): WORDS})).split("## Words")[
+        1:
+    ]
+    rows = [line.strip("| ").split(" | ") for line in seen.splitlines() if line.startswith("|")]
+    assert rows[0] == ["windows", "mean"]
+    assert [row[:2] for row in rows[2:]] == [
+        ["Lang3D-XL", "0.70"],
+        ["2-D teacher", "0.40"],
+        ["limit of the geometry", "0.95"],
+        ["chance", "0.05"],
+        ["photos", "3"],
+    ]
+    assert "0.33" in held_out and "0.70" not in held_out
 
 
 def test_missing_and_doubled_scenes_are_told(tmp_path, made):

@@ -19,6 +19,8 @@ GRID = IMAGE_SIZE // PATCH
 """Patches along a side."""
 _CONTEXT = 24
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, as for dense encoders
+BRIGHTNESS = 0.6
+"""Mean value of the landmarks' views."""
 
 
 def build_tokenizer(seed: int) -> Any:
@@ -116,7 +118,7 @@ def normalize(pixels: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n 3 s s"]:
 
 def as_encoder(clip: Any, tokenizer: Any) -> ImageTextEncoder:
     """The present model, with the interface used in preparation."""
-    return ImageTextEncoder(clip, tokenizer, _MEAN, _STD, identity="in training")
+    return ImageTextEncoder(clip, tokenizer, _MEAN, _STD, "in training", BRIGHTNESS)
 
 
 def save_clip(clip: Any, tokenizer: Any, folder: Path) -> None:
@@ -128,6 +130,10 @@ def save_clip(clip: Any, tokenizer: Any, folder: Path) -> None:
     tokenizer.backend_tokenizer.model.save(str(folder))  # vocab.json and merges.txt, for other readers
     sides = {"height": IMAGE_SIZE, "width": IMAGE_SIZE}
     processor = CLIPImageProcessor(
-        size={"shortest_edge": IMAGE_SIZE}, crop_size=sides, image_mean=list(_MEAN), image_std=list(_STD)
+        size={"shortest_edge": IMAGE_SIZE},
+        crop_size=sides,
+        image_mean=list(_MEAN),
+        image_std=list(_STD),
+        brightness=BRIGHTNESS,
     )
     processor.save_pretrained(folder)

@@ -1,0 +1,27 @@
+"""Brightness and tint of dark photos, brought to those that a small encoder has learned from."""
+
+from __future__ import annotations
+
+import math
+
+from jaxtyping import Float
+from torch import Tensor
+
+_DIM = 0.75
+"""Share of the known brightness below which a photo is dark: nearly all photos of landmarks are above it."""
+_DARKEST = 0.02
+"""A photo's mean is taken to be no less: black stays black, and no exponent is extreme."""
+
+
+def in_known_light(photo: Float[Tensor, "h w 3"], brightness: float) -> Float[Tensor, "h w 3"]:
+    """A dark photo (RGB in 0…1) with about this mean, and the same mean in all channels; others unchanged.
+
+    A gamma curve sets the brightness, which keeps black and white; then each channel is multiplied (gray
+    world), which removes a tint. Encoders trained on millions of photos need neither.
+    """
+    mean = max(float(photo.mean()), _DARKEST)
+    if mean >= _DIM * brightness:
+        return photo
+    lit = photo ** (math.log(brightness) / math.log(mean))
+    channels = lit.mean((0, 1))
+    return (lit * (channels.mean() / channels.clamp_min(_DARKEST))).clamp(0, 1)
