@@ -54,7 +54,7 @@ def test_a_flight_takes_the_shorter_way_round():
 
 def tour(count: int = 3) -> Tour:
     viewpoints = [Viewpoint(f"{i}.jpg", photo(f"{i}.jpg", i, 0).camera, 0.25, 0.9, 0.1) for i in range(count)]
-    return Tour(Found(Prompt("dome"), viewpoints, None, 0.0))
+    return Tour(Found(Prompt("dome"), viewpoints, None, 0.0, 0.5))
 
 
 def test_a_tour_goes_round():

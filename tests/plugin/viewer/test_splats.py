@@ -56,8 +56,8 @@ def test_invisible_and_broken_gaussians_are_left_out():
 @pytest.mark.parametrize("highest", [None, 0.9])
 def test_heat_is_mixed_into_gaussians_as_into_pixels(highest):
     colors, relevancy = torch.rand(40, 3), torch.rand(40)
-    display = Display(threshold=0.4, opacity=0.6, color_map="viridis")
-    mixed = with_heat(colors, relevancy, display, highest)
+    display = Display(opacity=0.6, color_map="viridis")
+    mixed = with_heat(colors, relevancy, 0.4, display, highest)
     pixels = overlay(colors.view(5, 8, 3), relevancy.view(5, 8), 0.4, 0.6, "viridis", highest)
     torch.testing.assert_close(mixed, pixels.view(40, 3))
     assert torch.equal(mixed[relevancy <= 0.4], colors[relevancy <= 0.4])
