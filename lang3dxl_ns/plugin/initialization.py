@@ -6,7 +6,6 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases
-from sklearn.neighbors import NearestNeighbors
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -60,6 +59,8 @@ def initial_gaussians(
 
 def _spacing(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
     points = means.numpy()
+    from sklearn.neighbors import NearestNeighbors  # takes a second; only training needs it
+
     distances = NearestNeighbors(n_neighbors=4).fit(points).kneighbors(points)[0][:, 1:]
     spacing = torch.from_numpy(distances).float().mean(dim=-1, keepdim=True)
     # Coincident points would make Gaussians of zero size.
