@@ -122,7 +122,7 @@ class AskPanel(ViewerControl):
         gui, appearance = self._gui, self._pipeline.model.appearance
         looks = (OWN_LOOK, *(() if appearance is None else appearance.names))
         with gui.add_folder("How it is shown"):
-            self._automatic = gui.add_checkbox("Automatic threshold", True, hint="What stands out matches")
+            self._automatic = gui.add_checkbox("Automatic", True, hint="What stands out matches")
             self._threshold = gui.add_slider("Threshold", 0.0, 1.0, 0.01, 0.5, hint="Relevancy that matches")
             self._opacity = gui.add_slider("Opacity", 0.0, 1.0, 0.05, 0.7, hint="Of the heat map")
             self._color_map = gui.add_dropdown("Colors", COLOR_MAPS)
