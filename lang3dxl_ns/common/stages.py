@@ -31,7 +31,7 @@ class Stages:
         kept = path is not None and path.exists()
         self._spent: dict[str, dict[str, float]] = json.loads(path.read_text()) if kept and path else {}
         self._current: str | None = None
-        self._start, self._tenths = 0.0, 0
+        self._start, self._tenths = 0.0, -1
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -45,7 +45,7 @@ class Stages:
     def begin(self, name: str) -> None:
         """Announce a stage; the one before it ends."""
         self.end()
-        self._current, self._start, self._tenths = name, time.perf_counter(), 0
+        self._current, self._start, self._tenths = name, time.perf_counter(), -1
         if self._path is not None:
             host_peak(reset=True)
         self._announce()
@@ -62,7 +62,8 @@ class Stages:
             write_atomically(self._path, json.dumps(self._spent, indent=1))
 
     def progress(self, done: float) -> None:
-        """Say, at every tenth of the present stage, about how long all that is left takes at this pace.
+        """Say, as soon as the pace can be told and then at every tenth of the present stage, about how long
+        all that is left takes.
 
         done: fraction of the stage, as far as this command does it.
         """
@@ -73,7 +74,7 @@ class Stages:
         ahead = sum(self._shares[name] for name in self._later()) / self._shares[self._current]
         left = elapsed / done * (1 - done + ahead)
         if self._tenths < 10:
-            say(f"{self._current}: {10 * self._tenths} % done; {_minutes(left)} left in all")
+            say(f"{self._current}: {100 * done:.0f} % done; {_minutes(left)} left in all")
 
     def figures(self) -> dict[str, dict[str, float]]:
         """Seconds and peak memory (MB) by stage."""
