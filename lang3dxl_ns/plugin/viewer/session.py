@@ -116,10 +116,11 @@ class Conversation:
         start = time.perf_counter()
         foreground = foreground.strip()
         everything = [*prompts, *(scene.prompts(foreground) if foreground else ())]
-        queries = scene.queries(everything)
+        # In the order of `find`: who asks the scene first has to wait for nobody who holds the model.
+        with self._making, self._model_to_ourselves() if self._learning() else nullcontext():
+            queries, thresholds = scene.queries(everything), scene.thresholds(everything)
         self.seconds.text = time.perf_counter() - start
         self.found = None
-        thresholds = scene.thresholds(everything)
         self.question = Question(prompts, foreground, queries, thresholds)
         return self.question
 
