@@ -262,13 +262,14 @@ def test_a_conversation_in_the_viewer(default):
         model.answers = None
 
 
-def test_words_are_learned_where_memory_is_short(trained, monkeypatch):
+@pytest.mark.parametrize(("name", "width"), [("lang3dxl", 3), ("lifting", 65)])
+def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, width):
     """Wide features as principal components, a few channels at a time, sums on the CPU."""
     monkeypatch.setattr(CompressedField, "gathered_channels", 5)
     monkeypatch.setattr("lang3dxl_ns.rendering.gathering.MEMORY", 2.0)
-    model = trained(iterations=3).pipeline.model
+    model = trained(iterations=3, pipeline__model__encoder__name=name).pipeline.model
     codes = model.gauss_params["codes"]
-    assert codes.device == CUDA and codes.shape == (model.num_points, 3)
+    assert codes.device == CUDA and codes.shape == (model.num_points, width)
     assert codes.isfinite().all(1).cpu().any()
 
 

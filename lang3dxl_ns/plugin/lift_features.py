@@ -46,7 +46,8 @@ def learn_from_photos(
     width += len(model.dense_mean)
     features, mass = gather(model.num_points, views(), width, model.means.detach())
     codes = encoder.learn_gaussians(features, mass, advance, basis)
-    model.gauss_params["codes"] = Parameter(codes, requires_grad=False)
+    # Features that are many lie on the CPU, and those that are codes themselves come from there.
+    model.gauss_params["codes"] = Parameter(codes.to(model.device), requires_grad=False)
 
 
 def pixel_features(

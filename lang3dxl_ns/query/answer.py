@@ -13,7 +13,7 @@ from torch import Tensor
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.threshold import EVEN, matches_any
+from lang3dxl_ns.query.threshold import EVEN, matching
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Asked:
         own = self.thresholds or (EVEN,) * len(maps)
         if self.confining:
             maps, within = maps.tensor_split([-self.confining])
-            maps = maps * matches_any(within, own[len(maps) :])
+            maps = maps * matching(within, own[len(maps) :]).any(0)
         asked = self.display.threshold
         thresholds = own[: len(maps)] if asked is None else (asked,) * len(maps)
         return relevancy_outputs(image, maps.unbind(), self.display, thresholds, self.highest)

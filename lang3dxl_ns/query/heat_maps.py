@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.threshold import matching
 
 
 def heat(
@@ -58,8 +59,7 @@ def strongest(
 ) -> tuple[Float[Tensor, "..."], Int64[Tensor, "..."], float]:
     """The highest relevancy of the prompts that match a place, 0 where none does; which prompt that is; and
     the lowest threshold, from which the result can be displayed."""
-    levels = maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))
-    best, which = torch.where(maps > levels, maps, 0.0).max(0)
+    best, which = torch.where(matching(maps, thresholds), maps, 0.0).max(0)
     return best, which, min(thresholds)
 
 

@@ -28,7 +28,7 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.splat_file import GaussianArrays, write_gaussians
 from lang3dxl_ns.query.text import Prompt, TextEncoder, parse_prompts
-from lang3dxl_ns.query.threshold import match_thresholds, matches_any
+from lang3dxl_ns.query.threshold import match_thresholds, matching
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_longer_side
 
@@ -181,7 +181,7 @@ class Scene:
             keep = keep & view.counts
         if confining:
             maps, within = maps.tensor_split([len(prompts)])
-            keep = keep & matches_any(within, thresholds[len(prompts) :])
+            keep = keep & matching(within, thresholds[len(prompts) :]).any(0)
         maps = maps * keep
         peaks = maps.flatten(1).max(dim=1)
         scores, places = peaks.values.tolist(), peaks.indices.tolist()
@@ -246,10 +246,13 @@ class Scene:
 
     def query_gaussians(self, text: str | Prompt) -> Float[Tensor, " n"]:
         """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo."""
-        prompts = self.prompts([text])
-        if len(prompts) > 1:
-            raise UserError(f"{text!r} are {len(prompts)} prompts: score Gaussians for one at a time")
-        return self._of_gaussians(prompts)[0][0]
+        return self._of_gaussians([self._one_prompt(text)])[0][0]
+
+    def _one_prompt(self, text: str | Prompt) -> Prompt:
+        first, *others = self.prompts([text])
+        if others:
+            raise UserError(f"{text!r} are {1 + len(others)} prompts: score Gaussians for one at a time")
+        return first
 
     def find(
         self, text: str | Sequence[str | Prompt], most: int = 10, threshold: float | None = None
@@ -284,16 +287,17 @@ class Scene:
         With a text, only those that match it, or with `everything` all of them; the PLY has their relevancy
         as a property. Colors as in `arrays`. Raises UserError if nothing matches.
         """
-        found = self.arrays(text, look)
-        if text is not None and found.relevancy is not None and not everything:
-            ((threshold,),) = self._of_gaussians(self.prompts([text]), threshold)[2:]
-            keep = found.relevancy > threshold
+        found = self.arrays(text if everything else None, look)
+        if text is not None and not everything:
+            (scores,), _, (threshold,) = self._of_gaussians([self._one_prompt(text)], threshold)
+            relevancy = scores.cpu().float().numpy()
+            keep = relevancy > threshold
             if not keep.any():
                 raise UserError(
-                    f"no Gaussian matches {text!r}: the best reaches {found.relevancy.max():.2f}; lower "
+                    f"no Gaussian matches {text!r}: the best reaches {relevancy.max():.2f}; lower "
                     f"--threshold, now {threshold:.2f}, or write all with their relevancy (--all)"
                 )
-            found = found[keep]
+            found = replace(found, relevancy=relevancy)[keep]
         return write_gaussians(Path(path), found)
 
     def _of_gaussians(
@@ -306,7 +310,7 @@ class Scene:
         thresholds, count = self._asked(threshold, thresholds, len(prompts)), len(prompts)
         scores, within = scores.tensor_split([count])
         if len(within):
-            scores = scores * matches_any(within, thresholds[count:])
+            scores = scores * matching(within, thresholds[count:]).any(0)
         return scores, doubts[:count], thresholds[:count]
 
     def _found(
@@ -343,10 +347,8 @@ class Scene:
         views = load_visible(path, self._views_key, cameras, self.device) if path else None
         if views is None:
             what = "measuring which Gaussians the photos show, once per checkpoint"
-            views = {
-                name: self._visible(name, camera)
-                for name, camera in watched(cameras.items(), what, self._watch)
-            }
+            shown = watched(cameras.items(), what, self._watch)
+            views = {name: self._visible(name, camera) for name, camera in shown}
             if path:
                 save_visible(path, views, self._views_key)
         return views

@@ -40,7 +40,6 @@ def match_thresholds(
     return tuple(EVEN if one else level for one, level in zip(strict, levels, strict=True))
 
 
-def matches_any(maps: Float[Tensor, "q ..."], thresholds: Sequence[float]) -> Bool[Tensor, "..."]:
-    """Where at least one prompt matches."""
-    levels = maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))
-    return (maps > levels).any(0)
+def matching(maps: Float[Tensor, "q ..."], thresholds: Sequence[float]) -> Bool[Tensor, "q ..."]:
+    """Where each prompt matches."""
+    return maps > maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))

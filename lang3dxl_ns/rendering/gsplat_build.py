@@ -162,11 +162,7 @@ def needs(folder: Path | None = None) -> list[Need]:
         Need("Python.h", str(header) if header.is_file() else None, apt),
         Need("ninja", shutil.which("ninja", path=search_path()), "pip install ninja"),
         Need("memory", f"{memory / 1e9:.1f} GB" if memory >= JOB_BYTES else None, "a build takes 3.5 GB"),
-        Need(
-            f"disk, {folder}",
-            room,
-            f"{trouble}: free half a gigabyte, or set TORCH_EXTENSIONS_DIR",
-        ),
+        Need(f"disk, {folder}", room, f"{trouble}: free half a gigabyte, or set TORCH_EXTENSIONS_DIR"),
     ]
 
 

@@ -25,7 +25,7 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.text import EncodeTexts, Prompt
-from lang3dxl_ns.query.threshold import matches_any
+from lang3dxl_ns.query.threshold import matching
 
 
 @dataclass
@@ -235,7 +235,7 @@ class Conversation:
         scores = self._scene_now().engine.of_gaussians(question.queries)
         if question.confining:
             scores, within = scores.tensor_split([-question.confining])
-            scores = scores * matches_any(within, question.thresholds[len(scores) :])
+            scores = scores * matching(within, question.thresholds[len(scores) :]).any(0)
         asked, own = self.display.threshold, question.thresholds[: len(scores)]
         best, _, lowest = strongest(scores, own if asked is None else (asked,) * len(scores))
         return best, lowest
