@@ -14,11 +14,16 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from lang3dxl_ns.common.kernels import takes_kernels
+
 HASH_PRIMES = (1, 2654435761, 805459861, 3674653429, 2097192037, 1434869437)
 MOST_DIMENSIONS = len(HASH_PRIMES)
 INITIAL_RANGE = 1e-4
 COORDINATE_LIMIT = 1024.0
 """Coordinates are clamped to ± this, where float32 still resolves an eighth of a cell 1/2048 wide."""
+
+_WIDEST_ROW_OF_KERNELS = 8
+"""Longer entries are faster to add up in torch, entry by entry in vectors."""
 
 
 class HashGrid(nn.Module):
@@ -41,6 +46,9 @@ class HashGrid(nn.Module):
         log2_table_size: log2 of the most entries per level.
         generator: source of the uniform ± 1e-4 initial values.
     """
+
+    kernels: str | None = None
+    """"numba" or "torch": the kernels to take on a CPU; None: those that the environment chooses."""
 
     def __init__(
         self,
@@ -96,12 +104,26 @@ class HashGrid(nn.Module):
         x = x.to(torch.promote_types(self.table.dtype, torch.float32)).clamp(
             -COORDINATE_LIMIT, COORDINATE_LIMIT
         )
+        narrow = self.features_per_level <= _WIDEST_ROW_OF_KERNELS
+        if narrow and takes_kernels(x, self.kernels) and x.dtype == self.table.dtype:
+            return self._interpolated_by_kernels(x, level_weights)
         # Whole units separately, as integers: far from 0 a float32 product has no digits left for a fraction.
         whole = x.detach().floor()
         position = (x.detach() - whole).T[:, None] * self.cells[:, None] + 0.5
         lower = position.floor()
         index = self._vertex_entries(lower.long() + whole.long().T[:, None] * self.cells[:, None])
         return _Interpolate.apply(x, self.table, index, position - lower, self.cells, level_weights)
+
+    def _interpolated_by_kernels(
+        self, x: Float[Tensor, "n d"], level_weights: Float[Tensor, " levels"] | None
+    ) -> Float[Tensor, "n out"]:
+        from lang3dxl_ns.components.fused_hash_grid import Lattices, interpolate  # numba is slow to import
+
+        primes = torch.tensor(HASH_PRIMES[: self.input_dim])
+        buffers = [values.numpy() for values in (self.cells, self.offsets, primes)]
+        lattices = Lattices(buffers[0], buffers[1], self.dense_levels, self.hash_mask, buffers[2])
+        weights = x.new_ones(self.levels) if level_weights is None else level_weights.to(x)
+        return interpolate(x.contiguous(), self.table.contiguous(), lattices, weights.contiguous())
 
     def coarse_to_fine(self, fraction: float) -> Float[Tensor, " levels"]:
         """Level weights: only the coarsest level open at fraction 0, all at 1; the newest one fades in."""

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
 
+from lang3dxl_ns.common.kernels import numba_is_installed
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, HASH_PRIMES, HashGrid
 from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 
@@ -20,7 +21,13 @@ LARGE = 512.0
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """Coordinates, tables and number types."""
+    """Coordinates, tables and number types; in torch operations, and on the CPU by the compiled kernels."""
+    yield from _cases("hash grid", "torch")
+    if device == "cpu" and numba_is_installed():
+        yield from _cases("hash grid, numba", "numba")
+
+
+def _cases(component: str, kernels: str) -> Iterator[Case]:
     bounds = {"float32": Bounds(2e-4, 5e-5, 1e-3, 2e-4), "float64": EXACT}
     catalog: dict[str, tuple[Callable[[], Tensor], str]] = {
         "uniform in [0, 1]": (_uniform, ""),
@@ -32,22 +39,23 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
     }
     for name, (points, note) in catalog.items():
         constants = frozenset({"table"}) if name == "NaN" else frozenset[str]()
-        yield Case("hash grid", name, partial(_problem, points, constants=constants), bounds, note)
-    yield Case("hash grid", "four dimensions", partial(_problem, lambda: _uniform(4)), bounds)
+        yield Case(component, name, partial(_problem, points, kernels, constants=constants), bounds, note)
+    yield Case(component, "four dimensions", partial(_problem, lambda: _uniform(4), kernels), bounds)
+    few = partial(_problem, _uniform, kernels, log2_table=3)
+    yield Case(component, "collisions: 8 entries a level", few, bounds)
+    if kernels == "numba":  # which is for float32 and float64 alone
+        return
     yield Case(
-        "hash grid", "collisions: 8 entries a level", partial(_problem, _uniform, log2_table=3), bounds
-    )
-    yield Case(
-        "hash grid",
+        component,
         "level 2048, table in bf16",
-        partial(_problem, _uniform, table_type=torch.bfloat16),
+        partial(_problem, _uniform, kernels, table_type=torch.bfloat16),
         {"float32": Bounds(2e-2, 1e-2, 5e-2, 1e-2)},
         "coordinates stay in float32: in bf16 the finest level would have no fractions left",
     )
     yield Case(
-        "hash grid",
+        component,
         "level 2048, coordinates in bf16",
-        partial(_problem, lambda: _uniform().bfloat16().double(), coordinate_type=torch.bfloat16),
+        partial(_problem, lambda: _uniform().bfloat16().double(), kernels, coordinate_type=torch.bfloat16),
         {"float32": Bounds(2e-4, 5e-5, 1e-2, 5e-3)},
         "the coordinate's gradient is rounded to bf16",
     )
@@ -79,6 +87,7 @@ def _with_nan() -> Tensor:
 
 def _problem(
     points: Callable[[], Tensor],
+    kernels: str,
     log2_table: int = 14,
     table_type: torch.dtype | None = None,
     coordinate_type: torch.dtype | None = None,
@@ -87,6 +96,7 @@ def _problem(
     x = points()
     # A growth of exactly 2, from 16 + 2 to 2048 + 2 vertices, so that numbers of cells are powers of two.
     grid = HashGrid(x.shape[1], 8, 4, log2_table, 18, 2050, generator=torch.Generator().manual_seed(0))
+    grid.kernels = kernels
     cells = 2.0 ** torch.arange(4, 12)
     grid.cells.copy_(cells)
     grid.dense_resolutions.copy_((cells[: grid.dense_levels] + 2).long())

@@ -9,6 +9,7 @@ import torch
 from lang3dxl_ns.components import hash_grid
 from lang3dxl_ns.components.hash_grid import HashGrid
 
+pytestmark = pytest.mark.usefixtures("backend")
 PRIMES = (1, 2654435761, 805459861, 3674653429)
 
 

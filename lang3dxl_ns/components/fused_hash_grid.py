@@ -1,0 +1,163 @@
+"""Hash-grid interpolation and its gradients in one compiled pass over points, levels and corners.
+
+The torch operations of `hash_grid` keep rows and weights of all corners in memory, and sort them to add up
+the table's gradient. Here each is computed where it is used, in the forward and again in the backward pass.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from lang3dxl_ns.common.jit import in_threads, kernel
+
+_POINTS = 1024
+"""Fewest points per thread."""
+
+
+class Lattices(NamedTuple):
+    """Levels of a grid, as the kernels take them."""
+
+    cells: Int[Array, " levels"]
+    """Cells per unit: two fewer than vertices per axis."""
+    offsets: Int[Array, " levels"]
+    """First table row of each level."""
+    dense_levels: int
+    """Levels whose vertices have a row each; finer ones are hashed."""
+    mask: int
+    """Largest row of a hashed level."""
+    primes: Int[Array, " d"]
+    """Factors of the hash."""
+
+
+def interpolate(
+    x: Float[Tensor, "n d"],
+    table: Float[Tensor, "entries f"],
+    lattices: Lattices,
+    level_weights: Float[Tensor, " levels"],
+) -> Float[Tensor, "n out"]:
+    """Features of points, as `HashGrid.forward` defines them; differentiable in points and table.
+
+    Points and table: on the CPU, of one number type, float32 or float64.
+    """
+    return _Interpolate.apply(x, table, lattices, level_weights)
+
+
+class _Interpolate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, table: Tensor, lattices: Lattices, level_weights: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.arrays = [tensor.numpy() for tensor in (x, table, level_weights)]
+        ctx.lattices = lattices
+        features = x.new_empty(len(x), len(lattices.cells) * table.shape[1])
+        shared = (*ctx.arrays, *lattices, features.numpy())
+        in_threads(_features, [(*part, *shared) for part in _ranges(len(x), _POINTS)])
+        return features
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> Any:  # type: ignore[override]
+        x, table, _ = ctx.arrays
+        grad, levels = upstream.contiguous().numpy(), len(ctx.lattices.cells)
+        grad_table = np.zeros_like(table)
+        # A thread per range of levels: no two of them add to the same rows.
+        shared = (*ctx.arrays, *ctx.lattices, grad, grad_table)
+        parts = in_threads(_gradients, [(*part, *shared) for part in _ranges(levels, 1)])
+        grad_x = sum(parts) if parts else np.zeros_like(x)
+        return torch.from_numpy(grad_x), torch.from_numpy(grad_table), None, None
+
+
+def _ranges(count: int, least: int) -> list[tuple[int, int]]:
+    """Equal parts of a range, as many as there are threads, of at least `least`."""
+    step = max(-(-count // torch.get_num_threads()), least)
+    return [(first, min(first + step, count)) for first in range(0, count, step)]
+
+
+@numba.njit(forceinline=True)
+def _look_up(point, level, cells, offsets, dense_levels, mask, primes, entries, sides):
+    """Table rows of the corners of a point's cell, and along every axis the weights of its two sides. Bit k
+    of a corner's number is its side along axis k."""
+    count, stride, one = cells[level], 1, sides.dtype.type(1)
+    resolution = count + 2
+    entries[0] = 0
+    for axis in range(len(point)):
+        whole = np.floor(point[axis])  # separately, as in `HashGrid.forward`
+        position = (point[axis] - whole) * sides.dtype.type(count) + sides.dtype.type(0.5)
+        lower = np.floor(position)
+        sides[axis, 0], sides[axis, 1] = one - (position - lower), position - lower
+        vertex = np.int64(lower) + np.int64(whole) * count
+        bit = 1 << axis
+        if level < dense_levels:
+            low, high = vertex % resolution * stride, (vertex + 1) % resolution * stride
+            stride *= resolution
+            for corner in range(bit):
+                entries[corner + bit] = entries[corner] + high
+                entries[corner] += low
+        else:
+            low, high = vertex * primes[axis] & mask, (vertex + 1) * primes[axis] & mask
+            for corner in range(bit):
+                entries[corner + bit] = entries[corner] ^ high
+                entries[corner] ^= low
+    for corner in range(1 << len(point)):
+        entries[corner] += offsets[level]
+
+
+@kernel
+def _features(first, last, x, table, level_weights, cells, offsets, dense_levels, mask, primes, features):
+    dimensions, width = x.shape[1], table.shape[1]
+    entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
+    for n in range(first, last):
+        if np.isnan(x[n]).any():
+            features[n] = np.nan
+            continue
+        for level in range(len(cells)):
+            _look_up(x[n], level, cells, offsets, dense_levels, mask, primes, entries, sides)
+            found = features[n, level * width : (level + 1) * width]
+            found[:] = 0
+            for corner in range(1 << dimensions):
+                weight = level_weights[level]
+                for axis in range(dimensions):
+                    weight *= sides[axis, corner >> axis & 1]
+                row = table[entries[corner]]
+                for f in range(width):
+                    found[f] += weight * row[f]
+
+
+@kernel
+def _gradients(
+    first, last, x, table, level_weights, cells, offsets, dense_levels, mask, primes, grad, grad_table
+):
+    """Adds to the table's gradient; returns the points', as far as it comes from these levels."""
+    dimensions, width = x.shape[1], table.shape[1]
+    entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
+    grad_x = np.zeros_like(x)
+    for n in range(len(x)):
+        if np.isnan(x[n]).any():
+            grad_x[n] = np.nan
+            continue
+        for level in range(first, last):
+            _look_up(x[n], level, cells, offsets, dense_levels, mask, primes, entries, sides)
+            above = grad[n, level * width : (level + 1) * width]
+            scale = level_weights[level] * x.dtype.type(cells[level])
+            for corner in range(1 << dimensions):
+                weight = level_weights[level]
+                for axis in range(dimensions):
+                    weight *= sides[axis, corner >> axis & 1]
+                row, grad_row = table[entries[corner]], grad_table[entries[corner]]
+                product = x.dtype.type(0)
+                for f in range(width):
+                    product += above[f] * row[f]
+                    grad_row[f] += weight * above[f]
+                for axis in range(dimensions):
+                    slope = product * scale
+                    for other in range(dimensions):
+                        if other != axis:
+                            slope *= sides[other, corner >> other & 1]
+                    grad_x[n, axis] += slope if corner >> axis & 1 else -slope
+    return grad_x
