@@ -140,7 +140,7 @@ class Lang3DXLModel(RenderingModel):
     def _gathered_codes_follow(self) -> Iterator[None]:
         """Let densification copy and remove codes held by no optimizer along with their Gaussians."""
         codes = self.gauss_params.get("codes")
-        if codes is None or self._learns_from_renderings:
+        if codes is None or self.learns_from_renderings:
             yield
             return
         optimizers = self.optimizers
@@ -150,7 +150,7 @@ class Lang3DXLModel(RenderingModel):
         self.gauss_params["codes"].requires_grad_(False)
 
     def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
-        names = [n for n in self.gauss_params if n != "codes" or self._learns_from_renderings]
+        names = [n for n in self.gauss_params if n != "codes" or self.learns_from_renderings]
         return {name: [self.gauss_params[name]] for name in names}
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
@@ -158,7 +158,7 @@ class Lang3DXLModel(RenderingModel):
         groups = super().get_param_groups()
         if self.semantic_field is not None and self.downsampler is not None:
             groups |= self.semantic_field.parameter_groups()
-            if self._learns_from_renderings:
+            if self.learns_from_renderings:
                 groups["downsampler"] = list(self.downsampler.parameters())
         if self.appearance is not None:
             groups["appearance_vectors"] = [self.appearance.vectors]

@@ -62,7 +62,7 @@ class RenderingModel(AnsweringModel):
 
     def _training_outputs(self, camera: Cameras) -> dict[str, Tensor]:
         carried = None
-        if self._learns_from_renderings and self._warm_up_is_over:
+        if self.learns_from_renderings and self._warm_up_is_over:
             carried = self.carried
         outputs, codes = self.render(camera, carried)
         if self.means.requires_grad:
@@ -83,7 +83,8 @@ class RenderingModel(AnsweringModel):
         return self.step >= self.config.warm_up * self.config.total_steps
 
     @property
-    def _learns_from_renderings(self) -> bool:
+    def learns_from_renderings(self) -> bool:
+        """Whether semantics are trained with the scene, not gathered afterwards."""
         return self.semantic_field is not None and not self.semantic_field.needs_lifting
 
     def _code_colors(self) -> Float[Tensor, "n 3"] | None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
-from torch import nn
 
 from lang3dxl_ns.common.memory import machine_memory
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.plugin.model import Lang3DXLModel
 
 COPIES = 4
 """Numbers kept per parameter: its value, gradient, and Adam's two moments."""
@@ -17,6 +20,10 @@ PER_LOOK = 3_000.0
 """Bytes more per Gaussian in view, with appearance."""
 PER_PIXEL = 480.0
 """Bytes of a step per pixel of the photo."""
+PER_CODE = 12.0
+"""Bytes per number of a code that is rendered, for every Gaussian and for every pixel."""
+PER_DECODED = 24.0
+"""Bytes per number of a decoded feature map: itself, its hidden layers, gradients, and what is compared."""
 CONTEXT = 0.8e9
 """Bytes of CUDA's context, its libraries, and gaps between tensors."""
 SHARE = 0.85
@@ -37,17 +44,23 @@ class Sizes:
     """Of the largest photo."""
     looks: bool
     """Whether colors depend on the photo."""
+    codes: int
+    """Length of the codes that are rendered; 0 if semantics aren't trained."""
+    decoded: int
+    """Numbers of the largest feature map that a step decodes; 0 if it decodes none."""
     on_gpu: bool
 
     @property
     def per_gaussian(self) -> float:
         """Bytes, if all are in view."""
-        return 4 * COPIES * self.numbers + PER_GAUSSIAN + PER_LOOK * self.looks
+        work = PER_GAUSSIAN + PER_LOOK * self.looks + PER_CODE * self.codes
+        return 4 * COPIES * self.numbers + work
 
     @property
     def fixed(self) -> float:
         """Bytes, whatever the number of Gaussians."""
-        return 4 * COPIES * self.network + PER_PIXEL * self.pixels + CONTEXT * self.on_gpu
+        maps = (PER_PIXEL + PER_CODE * self.codes) * self.pixels + PER_DECODED * self.decoded
+        return 4 * COPIES * self.network + maps + CONTEXT * self.on_gpu
 
     def memory(self, gaussians: int) -> float:
         """Bytes at the peak of a step."""
@@ -58,12 +71,17 @@ class Sizes:
         return max(int((memory - self.fixed) / self.per_gaussian), 1)
 
 
-def sizes_of(model: nn.Module, gaussians: nn.ParameterDict, looks: bool, pixels: int, on_gpu: bool) -> Sizes:
-    """Sizes of a model with these Gaussians, of the photos' largest number of pixels."""
+def sizes_of(model: Lang3DXLModel, pixels: int, on_gpu: bool) -> Sizes:
+    """Sizes of a model, and of the photos' largest number of pixels."""
+    gaussians, codes, decoded = model.gauss_params, 0, 0
+    if model.learns_from_renderings:
+        codes = 0 if model.carried is None else model.carried.shape[1]
+        assert model.config.decode_size is not None
+        decoded = max(model.config.decode_size) ** 2 * (len(model.clip_mean) + len(model.dense_mean))
     own = sum(p.numel() for p in gaussians.values())
     count = len(gaussians["means"])
     total = sum(p.numel() for p in model.parameters())
-    return Sizes(own // count, total - own, pixels, looks, on_gpu)
+    return Sizes(own // count, total - own, pixels, model.appearance is not None, codes, decoded, on_gpu)
 
 
 def memory_to_plan_with(device: torch.device) -> float:

@@ -97,9 +97,8 @@ class Lang3DXLTrainer(Trainer):
     def _limit_gaussians(self) -> None:
         """Set the cap of densification from the device's memory, and log what training will take."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
-        pixels, looks = int((cameras.width * cameras.height).max()), model.appearance is not None
-        device = torch.device(self.device)
-        sizes = sizes_of(model, model.gauss_params, looks, pixels, device.type == "cuda")
+        pixels, device = int((cameras.width * cameras.height).max()), torch.device(self.device)
+        sizes = sizes_of(model, pixels, device.type == "cuda")
         now, wanted = model.num_points, self.config.pipeline.model.max_gaussians
         model.strategy.most, message = plan(sizes, device, now, wanted)
         CONSOLE.log(escape(message))
