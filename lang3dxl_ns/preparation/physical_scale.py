@@ -21,6 +21,8 @@ from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 
 SMALLEST_CROP = 32
 """Pixels: smaller crops show an image encoder nothing."""
+FINE_SHARE = 0.7
+"""Side of fine crops relative to the smallest of the pyramid; chosen on three landmarks (docs/queries.md)."""
 EDGE_MARGIN = 0.1
 """Share of a side: observations nearer to the photo's edge are ignored by the "mean-inner" distance."""
 
@@ -120,6 +122,13 @@ def crop_sides(scales: Sequence[float], pixel_size: float, width: int) -> tuple[
         side = min(max(scale / pixel_size, SMALLEST_CROP), width)
         sizes.setdefault(math.floor(side + 1e-6), side * pixel_size)  # 0.47 / 0.01 is 46.99…
     return list(sizes), list(sizes.values())
+
+
+def fine_crops(side: int, size: float) -> tuple[list[int], list[float]]:
+    """Side in pixels and size in world units of fine crops, for the smallest ones of a photo's pyramid; lists
+    of one, as from `crop_sides`."""
+    fine = max(round(FINE_SHARE * side), 2)
+    return [fine], [size * fine / side]
 
 
 def propose_scale_range(reconstruction: Reconstruction, pixel_sizes: dict[str, float]) -> ScaleRange:

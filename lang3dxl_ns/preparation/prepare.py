@@ -29,8 +29,8 @@ from lang3dxl_ns.preparation.encoders import (
     load_dense_encoder,
     load_image_text_encoder,
 )
-from lang3dxl_ns.preparation.physical_scale import crop_sides
-from lang3dxl_ns.preparation.pyramid import HALF, QUARTER, build_clip_target, crop_centers
+from lang3dxl_ns.preparation.physical_scale import crop_sides, fine_crops
+from lang3dxl_ns.preparation.pyramid import HALF, THIRD, build_clip_target, crop_centers
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -38,7 +38,7 @@ from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetRe
 from lang3dxl_ns.preparation.workers import Workers
 from lang3dxl_ns.scene.photo import Photo
 
-_CROP_RULE = 2
+_CROP_RULE = 3
 """Increased when the crops or their average change, so that older entries are made again."""
 _CHECKERS = 4
 """Threads that check photos."""
@@ -71,7 +71,7 @@ class _Task:
     regions: dict[str, Any] | None
     has_regions: bool
     is_fine: bool = False
-    """Whether the crops are the smallest alone, on a finer grid."""
+    """Whether the crops are of one size, smaller than the pyramid's, on a finer grid."""
 
     @property
     def clip_kind(self) -> str:
@@ -80,7 +80,7 @@ class _Task:
     @property
     def steps(self) -> int:
         """Crops per side."""
-        return QUARTER if self.is_fine else HALF
+        return THIRD if self.is_fine else HALF
 
     @property
     def is_done(self) -> bool:
@@ -108,8 +108,8 @@ def prepare(
 
     pixel_sizes: world units per pixel *of the photo as it is read* (its `width`), by photo name; None for
     relative scales. scales: crop sides in world units, or in photo widths without pixel sizes.
-    regions: where label maps come from; None for none. fine: photos that get the smallest crops alone, on a
-    grid of a quarter of their side.
+    regions: where label maps come from; None for none. fine: photos that get crops of one size alone,
+    smaller than the pyramid's smallest, a third of their side apart.
 
     Photos that can't be read are left out with a warning. Raises UserError when none can be read, a model
     can't be loaded, or the disk is too small.
@@ -152,7 +152,7 @@ def _plan(
         pixel_size = 1 / photo.width if pixel_sizes is None else pixel_sizes[photo.name]
         sides, sizes = crop_sides(scales, pixel_size, photo.width)
         if is_fine := photo.name in fine:
-            sides, sizes = sides[:1], sizes[:1]
+            sides, sizes = fine_crops(sides[0], sizes[0])
         clip = {**source, "encoder": clip_model, "crop_sides": sides, "rule": _CROP_RULE}
         dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if dense_model else None
         labels = None if regions is None else regions.settings(photo)

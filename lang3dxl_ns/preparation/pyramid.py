@@ -35,7 +35,7 @@ class ClipTarget:
         return max(self.scales) / min(self.scales)
 
 
-HALF, QUARTER = 2, 4
+HALF, THIRD = 2, 3
 """Crops per side: how many steps a crop's own side is, from one center to the next."""
 
 
