@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from jaxtyping import Bool
@@ -28,6 +28,7 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.plugin.data_folder import parser_for
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
+from lang3dxl_ns.plugin.handover import Batch, SceneFacts
 from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
@@ -95,7 +96,9 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return self.config.run or super().get_datapath()
 
     def create_train_dataset(self) -> PhotoDataset:
-        return self._dataset(self.train_dataparser_outputs)
+        dataset = self._dataset(self.train_dataparser_outputs)
+        SceneFacts([photo.name for photo in dataset.photos]).into(dataset.metadata)
+        return dataset
 
     def create_eval_dataset(self) -> PhotoDataset:
         return self._dataset(self.dataparser.get_dataparser_outputs(split=self.test_split))
@@ -114,13 +117,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
         needs."""
         if self.test_mode != "val":
             return
-        self.train_dataset.metadata["needs"] = {need.component: need.needed for need in self.needs}
+        facts = SceneFacts.of(self.train_dataset.metadata)
+        facts.needs = {need.component: need.needed for need in self.needs}
         CONSOLE.print(Markdown(f"**What this scene needs**\n\n{needs_table(self.needs)}"))
         if self.targets is not None:
             prepared = set(self.targets.names)  # without damaged photos
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
-            self.train_dataset.metadata["feature_statistics"] = self.targets.feature_statistics(names)
-            self.train_dataset.metadata["clip_targets"] = partial(self.targets.clip_features, names)
+            facts.statistics = self.targets.feature_statistics(names)
+            facts.clip_targets = partial(self.targets.clip_features, names)
         _log(self._memory_budget())
 
     @cached_property
@@ -263,7 +267,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             raise UserError("none of the training photos can be used: see the reasons above")
         return usable
 
-    def next_train(self, step: int) -> tuple[Cameras, dict]:
+    def next_train(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
         """Camera and batch of the next training photo; every photo once per round.
 
         A photo found to be damaged is left out from then on, and logged.
@@ -313,7 +317,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         upcoming = [index[name] for name in state["upcoming"] if name in index]
         self.train_unseen_cameras = upcoming or self.sample_train_cameras()
 
-    def train_photos(self) -> Iterator[tuple[Cameras, dict]]:
+    def train_photos(self) -> Iterator[tuple[Cameras, Batch]]:
         """Camera and batch of every training photo once, without the damaged ones."""
         for index, photo in enumerate(self.train_dataset.photos):
             if index in self._left_out:
@@ -326,12 +330,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
             camera.metadata = {"cam_idx": index}
             yield camera, batch
 
-    def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
+    def next_eval_image(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
         """Camera and batch of a held-out photo, in turn."""
         return next(self._eval_rounds)
 
     @cached_property
-    def _eval_rounds(self) -> Iterator[tuple[Cameras, dict]]:
+    def _eval_rounds(self) -> Iterator[tuple[Cameras, Batch]]:
         return chain.from_iterable(repeat(EvalPhotos(self)))
 
     @property
@@ -339,7 +343,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """All held-out photos, read one at a time."""
         return EvalPhotos(self)
 
-    def read(self, dataset: PhotoDataset, index: int) -> tuple[Cameras, dict]:
+    def read(self, dataset: PhotoDataset, index: int) -> tuple[Cameras, Batch]:
         """Camera and batch of a photo. Raises UserError if it can't be read."""
         return self._batch(dataset, index, self._read(dataset, index))
 
@@ -368,7 +372,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             data["crop_sides"] = clip.crop_fractions
         return data
 
-    def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, dict]:
+    def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, Batch]:
         """A photo's data for a step, on the device, with `name` and `image_idx`. The camera stays on the CPU:
         the host reads its size, and would wait for a GPU."""
         batch: dict[str, Any] = {
@@ -383,7 +387,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             if key in batch:
                 batch[key] = batch[key].to(number)
         batch |= {"image_idx": index, "name": dataset.photos[index].name}
-        return dataset.cameras[index : index + 1], batch
+        return dataset.cameras[index : index + 1], cast(Batch, batch)
 
 
 def _log(message: str) -> None:

@@ -10,6 +10,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.scene.photo import Photo
 
@@ -45,7 +46,7 @@ class EvalPhotos:
         for index in self._wanted:
             yield self.dataset.cameras[index : index + 1], self.dataset.photos[index]
 
-    def __iter__(self) -> Iterator[tuple[Cameras, dict]]:
+    def __iter__(self) -> Iterator[tuple[Cameras, Batch]]:
         dataset = self.dataset
         _ = self._datamanager.targets  # errors in preparing them must not be blamed on a photo
         usable = False

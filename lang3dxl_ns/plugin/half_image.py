@@ -20,6 +20,7 @@ from torch import Tensor
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.scene.camera import Camera, in_view
@@ -45,7 +46,7 @@ class HalfImage:
 
 
 @torch.no_grad()
-def half_image(model: Lang3DXLModel, camera: Cameras, batch: dict) -> HalfImage:
+def half_image(model: Lang3DXLModel, camera: Cameras, batch: Batch) -> HalfImage:
     """Fit the look on a photo's left half, and score the right one.
 
     model: with appearance, in evaluation mode. batch: the photo, as the data manager hands it over.

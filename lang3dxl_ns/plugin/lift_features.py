@@ -13,13 +13,14 @@ from torch.nn import Parameter
 
 from lang3dxl_ns.components.losses import resize
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
+from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.rendering.gathering import gather
 
 
 def learn_from_photos(
     model: Lang3DXLModel,
-    photos: Iterable[tuple[Cameras, dict]],
+    photos: Iterable[tuple[Cameras, Batch]],
     advance: Callable[[], None] = lambda: None,
 ) -> None:
     """Gather the photos' target features onto the Gaussians, and let the encoder make codes of them.
@@ -31,7 +32,8 @@ def learn_from_photos(
     assert encoder is not None
     basis, width = None, len(model.clip_mean)
     if encoder.gathered_channels is not None and encoder.gathered_channels < width:
-        targets = model.kwargs["metadata"]["clip_targets"]
+        targets = model.facts.clip_targets
+        assert targets is not None
         basis, width = PrincipalBasis.of(targets(), encoder.gathered_channels), encoder.gathered_channels
 
     def views():

@@ -24,6 +24,7 @@ from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.light import harmonics, in_light
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
@@ -187,13 +188,14 @@ def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch
     state = checkpoint["pipeline"]
     if not isinstance(run.pipeline.model, Lang3DXLModelConfig):
         raise UserError(f"{folder} is a run of another method: train one with ns-train lang3dxl")
-    photos = [photo for photo in file.photos if photo.split == "train"]
+    names, metadata = [photo.name for photo in file.photos if photo.split == "train"], dict[str, Any]()
+    SceneFacts(names).into(metadata)
     # The checkpoint brings its own Gaussians: start with the fewest possible.
     start = replace(run.pipeline.model, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
     model = start.setup(
         scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
-        num_train_data=len(photos),
-        metadata={"feature_statistics": None, "photos": photos},
+        num_train_data=len(names),
+        metadata=metadata,
         device=device,
         grad_scaler=None,
         seed_points=(torch.eye(4)[:, :3], torch.zeros(4, 3)),

@@ -28,6 +28,7 @@ from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
+from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.initialization import initial_gaussians, seed_positions
 from lang3dxl_ns.plugin.model_config import make_strategy
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
@@ -55,7 +56,7 @@ class Lang3DXLModel(RenderingModel):
         self.gauss_params = nn.ParameterDict(initial_gaussians(self.config, means, colors))
         self._make_camera_optimizer(self._wants("camera optimizer", self.config.camera_optimization, False))
         self.semantic_field = self.downsampler = None
-        statistics: FeatureStatistics | None = self.kwargs["metadata"].get("feature_statistics")
+        statistics = self.facts.statistics
         if statistics is not None:
             clip, dense = statistics.clip, statistics.dense
             self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean, statistics)
@@ -95,7 +96,8 @@ class Lang3DXLModel(RenderingModel):
             std = clip if dense is None else torch.cat([clip, dense.std])
             self.semantic_field.set_output_statistics(torch.cat([clip_mean, dense_mean]), std)
             with part("learn targets"):
-                self.semantic_field.learn_targets(self.kwargs["metadata"]["clip_targets"])
+                assert self.facts.clip_targets is not None
+                self.semantic_field.learn_targets(self.facts.clip_targets)
         self.downsampler = AttenuatedDownsampler(c.downsampler, len(clip_mean))
         codes = self.semantic_field.initial_codes(self.num_points)
         if codes is not None:
@@ -104,7 +106,7 @@ class Lang3DXLModel(RenderingModel):
     def _wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
         """Whether to build an optional component; `auto`: by the scene's measured needs."""
         if choice == "auto":
-            return (self.kwargs["metadata"].get("needs") or {}).get(component, unmeasured)
+            return self.facts.needs.get(component, unmeasured)
         return choice == "on"
 
     def _make_camera_optimizer(self, wanted: bool) -> None:
@@ -114,9 +116,8 @@ class Lang3DXLModel(RenderingModel):
         self.camera_optimizer = settings.setup(num_cameras=self.num_train_data, device="cpu")
 
     def _make_appearance(self) -> AppearanceField:
-        names = [photo.name for photo in self.kwargs["metadata"].get("photos", ())]
         generator = torch.Generator().manual_seed(0)
-        return AppearanceField(self.config.appearance, names, *self.extent, generator=generator)
+        return AppearanceField(self.config.appearance, self.facts.names, *self.extent, generator=generator)
 
     # ── training ────────────────────────────────────────────────────────────────────────────────────
 
@@ -168,7 +169,7 @@ class Lang3DXLModel(RenderingModel):
     # ── losses and metrics ──────────────────────────────────────────────────────────────────────────
 
     def get_loss_dict(
-        self, outputs: dict, batch: dict, metrics_dict: dict | None = None
+        self, outputs: dict, batch: Batch, metrics_dict: dict | None = None
     ) -> dict[str, Tensor]:
         """Color loss and, if there are semantics, the semantic losses (already weighted)."""
         mask = self._downscale_if_required(batch["mask"])[..., 0] if "mask" in batch else None
@@ -182,7 +183,7 @@ class Lang3DXLModel(RenderingModel):
         return loss
 
     def _semantic_losses(
-        self, codes: Float[Tensor, "h w 3"], batch: dict, mask: Tensor | None
+        self, codes: Float[Tensor, "h w 3"], batch: Batch, mask: Tensor | None
     ) -> dict[str, Tensor]:
         c = self.config
         assert c.dense_weight is not None
@@ -213,7 +214,7 @@ class Lang3DXLModel(RenderingModel):
             clip, dense = self.semantic_field(resize_nearest(codes, size))
         return clip, dense, small_mask
 
-    def _match(self, clip: Float[Tensor, "h w c"], batch: dict, mask: Tensor | None):
+    def _match(self, clip: Float[Tensor, "h w c"], batch: Batch, mask: Tensor | None):
         assert self.downsampler is not None
         return self.downsampler.match(clip, batch["clip_target"], batch["crop_sides"], mask)
 
@@ -226,7 +227,7 @@ class Lang3DXLModel(RenderingModel):
         place = int(torch.randint(DECODE_SIZES, (), generator=generator)) / (DECODE_SIZES - 1)
         return round(smallest + place * (largest - smallest))
 
-    def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
+    def get_metrics_dict(self, outputs: dict, batch: Batch) -> dict[str, Tensor]:
         """Numbers for the log: PSNR of the step's photo and the number of Gaussians."""
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         metrics = {
@@ -241,8 +242,8 @@ class Lang3DXLModel(RenderingModel):
         return metrics
 
     @torch.no_grad()
-    def get_image_metrics_and_images(
-        self, outputs: dict, batch: dict
+    def get_image_metrics_and_images(  # type: ignore[override]
+        self, outputs: dict, batch: Batch
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Held-out photo: PSNR (`cc_psnr`: with matched colors), SSIM, and LPIPS if its weights are
         available."""
@@ -266,7 +267,7 @@ class Lang3DXLModel(RenderingModel):
         return metrics if perceptual is None else metrics | {"lpips": perceptual}
 
     @torch.no_grad()
-    def feature_metrics(self, camera: Cameras, batch: dict) -> dict[str, float]:
+    def feature_metrics(self, camera: Cameras, batch: Batch) -> dict[str, float]:
         """Agreement with a photo's targets, beside that of the mean training feature."""
         if self.carried is None or "clip_target" not in batch:
             return {}

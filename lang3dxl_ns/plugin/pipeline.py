@@ -31,6 +31,7 @@ from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.evaluated_photo import EvaluatedPhoto
 from lang3dxl_ns.plugin.half_image import PROTOCOL, half_image
+from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.label_limit import label_limit
 from lang3dxl_ns.plugin.lift_features import learn_from_photos
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED, describe_scene, scene_of_model
@@ -73,7 +74,7 @@ class Lang3DXLPipelineConfig(VanillaPipelineConfig):
     LANG3DXL_QUERY overrides it."""
 
 
-Score = Callable[[Cameras, "EvaluatedPhoto", dict, Photo], None]
+Score = Callable[[Cameras, "EvaluatedPhoto", Batch, Photo], None]
 """Adds word scores to an evaluated photo."""
 
 
@@ -197,7 +198,7 @@ class Lang3DXLPipeline(VanillaPipeline):
 
         return label_limit(self.model, labels(), truth.categories)
 
-    def _evaluate_photo(self, camera, batch: dict, photo: Photo, score: Score | None) -> EvaluatedPhoto:
+    def _evaluate_photo(self, camera, batch: Batch, photo: Photo, score: Score | None) -> EvaluatedPhoto:
         start = perf_counter()
         self.model.set_crop(None)
         outputs = self.model.get_outputs(camera)
@@ -217,7 +218,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         limit: Callable[[Cameras], Maps],
         camera: Cameras,
         evaluated: EvaluatedPhoto,
-        batch: dict,
+        batch: Batch,
         photo: Photo,
     ) -> None:
         size = scorer.truth.scoring_size(photo.height, photo.width)

@@ -17,6 +17,7 @@ from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.plugin.answering import AnsweringModel
 from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.rendering import Gaussians, Rendering, rasterize, spherical_harmonics
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
@@ -34,6 +35,11 @@ class RenderingModel(AnsweringModel):
     """Photo whose look views are rendered with; None: the appearance's rule for unseen views."""
     fitted_look: Float[Tensor, " v"] | None = None
     """Vector to render with instead, during the half-image protocol."""
+
+    @property
+    def facts(self) -> SceneFacts:
+        """What the data manager knows of the scene."""
+        return SceneFacts.of(self.kwargs["metadata"])
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
         """Render a camera: `rgb`, `accumulation`, `background`; in training `codes` [H, W, d] if the
@@ -192,7 +198,7 @@ class RenderingModel(AnsweringModel):
         assert self.appearance is not None
         position, direction = pose[:, 3].detach(), -pose[:, 2].detach()
         if self.training and camera.metadata and "cam_idx" in camera.metadata:
-            name = self.kwargs["metadata"]["photos"][camera.metadata["cam_idx"]].name
+            name = self.facts.names[camera.metadata["cam_idx"]]
             self.appearance.remember(name, position, direction)
             return self.appearance.vector(name)
         if self.fitted_look is not None:

@@ -62,13 +62,13 @@ def test_off_builds_no_parameters(train, scene):
 def test_scene_needs_decide_what_is_auto(train, scene, monkeypatch):
     model = train(scene, iterations=1, semantics=False).pipeline.model
     for use, needs, expected in (
-        ("auto", None, True),
+        ("auto", {}, True),
         ("auto", {"appearance": False}, False),
         ("auto", {"appearance": True}, True),
         ("on", {"appearance": False}, True),
         ("off", {"appearance": True}, False),
     ):
-        model.kwargs["metadata"]["needs"] = needs
+        model.facts.needs = needs
         assert model._wants("appearance", use) is expected
 
 

@@ -1,0 +1,60 @@
+"""What the data manager hands to the model: facts of the scene before training, a photo in every step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypedDict
+
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lang3dxl_ns.preparation.targets import FeatureStatistics
+
+_KEY = "lang3dxl"
+
+
+class _Photo(TypedDict):
+    image: Float[Tensor, "h w 3"] | Int[Tensor, "h w 3"]
+    """Colors 0…1, or 0…255 as integers."""
+    image_idx: int
+    """In its dataset."""
+    name: str
+
+
+class Batch(_Photo, total=False):
+    """A photo and its targets, on the model's device; what a scene doesn't have is absent."""
+
+    mask: Bool[Tensor, "h w 1"]
+    """The foreground."""
+    clip_target: Float[Tensor, "hd wd c"]
+    """As `preparation.targets.StoredClipTarget.features`."""
+    crop_sides: list[float]
+    """Of the crops in the CLIP target, ascending, as fractions of the photo's width."""
+    dense_target: Float[Tensor, "t t d"]
+    """Dense features of the photo squashed to a square."""
+    regions: Int[Tensor, "hr wr"]
+    """Region labels, −1 for none."""
+
+
+@dataclass
+class SceneFacts:
+    """What a model is built from, beside its settings and the scene's points."""
+
+    names: list[str] = field(default_factory=list)
+    """Training photos, in the order of their cameras."""
+    needs: Mapping[str, bool] = field(default_factory=dict)
+    """Whether the scene needs an optional component; empty if that wasn't measured."""
+    statistics: FeatureStatistics | None = None
+    """Of the targets; None for a model without semantics, or one that is loaded."""
+    clip_targets: Callable[[], Iterator[Float[Tensor, "hd wd c"]]] | None = None
+    """The CLIP targets of the training photos, one at a time."""
+
+    def into(self, metadata: dict[str, Any]) -> None:
+        """Put them where nerfstudio carries them from dataset to model."""
+        metadata[_KEY] = self
+
+    @staticmethod
+    def of(metadata: Mapping[str, Any]) -> SceneFacts:
+        """The facts put there, or none."""
+        return metadata.get(_KEY) or SceneFacts()
