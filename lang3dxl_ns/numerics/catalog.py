@@ -13,6 +13,7 @@ from lang3dxl_ns.numerics import (
     hash_grid,
     losses,
     physical_scale,
+    principal_basis,
     rasterizer,
     relevancy,
 )
@@ -27,6 +28,7 @@ GROUPS = (
     losses,
     physical_scale,
     relevancy,
+    principal_basis,
     gathering,
     compression,
 )
