@@ -22,7 +22,7 @@ from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 SMALLEST_CROP = 32
 """Pixels: smaller crops show an image encoder nothing."""
 FINE_SHARE = 0.7
-"""Side of fine crops relative to the smallest of the pyramid; chosen on three landmarks (docs/queries.md)."""
+"""Side of the finest crops relative to the pyramid's smallest; chosen by measurement (docs/queries.md)."""
 EDGE_MARGIN = 0.1
 """Share of a side: observations nearer to the photo's edge are ignored by the "mean-inner" distance."""
 
@@ -125,10 +125,10 @@ def crop_sides(scales: Sequence[float], pixel_size: float, width: int) -> tuple[
 
 
 def fine_crops(side: int, size: float) -> tuple[list[int], list[float]]:
-    """Side in pixels and size in world units of fine crops, for the smallest ones of a photo's pyramid; lists
-    of one, as from `crop_sides`."""
+    """Sides in pixels and sizes in world units of fine crops, as from `crop_sides`: the smallest of a photo's
+    pyramid, and smaller ones."""
     fine = max(round(FINE_SHARE * side), 2)
-    return [fine], [size * fine / side]
+    return [fine, side], [size * fine / side, size]
 
 
 def propose_scale_range(reconstruction: Reconstruction, pixel_sizes: dict[str, float]) -> ScaleRange:

@@ -71,7 +71,7 @@ class _Task:
     regions: dict[str, Any] | None
     has_regions: bool
     is_fine: bool = False
-    """Whether the crops are of one size, smaller than the pyramid's, on a finer grid."""
+    """Whether the crops are small ones alone, on a finer grid."""
 
     @property
     def clip_kind(self) -> str:
@@ -108,8 +108,8 @@ def prepare(
 
     pixel_sizes: world units per pixel *of the photo as it is read* (its `width`), by photo name; None for
     relative scales. scales: crop sides in world units, or in photo widths without pixel sizes.
-    regions: where label maps come from; None for none. fine: photos that get crops of one size alone,
-    smaller than the pyramid's smallest, a third of their side apart.
+    regions: where label maps come from; None for none. fine: photos that get small crops alone
+    (`fine_crops`), the smallest a third of their side apart.
 
     Photos that can't be read are left out with a warning. Raises UserError when none can be read, a model
     can't be loaded, or the disk is too small.

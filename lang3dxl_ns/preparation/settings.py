@@ -46,8 +46,8 @@ class PreparationConfig:
     if crops have no size in the world."""
     crops: Literal["auto", "pyramid", "fine"] = "auto"
     """What training photos are read at. pyramid: crops of all sizes, half a side apart, averaged (Lang3D-XL's
-    targets). fine: one size, 0.7 of the smallest, a third of its side apart: twice as many in all. auto: fine
-    where features are gathered onto Gaussians, which sharpens nothing; pyramid where they are trained
+    targets). fine: the smallest, and 0.7 of them a third of a side apart: three times as many in all. auto:
+    fine where features are gathered onto Gaussians, which sharpens nothing; pyramid where they are trained
     through the downsampler, which does. Held-out photos have the pyramid, as the 2-D teacher that is
     scored."""
     pixel_distance: DistanceRule = "median"

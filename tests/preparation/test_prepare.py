@@ -96,15 +96,15 @@ def entries(store):
     return {path.name: path.stat().st_mtime_ns for path in store.root.glob("*/*")}
 
 
-def test_fine_crops_are_of_one_size_below_the_pyramids_and_on_a_finer_grid(photos, config, store, models):
+def test_fine_crops_are_the_smallest_and_smaller_ones_on_a_finer_grid(photos, config, store, models):
     pyramid = run(photos, config, store).reader.clip("north/b.png")
     reader = prepare(photos, None, config, SCALES, store, "cpu", fine=["north/b.png"]).reader
     clip = load_image_text_encoder(models["clip"], "cpu")
-    crops = [28], [0.28]  # 0.7 of 40 pixels, and of 0.4 photo widths
+    crops = [28, 40], [0.28, 0.4]  # 0.7 of 40 pixels and of 0.4 photo widths, and these
     expected = build_clip_target(photos[1].read(), *crops, clip.encode_images, clip.crop_size, 64, steps=3)
     found = reader.clip("north/b.png")
     torch.testing.assert_close(found.features, expected.features.half(), atol=2e-3, rtol=2e-3)
-    assert found.crop_fractions == [0.28]
+    assert found.crop_fractions == [0.28, 0.4]
     assert found.features.shape[0] >= 2 * pyramid.features.shape[0]
     assert reader.clip("south/a.png").crop_fractions == [0.4, 0.8]
 
