@@ -56,8 +56,7 @@ class AppearanceConfig:
     """`auto`: on, unless the scene's measured needs show that its photos share one light. Off means absent:
     no parameters, no cost."""
     preset: Literal["auto", "short", "paper"] = "auto"
-    """Hash grid over positions: `short` is coarse, for runs on a CPU; `paper` as published; `auto`: chosen by
-    the length of the run."""
+    """Hash grid over positions: `short` is coarse; `paper` as published; `auto`: short."""
     vector_dim: int = 24
     """Size of a photo's vector."""
     unseen: Literal["nearest", "mean"] = "nearest"
