@@ -34,11 +34,11 @@ def _optimizers() -> dict[str, dict]:
     learned = partial(RunScheduleConfig, start=0.1, warm=0.05, end=0.01, power=2.0)
     return {
         "means": {
-            "optimizer": RunAdamConfig(lr=1.6e-4),
+            "optimizer": RunAdamConfig(lr=1.6e-4, short_lr=6.4e-4),
             "scheduler": RunScheduleConfig(shape="log-linear", end=0.01),
         },
         "features_dc": {
-            "optimizer": RunAdamConfig(lr=2.5e-3),
+            "optimizer": RunAdamConfig(lr=2.5e-3, short_lr=7.5e-3),
             "scheduler": RunScheduleConfig(end=0.1, power=2.0),
         },
         "features_rest": {
@@ -46,8 +46,12 @@ def _optimizers() -> dict[str, dict]:
             "scheduler": RunScheduleConfig(end=0.1, power=2.0),
         },
         "opacities": {"optimizer": RunAdamConfig(lr=0.05), "scheduler": None},
-        "scales": {"optimizer": RunAdamConfig(lr=5e-3), "scheduler": None},
-        "quats": {"optimizer": RunAdamConfig(lr=1e-3), "scheduler": None},
+        "scales": {"optimizer": RunAdamConfig(lr=5e-3, short_lr=1.5e-2), "scheduler": None},
+        "quats": {"optimizer": RunAdamConfig(lr=1e-3, short_lr=5e-3), "scheduler": None},
+        "sky": {
+            "optimizer": RunAdamConfig(lr=1e-3, short_lr=5e-3),
+            "scheduler": RunScheduleConfig(end=0.1),
+        },
         "codes": {
             "optimizer": RunAdamConfig(lr=1e-3, short_lr=3e-2),
             "scheduler": RunScheduleConfig(end=0.05),

@@ -30,7 +30,15 @@ differ in exposure and white balance, the error after 300 steps is twice that wi
 FIRST_LOGIT = -4.0
 """Log odds that an untrained opacity shift removes a Gaussian from a training step: about 2 %."""
 GRIDS: dict[str, dict[str, int]] = {
-    # Light changes smoothly over a building: a coarse grid learns it in hundreds of steps, in half the time.
+    # Light changes smoothly over a building, from wall to wall. Finer grids take longer, and learn a photo's
+    # patches instead of its light.
+    "coarse": {
+        "levels": 2,
+        "features_per_level": 4,
+        "log2_table_size": 14,
+        "min_resolution": 6,
+        "max_resolution": 12,
+    },
     "short": {
         "levels": 4,
         "features_per_level": 4,
@@ -55,9 +63,8 @@ class AppearanceConfig:
     use: Literal["auto", "on", "off"] = "auto"
     """`auto`: on, unless the scene's measured needs show that its photos share one light. Off means absent:
     no parameters, no cost."""
-    preset: Literal["auto", "short", "paper"] = "auto"
-    """Hash grid over positions: `short` is coarse, for runs on a CPU; `paper` as published; `auto`: chosen by
-    the length of the run."""
+    preset: Literal["auto", "coarse", "short", "paper"] = "auto"
+    """Hash grid over positions: `coarse`, finer (`short`), or as published (`paper`); `auto`: coarse."""
     vector_dim: int = 24
     """Size of a photo's vector."""
     unseen: Literal["nearest", "mean"] = "nearest"
@@ -92,7 +99,7 @@ class AppearanceField(nn.Module):
     ):
         super().__init__()
         self.config = config
-        grid = GRIDS["short" if config.preset == "auto" else config.preset]
+        grid = GRIDS["coarse" if config.preset == "auto" else config.preset]
         self.grid = HashGrid(3, **grid, generator=generator)
         inputs = self.grid.output_dim + 3 + config.vector_dim
         # The first layer is split in two: the photo's part is the same for all Gaussians, and computed once.

@@ -22,6 +22,8 @@ class Densification(DefaultStrategy):
     """Screen-space gradient (image = [−1, 1]) above which Gaussians grow."""
     most: int = 0
     """Number of Gaussians not to exceed; 0: no limit."""
+    still: int = 0
+    """The first Gaussians, the sky's, which neither grow nor go."""
     loss_scale: float = 1.0
     """Factor in the latest step's gradients, under mixed precision."""
 
@@ -39,6 +41,7 @@ class Densification(DefaultStrategy):
             if state[name] is None:
                 state[name] = torch.zeros(norms.shape[1], device=norms.device)
         state["grad2d"] += torch.where(seen, norms, 0.0).sum(0)
+        state["grad2d"][: self.still] = 0.0
         state["count"] += seen.sum(0)
 
     def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:
@@ -55,10 +58,12 @@ class Densification(DefaultStrategy):
     def _prune_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> int:
         """Beyond the cap the least opaque go."""
         pruned = super()._prune_gs(params, optimizers, state, step)
-        excess = len(params["means"]) - self.most
+        excess = len(params["means"]) - max(self.most, self.still)
         if not self.most or excess <= 0:
             return pruned
-        least = params["opacities"].detach().flatten().topk(excess, largest=False).indices
+        opacities = params["opacities"].detach().flatten().clone()
+        opacities[: self.still] = float("inf")
+        least = opacities.topk(excess, largest=False).indices
         gone = torch.zeros(len(params["means"]), dtype=torch.bool, device=least.device)
         remove(params=params, optimizers=optimizers, state=state, mask=gone.index_fill_(0, least, True))
         return pruned + excess

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.sky import OPACITY
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.scene.geometry import sphere_around
 
@@ -39,22 +40,28 @@ def seed_positions(
 def initial_gaussians(
     config: Lang3DXLModelConfig, means: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]
 ) -> dict[str, Parameter]:
-    """A Gaussian per position (at least `FEWEST`), as wide as the mean distance to its three nearest
-    neighbors, and the sky."""
-    if config.sky_gaussians:
-        sky = sphere_around(means, config.sky_gaussians)
-        means = torch.cat([means, sky])
-        colors = torch.cat([colors, torch.full_like(sky, 0.5)])
+    """The sky's Gaussians, and one per position (at least `FEWEST`), as wide as the mean distance to its
+    three nearest neighbors."""
+    sky = sphere_around(means, config.sky_gaussians)
+    means = torch.cat([sky, means])
+    colors = torch.cat([torch.full_like(sky, 0.5), colors])
     n = len(means)
+    opacities = torch.full((n, 1), 0.1)
+    opacities[: len(sky)] = OPACITY
     return {
         "means": Parameter(means),
         "scales": Parameter(_spacing(means).log().repeat(1, 3)),
         # Uniform over rotations; with its own generator, so that preparation does not affect it.
         "quats": Parameter(F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)),
-        "features_dc": Parameter(RGB2SH(colors) if config.sh_degree > 0 else torch.logit(colors, eps=1e-4)),
+        "features_dc": Parameter(color_parameters(config, colors)),
         "features_rest": Parameter(torch.zeros(n, num_sh_bases(config.sh_degree) - 1, 3)),
-        "opacities": Parameter(torch.logit(0.1 * torch.ones(n, 1))),
+        "opacities": Parameter(torch.logit(opacities)),
     }
+
+
+def color_parameters(config: Lang3DXLModelConfig, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Colors (0…1) as the model stores them: harmonics of degree 0, or logits where these are all."""
+    return RGB2SH(colors) if config.sh_degree > 0 else torch.logit(colors, eps=1e-4)
 
 
 def _spacing(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:

@@ -26,10 +26,11 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
+from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
 from lang3dxl_ns.plugin.handover import Batch
-from lang3dxl_ns.plugin.initialization import initial_gaussians, seed_positions
+from lang3dxl_ns.plugin.initialization import color_parameters, initial_gaussians, seed_positions
 from lang3dxl_ns.plugin.model_config import make_strategy
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.preparation.targets import FeatureStatistics
@@ -54,6 +55,8 @@ class Lang3DXLModel(RenderingModel):
         means, colors = seed_positions(self.config, self.seed_points)
         self.extent = center_and_radius(means)
         self.gauss_params = nn.ParameterDict(initial_gaussians(self.config, means, colors))
+        sky = self.gauss_params["means"].detach()[: self.config.sky_gaussians]
+        self.sky = Sky(sky - self.extent[0]) if len(sky) else None
         self._make_camera_optimizer(self._wants("camera optimizer", self.config.camera_optimization, False))
         self.semantic_field = self.downsampler = None
         statistics = self.facts.statistics
@@ -73,6 +76,7 @@ class Lang3DXLModel(RenderingModel):
             "black" if self.config.background_color == "random" else self.config.background_color
         )
         self.strategy = make_strategy(self.config)
+        self.strategy.still = len(sky)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def _add_semantics(
@@ -129,13 +133,17 @@ class Lang3DXLModel(RenderingModel):
 
     def step_post_backward(self, step: int) -> None:
         """After an iteration: densify and prune (except at step 0, where the strategy would reset opacities,
-        and after a skipped step)."""
+        and after a skipped step); write the sky's colors."""
         if step > 0 and self.step_is_sound:
             before = self.num_points
             with self._gathered_codes_follow():
                 super().step_post_backward(step)
             if self.num_points != before:
                 CONSOLE.log(f"Step {step}: {before} → {self.num_points} Gaussians")
+        if self.sky is not None:
+            with torch.no_grad():
+                colors = color_parameters(self.config, self.sky.colors)
+                self.gauss_params["features_dc"][: len(self.sky)] = colors
 
     @contextmanager
     def _gathered_codes_follow(self) -> Iterator[None]:
@@ -161,6 +169,8 @@ class Lang3DXLModel(RenderingModel):
             groups |= self.semantic_field.parameter_groups()
             if self.learns_from_renderings:
                 groups["downsampler"] = list(self.downsampler.parameters())
+        if self.sky is not None:
+            groups["sky"] = [self.sky.harmonics]
         if self.appearance is not None:
             groups["appearance_vectors"] = [self.appearance.vectors]
             groups["appearance"] = self.appearance.network_parameters()
@@ -312,6 +322,10 @@ class Lang3DXLModel(RenderingModel):
         """
         self._match_semantics(state)
         self._match_appearance(state)
+        sky = state.get("sky.directions")  # absent from checkpoints of earlier versions
+        if sky is None or self.sky is None or len(sky) != len(self.sky):
+            self.sky = None if sky is None else Sky(torch.zeros_like(sky)).to(self.device)
+            self.strategy.still = 0 if sky is None else len(sky)
         self.config.sh_degree = isqrt(state["gauss_params.features_rest"].shape[1] + 1) - 1
         if "camera_optimizer.pose_adjustment" in state and self.config.camera_optimizer.mode == "off":
             self._make_camera_optimizer(wanted=True)

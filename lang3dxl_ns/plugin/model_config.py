@@ -8,13 +8,15 @@ from typing import Literal
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
 from lang3dxl_ns.baselines.encoders import EncoderConfig
+from lang3dxl_ns.components import schedules
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.plugin.densification import Densification
+from lang3dxl_ns.plugin.optimizers import run_length_weight
 
 SHORT_FIELD_RUN = 5_000
-"""Runs with fewer iterations use the field's `short` preset."""
+"""Runs with fewer iterations use the field's `short` preset, if they train it with the scene."""
 
 
 @dataclass
@@ -33,12 +35,12 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     clip_weight: float = 1.0
     """Weight of the CLIP loss (mean absolute difference)."""
     dense_weight: float | None = None
-    """Weight of the dense (DINO) loss. None: 2 in short runs, 0.5 in long ones."""
+    """Weight of the dense (DINO) loss. None: 2 in short runs, falling to 0.5 in long ones."""
     region_weight: float = 5e-4
     """Weight of the feature variance inside regions, if the scene has regions."""
     decode_size: tuple[int, int] | None = None
     """The code map is decoded at one of five sizes in this range: pixels of its longer side, inclusive.
-    None: 56 to 72 in short runs, 80 to 120 (the paper's) in long ones."""
+    None: 56 to 72 in short runs, growing to 80 to 120 (the paper's) in long ones."""
     warm_up: float = 0.0
     """Fraction of the run that trains colors only, before the semantic losses start."""
     feature_gradient_to_geometry: bool = False
@@ -57,7 +59,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     machine's) memory holds; 0: no limit."""
     sky_gaussians: int = 2_000
     """Gaussians on a sphere around the scene for the sky and the far distance, where a COLMAP
-    model has no points; 0 for none."""
+    model has no points; their colors are one smooth function of the direction. 0 for none."""
     total_steps: int = 30_000
     """Iterations of the run, for the fractions below; set by the trainer."""
     densify_from: float = 1 / 15
@@ -77,25 +79,27 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     use_absgrad: bool = False
     """Densify by the norm of the mean gradient, as in the paper."""
     densify_grad_thresh: float | None = None  # type: ignore[assignment]
-    """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-4 (the
-    paper's) in long runs; 2e-3 in short ones, which densify while gradients are still large."""
+    """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-3 in
+    short runs, which densify while gradients are still large, falling to 2e-4 (the paper's) in long ones."""
 
     def fit_to_run(self, iterations: int) -> None:
-        """Resolve settings that depend on the length of the run."""
-        short = iterations < SHORT_FIELD_RUN
+        """Resolve settings that depend on the length of the run: between short and long ones
+        (`optimizers.run_length_weight`) numbers change gradually."""
+        x = run_length_weight(iterations)
         self.total_steps = iterations
         if self.semantic_field.preset == "auto":
             # Compression is a direct regression of a thousand steps, whatever the run's length.
-            self.semantic_field.preset = "short" if short or self.encoder.name == "lang3dxl" else "default"
+            compressed = self.encoder.name == "lang3dxl"
+            self.semantic_field.preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "default"
         self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
         if self.appearance.preset == "auto":
-            self.appearance.preset = "short" if short else "paper"
+            self.appearance.preset = "coarse"
         if self.densify_grad_thresh is None:
-            self.densify_grad_thresh = 2e-3 if short else 2e-4
+            self.densify_grad_thresh = schedules.log_linear(x, 2e-3, 2e-4)
         if self.dense_weight is None:
-            self.dense_weight = 2.0 if short else 0.5
+            self.dense_weight = schedules.log_linear(x, 2.0, 0.5)
         if self.decode_size is None:
-            self.decode_size = (56, 72) if short else (80, 120)
+            self.decode_size = (round(56 + 24 * x), round(72 + 48 * x))
 
 
 def make_strategy(config: Lang3DXLModelConfig) -> Densification:

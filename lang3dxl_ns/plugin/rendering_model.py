@@ -15,6 +15,7 @@ from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.answering import AnsweringModel
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.handover import SceneFacts
@@ -31,6 +32,8 @@ class RenderingModel(AnsweringModel):
     config: Lang3DXLModelConfig
     semantic_field: SemanticEncoder | None
     appearance: AppearanceField | None
+    sky: Sky | None
+    """Of the first Gaussians; None: there is no sky, or it was trained like all Gaussians."""
     look: str | None
     """Photo whose look views are rendered with; None: the appearance's rule for unseen views."""
     fitted_look: Float[Tensor, " v"] | None = None
@@ -161,7 +164,10 @@ class RenderingModel(AnsweringModel):
         view, pose = self._view(camera)
         background = self._get_background_color()
         gaussians = self._activated(g)
-        colors, in_photo = self._colors(g, pose[:, 3]), gaussians
+        colors = self._colors(g, pose[:, 3])
+        if self.sky is not None and self.training:
+            gaussians, colors = self.sky(gaussians, colors)
+        in_photo = gaussians
         if self.appearance is not None:
             vector = self._light(camera, pose)
             near = view.detach().to(self.device)
