@@ -299,24 +299,24 @@ def test_numerics():
 
 
 def bug_tensor_on_the_cpu(model):
-    colors = model._colors
-    model._colors = lambda g, center: colors(g, center) * torch.ones(3)
+    colors = model.colors_from
+    model.colors_from = lambda g, center: colors(g, center) * torch.ones(3)
 
 
 def bug_index_of_a_cpu_tensor(model):
     means = torch.zeros(model.num_points, 3)
-    model._colors = lambda g, center: means[(g["means"][:, 0] > 0).nonzero()[:, 0]]
+    model.colors_from = lambda g, center: means[(g["means"][:, 0] > 0).nonzero()[:, 0]]
 
 
 def bug_numpy(model):
-    colors = model._colors
-    model._colors = lambda g, center: torch.as_tensor(colors(g, center).detach().numpy())
+    colors = model.colors_from
+    model.colors_from = lambda g, center: torch.as_tensor(colors(g, center).detach().numpy())
 
 
 def bug_cpu_generator(model):
-    generator, colors = torch.Generator(), model._colors
+    generator, colors = torch.Generator(), model.colors_from
     noise = lambda: torch.rand(model.num_points, 3, generator=generator, device=model.device)  # noqa: E731
-    model._colors = lambda g, center: colors(g, center) + noise()
+    model.colors_from = lambda g, center: colors(g, center) + noise()
 
 
 @pytest.mark.parametrize(
@@ -330,14 +330,14 @@ def bug_cpu_generator(model):
 )
 def test_planted_bugs_are_found(default, monkeypatch, plant, error):
     model = default.pipeline.model
-    monkeypatch.setattr(model, "_colors", model._colors)  # so that it is restored
+    monkeypatch.setattr(model, "colors_from", model.colors_from)  # so that it is restored
     plant(model)
     with fake_gpu(), pytest.raises((RuntimeError, TypeError), match=error):
         model.get_outputs_for_camera(default.pipeline.datamanager.train_dataset.cameras[0:1])
 
 
 def test_a_planted_wait_is_counted(default, monkeypatch):
-    model, colors = default.pipeline.model.eval(), default.pipeline.model._colors
+    model, colors = default.pipeline.model.eval(), default.pipeline.model.colors_from
     camera = default.pipeline.datamanager.train_dataset.cameras[0:1]
 
     def impatient(g, center):
@@ -346,7 +346,7 @@ def test_a_planted_wait_is_counted(default, monkeypatch):
 
     found = []
     for planted in (colors, impatient):
-        monkeypatch.setattr(model, "_colors", planted)
+        monkeypatch.setattr(model, "colors_from", planted)
         with fake_gpu() as gpu, gpu.counting() as waits:
             model.get_outputs_for_camera(camera)
         found.append(own(waits))

@@ -93,7 +93,7 @@ def fit_look(
         for _ in range(steps):
             lit, shown = field(gaussians, colors, vector, everything)
             image = rasterize(
-                shown, view, lit, background, antialiased=antialiased, backend=model._backend
+                shown, view, lit, background, antialiased=antialiased, backend=model.backend
             ).image
             loss = rgb_loss(image.clamp(0.0, 1.0), left, mask, model.config.ssim_lambda)
             # Of the vector alone: the model's parameters get no gradient.
@@ -108,9 +108,9 @@ def _in_view(
     model: Lang3DXLModel, view: Camera, position: Float[Tensor, "3"]
 ) -> tuple[Gaussians, Float[Tensor, "m 3"]]:
     """The Gaussians that a view may show, and their colors before any look."""
-    gaussians = model._activated(model.gauss_params).detach()
+    gaussians = model.activated(model.gauss_params).detach()
     seen = in_view(view.to(model.device), gaussians.means, gaussians.scales)
-    colors = model._colors(model.gauss_params, position)[seen]
+    colors = model.colors_from(model.gauss_params, position)[seen]
     return Gaussians(*(values[seen] for values in vars(gaussians).values())), colors
 
 

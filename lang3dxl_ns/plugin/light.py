@@ -23,7 +23,7 @@ def in_light(
     gaussians = Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1)).detach()
     pose = camera.view_matrix.to(model.device)
     position, forward = -pose[:3, :3].T @ pose[:3, 3], pose[2, :3]
-    colors = model._colors(g, position)
+    colors = model.colors_from(g, position)
     if model.appearance is None:
         return gaussians, colors
     field = model.appearance

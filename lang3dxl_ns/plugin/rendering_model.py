@@ -123,12 +123,12 @@ class RenderingModel(AnsweringModel):
     def composite(self, camera: Cameras, features: Float[Tensor, "n d"]) -> Float[Tensor, "H W d"]:
         """Values of Gaussians composited over black in a camera; differentiable in the features alone."""
         view, _ = self._view(camera)
-        gaussians = self._activated(self.gauss_params).detach()
-        antialiased, backend = self.config.rasterize_mode == "antialiased", self._backend
+        gaussians = self.activated(self.gauss_params).detach()
+        antialiased, backend = self.config.rasterize_mode == "antialiased", self.backend
         return rasterize(gaussians, view.detach(), features, antialiased=antialiased, backend=backend).image
 
     @property
-    def _backend(self) -> Backend:
+    def backend(self) -> Backend:
         """The rasterizer asked for, which only a GPU has a choice of."""
         return self.config.rasterizer if self.means.is_cuda else "auto"
 
@@ -151,7 +151,8 @@ class RenderingModel(AnsweringModel):
         self.last_size = (view.height, view.width)
         return view, to_device(pose, self.device)
 
-    def _activated(self, g: Mapping[str, Tensor]) -> Gaussians:
+    def activated(self, g: Mapping[str, Tensor]) -> Gaussians:
+        """Gaussians of the parameters `g`, which store log scales and logits of opacity."""
         scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
         return Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1))
 
@@ -163,8 +164,8 @@ class RenderingModel(AnsweringModel):
             features = features[keep]
         view, pose = self._view(camera)
         background = self._get_background_color()
-        gaussians = self._activated(g)
-        colors = self._colors(g, pose[:, 3])
+        gaussians = self.activated(g)
+        colors = self.colors_from(g, pose[:, 3])
         if self.sky is not None and self.training:
             gaussians, colors = self.sky(gaussians, colors)
         in_photo = gaussians
@@ -176,7 +177,7 @@ class RenderingModel(AnsweringModel):
             with part("appearance"):
                 colors, in_photo = self.appearance(gaussians, colors, vector, visible, seed)
         settings: dict[str, Any] = {
-            "backend": self._backend,
+            "backend": self.backend,
             "antialiased": self.config.rasterize_mode == "antialiased",
             "absgrad": self.strategy.absgrad and self.training,
         }
@@ -213,7 +214,7 @@ class RenderingModel(AnsweringModel):
             return self.appearance.vector(self.look)
         return self.appearance.vector_of_view(position, direction)
 
-    def _colors(self, g: Mapping[str, Tensor], camera_center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
+    def colors_from(self, g: Mapping[str, Tensor], camera_center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
         """Colors seen from a point. The degree of the harmonics rises by one every 1,000 iterations, or
         every tenth of a run of under 10,000. At degree 0 colors are logits, as in splatfacto."""
         if self.config.sh_degree == 0:

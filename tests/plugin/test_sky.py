@@ -72,7 +72,7 @@ def test_trained_it_is_gaussians_like_any_others(train, scene):
         model = trained(train, scene, pipeline__model__view_dependence=view_dependence).eval()
         model.step = 10_000
         dc, sky = model.gauss_params["features_dc"][:COUNT], model.sky.colors
-        shown = model._colors(model.gauss_params, torch.zeros(3))[:COUNT]
+        shown = model.colors_from(model.gauss_params, torch.zeros(3))[:COUNT]
         torch.testing.assert_close(shown, sky.clamp(1e-4, 1 - 1e-4), atol=1e-4, rtol=0)
         assert dc.std() > 0
 
