@@ -31,6 +31,7 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
     cell = "a rounded place may lie in the next cell of the grid"
     catalog: dict[str, tuple[Callable[[], Problem], str]] = {
         "usual": (_problem, ""),
+        "finer grid": (partial(_problem, preset="short"), cell),
         "as published (fine grid)": (partial(_problem, preset="paper"), cell),
         "opacity shift": (partial(_problem, shift=True), ""),
         "opacity shift, logits of 1e4": (partial(_problem, shift=True, loudness=1e5), ""),
@@ -55,7 +56,7 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
 
 
 def _problem(
-    preset: str = "short",
+    preset: str = "coarse",
     shift: bool = False,
     loudness: float = 1.0,
     vector: float | None = None,

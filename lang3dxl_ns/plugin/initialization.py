@@ -10,10 +10,10 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.sky import OPACITY
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.scene.geometry import sphere_around
 
+FIRST_OPACITY = 0.1
 FEWEST = 4
 """Fewest positions, so that each has three neighbors."""
 
@@ -38,7 +38,10 @@ def seed_positions(
 
 
 def initial_gaussians(
-    config: Lang3DXLModelConfig, means: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]
+    config: Lang3DXLModelConfig,
+    means: Float[Tensor, "n 3"],
+    colors: Float[Tensor, "n 3"],
+    sky_opacity: float = FIRST_OPACITY,
 ) -> dict[str, Parameter]:
     """The sky's Gaussians, and one per position (at least `FEWEST`), as wide as the mean distance to its
     three nearest neighbors."""
@@ -46,8 +49,8 @@ def initial_gaussians(
     means = torch.cat([sky, means])
     colors = torch.cat([torch.full_like(sky, 0.5), colors])
     n = len(means)
-    opacities = torch.full((n, 1), 0.1)
-    opacities[: len(sky)] = OPACITY
+    opacities = torch.full((n, 1), FIRST_OPACITY)
+    opacities[: len(sky)] = sky_opacity
     return {
         "means": Parameter(means),
         "scales": Parameter(_spacing(means).log().repeat(1, 3)),

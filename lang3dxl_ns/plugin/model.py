@@ -26,11 +26,16 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
-from lang3dxl_ns.components.sky import Sky
+from lang3dxl_ns.components.sky import OPACITY, Sky
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
 from lang3dxl_ns.plugin.handover import Batch
-from lang3dxl_ns.plugin.initialization import color_parameters, initial_gaussians, seed_positions
+from lang3dxl_ns.plugin.initialization import (
+    FIRST_OPACITY,
+    color_parameters,
+    initial_gaussians,
+    seed_positions,
+)
 from lang3dxl_ns.plugin.model_config import make_strategy
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.preparation.targets import FeatureStatistics
@@ -54,9 +59,12 @@ class Lang3DXLModel(RenderingModel):
             self.config.sh_degree = 0
         means, colors = seed_positions(self.config, self.seed_points)
         self.extent = center_and_radius(means)
-        self.gauss_params = nn.ParameterDict(initial_gaussians(self.config, means, colors))
-        sky = self.gauss_params["means"].detach()[: self.config.sky_gaussians]
-        self.sky = Sky(sky - self.extent[0]) if len(sky) else None
+        looks = self._wants("appearance", self.config.appearance.use)
+        # Where photos differ in light a smooth sky costs words (docs/training.md).
+        smooth = self.config.sky_gaussians if not looks else 0
+        first = initial_gaussians(self.config, means, colors, OPACITY if smooth else FIRST_OPACITY)
+        self.gauss_params = nn.ParameterDict(first)
+        self.sky = Sky(first["means"].detach()[:smooth] - self.extent[0]) if smooth else None
         self._make_camera_optimizer(self._wants("camera optimizer", self.config.camera_optimization, False))
         self.semantic_field = self.downsampler = None
         statistics = self.facts.statistics
@@ -65,7 +73,7 @@ class Lang3DXLModel(RenderingModel):
             self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean, statistics)
         self.look = None
         self.appearance = None
-        if self._wants("appearance", self.config.appearance.use):
+        if looks:
             self.appearance = self._make_appearance()
         self.step = 0
         self.step_is_sound = True
@@ -76,7 +84,7 @@ class Lang3DXLModel(RenderingModel):
             "black" if self.config.background_color == "random" else self.config.background_color
         )
         self.strategy = make_strategy(self.config)
-        self.strategy.still = len(sky)
+        self.strategy.still = smooth
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
 
     def _add_semantics(

@@ -59,7 +59,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     machine's) memory holds; 0: no limit."""
     sky_gaussians: int = 2_000
     """Gaussians on a sphere around the scene for the sky and the far distance, where a COLMAP
-    model has no points; their colors are one smooth function of the direction. 0 for none."""
+    model has no points; 0 for none. If photos share one light, their colors are one smooth function."""
     total_steps: int = 30_000
     """Iterations of the run, for the fractions below; set by the trainer."""
     densify_from: float = 1 / 15

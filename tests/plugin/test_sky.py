@@ -1,5 +1,6 @@
 """The sky: what trains it, and what it is outside training."""
 
+import pytest
 import torch
 
 from lang3dxl_ns.components.sky import OPACITY, Sky
@@ -51,7 +52,8 @@ def test_one_smooth_function_reaches_directions_that_no_photo_shows():
 
 
 def trained(train, scene, **changes) -> Lang3DXLModel:
-    changes = {"pipeline__model__sky_gaussians": COUNT, **changes}
+    one_light = {"pipeline__model__appearance__use": "off"}
+    changes = {"pipeline__model__sky_gaussians": COUNT, **one_light, **changes}
     return train(scene, iterations=20, semantics=False, **changes).pipeline.model
 
 
@@ -77,9 +79,12 @@ def test_trained_it_is_gaussians_like_any_others(train, scene):
         assert dc.std() > 0
 
 
-def test_without_a_sky_there_is_nothing_of_it(train, scene):
-    model = trained(train, scene, pipeline__model__sky_gaussians=0)
-    assert model.sky is None and "sky" not in model.get_param_groups()
+@pytest.mark.parametrize(
+    "changes", [{"pipeline__model__sky_gaussians": 0}, {"pipeline__model__appearance__use": "on"}]
+)
+def test_without_a_sky_and_with_looks_there_is_nothing_of_it(train, scene, changes):
+    model = trained(train, scene, **changes)
+    assert model.sky is None and "sky" not in model.get_param_groups() and model.strategy.still == 0
     assert not [name for name in model.state_dict() if name.startswith("sky")]
 
 
