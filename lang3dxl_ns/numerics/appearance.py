@@ -23,7 +23,9 @@ from lang3dxl_ns.rendering import Gaussians
 
 COUNT = 200
 BOUNDS = {"float32": Bounds(2e-5, 5e-6, 1e-3, 1e-4), "float64": EXACT}
-HALF = {"bf16": Bounds(3e-2, 1e-2, 0.5, 0.2), "fp16": Bounds(4e-3, 2e-3, 5e-2, 1e-2)}
+HALF = {"bf16": Bounds(3e-2, 1e-2, 0.5, 0.2), "fp16": Bounds(1e-3, 5e-4, 0.1, 0.04)}
+"""A ReLU that rounding opens or closes changes a whole row's gradient: over 16 draws of the numbers, half of
+them with the grid before this one, fp16 has 1e-3 to .08, RMS .001 to .036."""
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:

@@ -56,7 +56,7 @@ def test_off_builds_no_parameters(train, scene):
     model = trainer.pipeline.model
     assert model.appearance is None
     assert not [name for name in model.state_dict() if "appearance" in name]
-    assert set(trainer.optimizers.optimizers) == set(model.gauss_params)
+    assert set(trainer.optimizers.optimizers) == {*model.gauss_params, "sky"}
 
 
 def test_scene_needs_decide_what_is_auto(train, scene, monkeypatch):
@@ -73,9 +73,10 @@ def test_scene_needs_decide_what_is_auto(train, scene, monkeypatch):
 
 
 def test_first_iteration_moves_gaussians_as_without_appearance(train, scene):
-    """An untrained field changes neither rendering nor gradients."""
+    """An untrained field changes neither rendering nor gradients. (A smooth sky would.)"""
+    changes = {"semantics": False, "pipeline__model__sky_gaussians": 0}
     with_it, without = (
-        gaussians(train(scene, iterations=1, semantics=False, **{USE: use})) for use in ("on", "off")
+        gaussians(train(scene, iterations=1, **changes, **{USE: use})) for use in ("on", "off")
     )
     for name in without:
         assert torch.equal(with_it[name], without[name]), name
