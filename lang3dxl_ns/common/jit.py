@@ -57,6 +57,12 @@ def in_threads(function: Callable[..., Any], parts: Sequence[tuple[Any, ...]]) -
     return list(_pool(threads).map(lambda part: function(*part), parts))
 
 
+def ranges(count: int, least: int = 1) -> list[tuple[int, int]]:
+    """A range in equal parts, as many as there are threads, of at least `least` each."""
+    step = max(-(-count // torch.get_num_threads()), least)
+    return [(first, min(first + step, count)) for first in range(0, count, step)]
+
+
 @functools.lru_cache(maxsize=1)
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="kernel")

@@ -16,7 +16,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lang3dxl_ns.common.jit import in_threads, kernel
+from lang3dxl_ns.common.jit import in_threads, kernel, ranges
 
 _POINTS = 1024
 """Fewest points per thread."""
@@ -57,7 +57,7 @@ class _Interpolate(torch.autograd.Function):
         ctx.lattices = lattices
         features = x.new_empty(len(x), len(lattices.cells) * table.shape[1])
         shared = (*ctx.arrays, *lattices, features.numpy())
-        in_threads(_features, [(*part, *shared) for part in _ranges(len(x), _POINTS)])
+        in_threads(_features, [(*part, *shared) for part in ranges(len(x), _POINTS)])
         return features
 
     @staticmethod
@@ -68,15 +68,9 @@ class _Interpolate(torch.autograd.Function):
         grad_table = np.zeros_like(table)
         # A thread per range of levels: no two of them add to the same rows.
         shared = (*ctx.arrays, *ctx.lattices, grad, grad_table)
-        parts = in_threads(_gradients, [(*part, *shared) for part in _ranges(levels, 1)])
+        parts = in_threads(_gradients, [(*part, *shared) for part in ranges(levels)])
         grad_x = sum(parts) if parts else np.zeros_like(x)
         return torch.from_numpy(grad_x), torch.from_numpy(grad_table), None, None
-
-
-def _ranges(count: int, least: int) -> list[tuple[int, int]]:
-    """Equal parts of a range, as many as there are threads, of at least `least`."""
-    step = max(-(-count // torch.get_num_threads()), least)
-    return [(first, min(first + step, count)) for first in range(0, count, step)]
 
 
 @numba.njit(forceinline=True)
@@ -113,7 +107,7 @@ def _features(first, last, x, table, level_weights, cells, offsets, dense_levels
     dimensions, width = x.shape[1], table.shape[1]
     entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
     for n in range(first, last):
-        if np.isnan(x[n]).any():
+        if np.isnan(x[n].sum()):
             features[n] = np.nan
             continue
         for level in range(len(cells)):
@@ -138,7 +132,7 @@ def _gradients(
     entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
     grad_x = np.zeros_like(x)
     for n in range(len(x)):
-        if np.isnan(x[n]).any():
+        if np.isnan(x[n].sum()):
             grad_x[n] = np.nan
             continue
         for level in range(first, last):

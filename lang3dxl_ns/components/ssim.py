@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lang3dxl_ns.common.jit import in_threads, kernel
+from lang3dxl_ns.common.jit import in_threads, kernel, ranges
 from lang3dxl_ns.rendering.simd import LANES, load, store
 
 WINDOW = 11
@@ -40,7 +40,7 @@ class _Similarity(torch.autograd.Function):
         weights = _GAUSSIAN.astype(images[0].dtype)
         # Derivatives by the blurred prediction, its blurred square, and the blurred product.
         slopes = np.empty((3, channels * lines, _padded(width)), images[0].dtype)
-        parts = _ranges(channels * lines)
+        parts = ranges(channels * lines)
         sums = in_threads(
             _similarity, [(*part, *images, channels, height, width, weights, slopes) for part in parts]
         )
@@ -53,7 +53,7 @@ class _Similarity(torch.autograd.Function):
         channels, height, width = ctx.shape
         gradient = np.empty((channels * height, _padded(width)), ctx.slopes.dtype)
         factor = float(upstream) / (channels * (height - WINDOW + 1) * (width - WINDOW + 1))
-        parts = _ranges(channels * height)
+        parts = ranges(channels * height)
         shared = (*ctx.images, height, width, ctx.weights, ctx.slopes, factor, gradient)
         in_threads(_gradient, [(*part, *shared) for part in parts])
         return torch.from_numpy(gradient).view(channels, height, -1)[:, :, :width], None
@@ -69,11 +69,6 @@ def _roomy(image: Float[Tensor, "c h w"]) -> Float[np.ndarray, " entries"]:
     room = image.new_zeros(channels * height * _padded(width) + LANES)
     room[:-LANES].view(channels, height, -1)[:, :, :width] = image.detach()
     return room.numpy()
-
-
-def _ranges(lines: int) -> list[tuple[int, int]]:
-    step = -(-lines // torch.get_num_threads())
-    return [(first, min(first + step, lines)) for first in range(0, lines, step)]
 
 
 @numba.njit(forceinline=True)

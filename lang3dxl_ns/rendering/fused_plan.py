@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.common.jit import in_threads, kernel
+from lang3dxl_ns.common.jit import in_threads, kernel, ranges
 from lang3dxl_ns.rendering.tile_plan import LOG2_E, depth_order
 
 TILE = 16
@@ -73,8 +73,7 @@ def make_plan(
     )
 
     sizes = np.zeros(columns * rows + 1, np.int64)
-    band = -(-rows // torch.get_num_threads())
-    bands = [(first, min(first + band, rows)) for first in range(0, rows, band)]
+    bands = ranges(rows)
     in_threads(_count_rows, [(order, boxes, columns, *band, sizes) for band in bands])
     starts = np.cumsum(sizes)
     ranks = np.empty(starts[-1], np.int32)

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lang3dxl_ns.common.jit import in_threads, kernel
+from lang3dxl_ns.common.jit import in_threads, kernel, ranges
 from lang3dxl_ns.rendering.gaussians import Gaussians
 from lang3dxl_ns.rendering.projection import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Splats
 from lang3dxl_ns.rendering.simd import (
@@ -86,9 +86,7 @@ class _Projection(torch.autograd.Function):
 
 def _vectors(count: int) -> list[tuple[int, int]]:
     """A range of Gaussians for each thread, divided between vectors."""
-    vectors = -(-count // LANES)
-    step = -(-vectors // torch.get_num_threads())
-    return [(first * LANES, min((first + step) * LANES, count)) for first in range(0, vectors, step)]
+    return [(first * LANES, min(last * LANES, count)) for first, last in ranges(-(-count // LANES))]
 
 
 @numba.njit(forceinline=True)
