@@ -39,13 +39,6 @@ GRIDS: dict[str, dict[str, int]] = {
         "min_resolution": 6,
         "max_resolution": 12,
     },
-    "short": {
-        "levels": 4,
-        "features_per_level": 4,
-        "log2_table_size": 14,
-        "min_resolution": 8,
-        "max_resolution": 64,
-    },
     "paper": {
         "levels": 12,
         "features_per_level": 2,
@@ -63,8 +56,8 @@ class AppearanceConfig:
     use: Literal["auto", "on", "off"] = "auto"
     """`auto`: on, unless the scene's measured needs show that its photos share one light. Off means absent:
     no parameters, no cost."""
-    preset: Literal["auto", "coarse", "short", "paper"] = "auto"
-    """Hash grid over positions: `coarse`, finer (`short`), or as published (`paper`); `auto`: coarse."""
+    preset: Literal["coarse", "paper"] = "coarse"
+    """Hash grid over positions: `coarse`, or as published."""
     vector_dim: int = 24
     """Size of a photo's vector."""
     unseen: Literal["nearest", "mean"] = "nearest"
@@ -99,8 +92,7 @@ class AppearanceField(nn.Module):
     ):
         super().__init__()
         self.config = config
-        grid = GRIDS["coarse" if config.preset == "auto" else config.preset]
-        self.grid = HashGrid(3, **grid, generator=generator)
+        self.grid = HashGrid(3, **GRIDS[config.preset], generator=generator)
         inputs = self.grid.output_dim + 3 + config.vector_dim
         # The first layer is split in two: the photo's part is the same for all Gaussians, and computed once.
         self.from_gaussian = _linear(inputs - config.vector_dim, HIDDEN, inputs, generator)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypedDict
 
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.preparation.targets import FeatureStatistics
@@ -15,8 +15,7 @@ _KEY = "lang3dxl"
 
 
 class _Photo(TypedDict):
-    image: Float[Tensor, "h w 3"] | Int[Tensor, "h w 3"]
-    """Colors 0…1, or 0…255 as integers."""
+    image: UInt8[Tensor, "h w 3"]
     image_idx: int
     """In its dataset."""
     name: str

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE, Gaussians
+from lang3dxl_ns.rendering.gaussians import Gaussians
 from lang3dxl_ns.scene.camera import Camera
 
 
@@ -19,8 +19,7 @@ def in_light(
     model's look for this view). A browser keeps them for other views: view-dependent colors are those
     towards this camera."""
     g = model.gauss_params
-    scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
-    gaussians = Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1)).detach()
+    gaussians = model.activated(g).detach()
     pose = camera.view_matrix.to(model.device)
     position, forward = -pose[:3, :3].T @ pose[:3, 3], pose[2, :3]
     colors = model.colors_from(g, position)

@@ -330,10 +330,7 @@ class Lang3DXLModel(RenderingModel):
         """
         self._match_semantics(state)
         self._match_appearance(state)
-        sky = state.get("sky.directions")  # absent from checkpoints of earlier versions
-        if sky is None or self.sky is None or len(sky) != len(self.sky):
-            self.sky = None if sky is None else Sky(torch.zeros_like(sky)).to(self.device)
-            self.strategy.still = 0 if sky is None else len(sky)
+        self._match_sky(state)
         self.config.sh_degree = isqrt(state["gauss_params.features_rest"].shape[1] + 1) - 1
         if "camera_optimizer.pose_adjustment" in state and self.config.camera_optimizer.mode == "off":
             self._make_camera_optimizer(wanted=True)
@@ -362,6 +359,13 @@ class Lang3DXLModel(RenderingModel):
                 f"--pipeline.model.appearance.use auto, or train anew"
             )
         self.appearance = self._make_appearance().to(self.device) if saved else None
+
+    def _match_sky(self, state: Mapping[str, Any]) -> None:
+        """The checkpoint's sky, or none if it was trained like all Gaussians."""
+        saved = state.get("sky.directions")
+        if saved is None or self.sky is None or len(saved) != len(self.sky):
+            self.sky = None if saved is None else Sky(torch.zeros_like(saved)).to(self.device)
+            self.strategy.still = 0 if saved is None else len(saved)
 
     def _match_semantics(self, state: Mapping[str, Any]) -> None:
         """Build the components that the checkpoint has, or raise an error about the difference."""

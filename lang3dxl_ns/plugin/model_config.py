@@ -92,8 +92,6 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
             compressed = self.encoder.name == "lang3dxl"
             self.semantic_field.preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "default"
         self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
-        if self.appearance.preset == "auto":
-            self.appearance.preset = "coarse"
         if self.densify_grad_thresh is None:
             self.densify_grad_thresh = schedules.log_linear(x, 2e-3, 2e-4)
         if self.dense_weight is None:

@@ -75,8 +75,10 @@ def sizes_of(model: Lang3DXLModel, pixels: int, on_gpu: bool) -> Sizes:
     """Sizes of a model, and of the photos' largest number of pixels."""
     gaussians, codes, decoded = model.gauss_params, 0, 0
     if model.learns_from_renderings:
-        codes = 0 if model.carried is None else model.carried.shape[1]
-        assert model.config.decode_size is not None
+        assert model.semantic_field is not None and model.config.decode_size is not None
+        # Of one Gaussian, since some encoders compute what a Gaussian carries.
+        carried = model.semantic_field.carried({name: p.detach()[:1] for name, p in gaussians.items()})
+        codes = 0 if carried is None else carried.shape[1]
         decoded = max(model.config.decode_size) ** 2 * (len(model.clip_mean) + len(model.dense_mean))
     own = sum(p.numel() for p in gaussians.values())
     count = len(gaussians["means"])

@@ -16,7 +16,7 @@ NAMES = ["a.jpg", "b.jpg", "c.jpg"]
 
 def make_field(names=NAMES, trained=False, scale=1.0, seed=0, **settings) -> AppearanceField:
     """In float64; `trained` gives the weights arbitrary values, as after training."""
-    config = AppearanceConfig(preset="short", **settings)
+    config = AppearanceConfig(**settings)
     generator = torch.Generator().manual_seed(seed)
     field = AppearanceField(config, names, torch.tensor([1.0, -2.0, 0.5]) * scale, scale, generator=generator)
     if trained:
