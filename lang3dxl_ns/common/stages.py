@@ -74,7 +74,7 @@ class Stages:
         ahead = sum(self._shares[name] for name in self._later()) / self._shares[self._current]
         left = elapsed / done * (1 - done + ahead)
         if self._tenths < 10:
-            say(f"{self._current}: {100 * done:.0f} % done; {_minutes(left)} left in all")
+            say(f"{self._current}: {100 * done:.0f} % done; {roughly(left)} left in all")
 
     def figures(self) -> dict[str, dict[str, float]]:
         """Seconds and peak memory (MB) by stage."""
@@ -96,11 +96,12 @@ class Stages:
         line = f"\n{place + 1} of {len(order)}: {order[place]}"
         if done and self._path is not None:
             pace = sum(self._spent[s]["seconds"] for s in done) / sum(self._shares[s] for s in done)
-            line += f" ({_minutes(pace * sum(self._shares[s] for s in order[place:]))} left)"
+            line += f" ({roughly(pace * sum(self._shares[s] for s in order[place:]))} left)"
         say(line)
 
 
-def _minutes(seconds: float) -> str:
+def roughly(seconds: float) -> str:
+    """A duration in words, rounded up: "about 3 minutes"."""
     if seconds < 90:
         return f"about {10 * math.ceil(seconds / 10)} seconds"
     if seconds < 5400:

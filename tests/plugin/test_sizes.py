@@ -1,10 +1,11 @@
-"""Memory of training: the estimate, and the number of Gaussians that it allows."""
+"""Memory and time of training: the estimates, and the number of Gaussians that fit."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
+from lang3dxl_ns.plugin import trainer as trainers
 from lang3dxl_ns.plugin.sizes import Sizes, plan, sizes_of
 
 SIZES = Sizes(numbers=62, network=6_000_000, pixels=700_000, looks=False, codes=0, decoded=0, on_gpu=False)
@@ -44,3 +45,21 @@ def test_semantics_count_where_they_are_trained(scene, train):
     channels = len(trained.clip_mean) + len(trained.dense_mean)
     assert sizes_of(trained, 100, False).codes == 3
     assert sizes_of(trained, 100, False).decoded == 72**2 * channels
+
+
+def test_the_time_of_training_is_told_before_it_and_telling_changes_nothing(scene, train, monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(trainers.CONSOLE, "log", said.append)
+    ticks = iter(range(1000))
+    monkeypatch.setattr(trainers, "perf_counter", lambda: next(ticks))  # a rendering takes a second
+    trainer = train(scene, iterations=2)
+    assert [line for line in said if "Gaussians multiply" in line] == [
+        "training: about 10 seconds for 2 iterations, more if Gaussians multiply"
+    ]
+    model, random = trainer.pipeline.model.train(), torch.get_rng_state()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    trainer.config.max_num_iterations = 3000
+    trainer._announce_time()
+    assert "about 2.5 hours for 3,000 iterations" in said[-1]
+    assert torch.equal(torch.get_rng_state(), random) and model.training
+    torch.testing.assert_close(dict(model.state_dict()), before, rtol=0, atol=0, equal_nan=True)
