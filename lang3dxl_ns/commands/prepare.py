@@ -59,5 +59,5 @@ def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | 
         cache_dir=cache_dir,
         **{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)},
     )
-    config.settle_targets(learned=config.makes_dense or config.regions not in ("auto", "none"))
+    config.settle_targets(learned=config.crops == "pyramid" or config.regions not in ("auto", "none"))
     return config.setup(device=best_device(), test_mode="test")

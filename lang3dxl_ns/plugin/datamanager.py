@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
@@ -125,6 +126,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
             facts.statistics = self.targets.feature_statistics(names)
             facts.clip_targets = partial(self.targets.clip_features, names)
+            if self.targets.dense_dim:
+                facts.dense_targets = partial(self.targets.dense_features, names)
         _log(self._memory_budget())
 
     @cached_property
@@ -180,7 +183,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if self.targets is not None:
             plan = plan_crops(list(self.photos.values()), self._reconstruction(), config)
             sizes = novel_pixel_sizes(views, config) if plan.pixel_sizes is not None else None
-            prepare(dataset.photos, sizes, config, plan.scales, FeatureStore(self.cache_dir), self.device)
+            clip_alone = replace(config, dense="none") if config.crops == "fine" else config
+            prepare(dataset.photos, sizes, clip_alone, plan.scales, FeatureStore(self.cache_dir), self.device)
         return dataset
 
     @cached_property
@@ -238,7 +242,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @cached_property
     def _train_cache(self) -> PhotoCache:
         _ = self.targets  # so that they are not made in the cache's thread
-        return PhotoCache(lambda index: self._read(self.train_dataset, index), self.cache_bytes)
+        shown = self.config.targets_in_steps
+        return PhotoCache(lambda index: self._read(self.train_dataset, index, shown), self.cache_bytes)
 
     @property
     def cache_bytes(self) -> float:
@@ -250,7 +255,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Memory that training uses for photos, estimated from the first one's targets."""
         photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
         total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
-        if self.targets is not None:
+        if self.targets is not None and self.config.targets_in_steps:
             total += len(photos) * self.targets.bytes_of(self.targets.names[0])
         held = min(total, self.cache_bytes)
         return (
@@ -351,15 +356,15 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Pixels of a typical photo, for nerfstudio's speed display."""
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
 
-    def _read(self, dataset: PhotoDataset, index: int) -> dict[str, Any]:
+    def _read(self, dataset: PhotoDataset, index: int, with_targets: bool = True) -> dict[str, Any]:
         """A photo's data for a step, as kept in memory: bytes and half precision.
 
-        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with semantics `clip_target` [Hd, Wd, C],
+        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target` [Hd, Wd, C],
         `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
         (labels, −1 for none).
         """
         data: dict[str, Any] = dict(dataset.read(index))
-        if self.targets is not None:
+        if self.targets is not None and with_targets:
             name = dataset.photos[index].name
             clip = self.targets.clip(name)
             found = {

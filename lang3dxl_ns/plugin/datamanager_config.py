@@ -30,6 +30,8 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     Default: a quarter of the machine's memory."""
     read_ahead: int = 4
     """Photos read ahead of the training step, in addition to that memory."""
+    targets_in_steps: tyro.conf.Suppress[bool] = True
+    """Whether training steps learn from the targets; settled with the encoder."""
     run: tyro.conf.Suppress[Path | None] = None
     """Folder of the run whose config.yml this comes from; set when that is read."""
 
@@ -39,11 +41,15 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
         check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
 
     def settle_targets(self, learned: bool) -> None:
-        """Dense features and regions are for semantics `learned` with the scene; others have finer crops."""
+        """Regions and targets in every step are for semantics `learned` with the scene; others have finer
+        crops."""
+        self.targets_in_steps = learned
         if self.crops == "auto":
             self.crops = "pyramid" if learned else "fine"
         if not learned or self.clip == "none":
-            self.dense = self.regions = "none"
+            self.regions = "none"
+        if self.clip == "none":
+            self.dense = "none"
         elif self.dense == "auto":
             self.dense = BUILTIN if self.clip == BUILTIN else DENSE_MODEL
 

@@ -6,11 +6,13 @@ from collections.abc import Callable, Iterable
 from functools import partial
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 from torch.nn import Parameter
 
+from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
 from lang3dxl_ns.components.losses import resize
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.plugin.handover import Batch
@@ -23,18 +25,23 @@ def learn_from_photos(
     photos: Iterable[tuple[Cameras, Batch]],
     advance: Callable[[], None] = lambda: None,
 ) -> None:
-    """Gather the photos' target features onto the Gaussians, and let the encoder make codes of them.
+    """Gather the photos' target features onto the Gaussians, sharpen them where there are dense features, and
+    let the encoder make codes of them.
 
     model: in training mode, so that it renders its photos as in training. photos: cameras and batches, with
     targets. advance: called as the encoder learns, `learning_steps` times.
     """
-    encoder = model.semantic_field
+    encoder, facts = model.semantic_field, model.facts
     assert encoder is not None
-    basis, width = None, len(model.clip_mean)
+    basis = fine_basis = None
+    width = channels = len(model.clip_mean)
     if encoder.gathered_channels is not None and encoder.gathered_channels < width:
-        targets = model.facts.clip_targets
-        assert targets is not None
-        basis, width = PrincipalBasis.of(targets(), encoder.gathered_channels), encoder.gathered_channels
+        assert facts.clip_targets is not None
+        width = channels = encoder.gathered_channels
+        basis = PrincipalBasis.of(facts.clip_targets(), width)
+    if facts.dense_targets is not None:
+        fine_basis = PrincipalBasis.of(map(_unit, facts.dense_targets()), DENSE_AXES)
+        channels += fine_basis.axes.shape[1]
 
     def views():
         for camera, batch in photos:
@@ -42,14 +49,21 @@ def learn_from_photos(
             mask = batch["mask"][..., 0] if "mask" in batch else None
             clip = batch["clip_target"]
             clip = clip if basis is None else basis.to(clip).coordinates(clip)
-            pixels = pixel_features(clip, batch.get("dense_target"), mask, size)
-            yield partial(model.composite, camera), pixels
+            dense = None
+            if fine_basis is not None:
+                dense = fine_basis.to(clip).coordinates(_unit(batch["dense_target"]))
+            yield partial(model.composite, camera), pixel_features(clip, dense, mask, size)
 
-    width += len(model.dense_mean)
-    features, mass = gather(model.num_points, views(), width, model.means.detach())
+    features, mass = gather(model.num_points, views(), channels, model.means.detach())
+    if fine_basis is not None:
+        features = sharpen(features[:, :width], features[:, width:], mass)
     codes = encoder.learn_gaussians(features, mass, advance, basis)
     # Features that are many lie on the CPU, and those that are codes themselves come from there.
     model.gauss_params["codes"] = Parameter(codes.to(model.device), requires_grad=False)
+
+
+def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:
+    return F.normalize(dense.float(), dim=-1)
 
 
 def pixel_features(

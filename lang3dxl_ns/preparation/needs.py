@@ -77,7 +77,7 @@ def scene_needs(
         _pyramid_levels(photos, crops),
         _foreground(photos),
         Need("regions", sources.regions, "a source of regions is given", None, None),
-        Need("dense head", sources.dense, "a dense encoder is given; queries never use it", None, None),
+        Need("dense features", sources.dense, "a dense encoder is given: it sharpens words", None, None),
         _camera_optimizer(reconstruction),
     ]
 

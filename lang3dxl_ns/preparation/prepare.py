@@ -69,6 +69,7 @@ class _Task:
     clip: dict[str, Any] | None
     dense: dict[str, Any] | None
     regions: dict[str, Any] | None
+    has_dense: bool
     has_regions: bool
     is_fine: bool = False
     """Whether the crops are small ones alone, on a finer grid."""
@@ -109,7 +110,7 @@ def prepare(
     pixel_sizes: world units per pixel *of the photo as it is read* (its `width`), by photo name; None for
     relative scales. scales: crop sides in world units, or in photo widths without pixel sizes.
     regions: where label maps come from; None for none. fine: photos that get small crops alone
-    (`fine_crops`), the smallest a third of their side apart.
+    (`fine_crops`), the smallest a third of their side apart; if there are some, only they get dense features.
 
     Photos that can't be read are left out with a warning. Raises UserError when none can be read, a model
     can't be loaded, or the disk is too small.
@@ -125,8 +126,9 @@ def prepare(
     if left_out:
         say(f"left out {len(left_out)} of {len(photos)} photos:", *(f"  {why}" for why in left_out.values()))
     encoded = sum(task.photo.name not in left_out for task in missing)
+    with_dense = [task.photo.name for task in tasks if task.has_dense]
     with_regions = [task.photo.name for task in tasks if task.has_regions]
-    reader = TargetReader(store, names, config.makes_dense, with_regions, fine)
+    reader = TargetReader(store, names, with_dense, with_regions, fine)
     return PreparedTargets(reader, left_out, encoded)
 
 
@@ -154,10 +156,11 @@ def _plan(
         if is_fine := photo.name in fine:
             sides, sizes = fine_crops(sides[0], sizes[0])
         clip = {**source, "encoder": clip_model, "crop_sides": sides, "rule": _CROP_RULE}
-        dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if dense_model else None
+        has_dense = dense_model is not None and (is_fine or not fine)
+        dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if has_dense else None
         labels = None if regions is None else regions.settings(photo)
         settings = None if labels is None else {**source, **labels}
-        task = _Task(photo, sides, sizes, clip, dense, settings, labels is not None, is_fine)
+        task = _Task(photo, sides, sizes, clip, dense, settings, has_dense, labels is not None, is_fine)
         task.drop_current(store)
         return task
 

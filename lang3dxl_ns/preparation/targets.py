@@ -58,14 +58,17 @@ class TargetReader:
         self,
         store: FeatureStore,
         names: Sequence[str],
-        with_dense: bool = True,
+        with_dense: Collection[str] = (),
         with_regions: Collection[str] = (),
         fine: Collection[str] = (),
     ) -> None:
         self.names, self._fine = list(names), frozenset(fine)
-        self._store, self._with_dense, self._with_regions = store, with_dense, frozenset(with_regions)
+        self._store, self._with_regions = store, frozenset(with_regions)
+        self._with_dense = [name for name in self.names if name in frozenset(with_dense)]
         self.clip_dim: int = store.shapes(self._clip_kind(self.names[0]), self.names[0])["features"][-1]
-        self.dense_dim: int = store.shapes(DENSE, self.names[0])["features"][-1] if with_dense else 0
+        self.dense_dim: int = (
+            store.shapes(DENSE, self._with_dense[0])["features"][-1] if self._with_dense else 0
+        )
 
     def _clip_kind(self, name: str) -> str:
         return FINE if name in self._fine else CLIP
@@ -84,8 +87,12 @@ class TargetReader:
         return (self.clip(name).features for name in names)
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
-        """The dense features of the photo squashed to a square, float16; None if prepared without."""
-        return self._store.read(DENSE, name)["features"] if self._with_dense else None
+        """The dense features of the photo squashed to a square, float16; None for a photo without."""
+        return self._store.read(DENSE, name)["features"] if name in self._with_dense else None
+
+    def dense_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "t t d"]]:
+        """The dense features of those photos that have some, one at a time, float16."""
+        return (self._store.read(DENSE, name)["features"] for name in names if name in self._with_dense)
 
     def regions(self, name: str) -> Int[Tensor, "h w"] | None:
         """Region labels of the photo, −1 for none; None (no file is read) for a photo without regions."""
@@ -94,7 +101,9 @@ class TargetReader:
     def bytes_of(self, name: str) -> int:
         """Bytes of a photo's targets on disk."""
         kinds = (
-            [self._clip_kind(name)] + [DENSE] * self._with_dense + [REGIONS] * (name in self._with_regions)
+            [self._clip_kind(name)]
+            + [DENSE] * (name in self._with_dense)
+            + [REGIONS] * (name in self._with_regions)
         )
         return sum(self._store.path(kind, name).stat().st_size for kind in kinds)
 
@@ -115,11 +124,7 @@ class TargetReader:
         names = self.names if names is None else list(names)
         names = names[:: -(-len(names) // sample)]
         clip = _statistics(self.clip(name).features for name in names)
-        dense = (
-            _statistics(self._store.read(DENSE, name)["features"] for name in names)
-            if self._with_dense
-            else None
-        )
+        dense = _statistics(self.dense_features(names)) if self._with_dense else None
         return FeatureStatistics(clip, dense)
 
 
