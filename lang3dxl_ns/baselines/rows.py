@@ -71,6 +71,8 @@ ROWS = (
     Row("single-scale", "supervision", "crops of one size", {f"{_DATA}scales": 1}),
     Row("pyramid", "supervision", "gathered from the whole pyramid, crops half a side apart",
         {f"{_DATA}crops": "pyramid"}),
+    Row("unsharpened", "supervision", "gathered features, not sharpened by dense ones",
+        {f"{_DATA}dense": "none"}),
     Row("no-ad-lr", "supervision", "without attenuated downsampler (LR)",
         _PAPER | {"pipeline.model.downsampler.match": "resize-features"}, "windows AP .53"),
     Row("no-ad-hr", "supervision", "without attenuated downsampler (HR)",

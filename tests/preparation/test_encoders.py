@@ -245,7 +245,7 @@ def test_half_precision_on_the_gpu_stays_close_to_the_cpu(clip_folder, dino_fold
         ("builtin", "auto", True, "builtin"),
         ("openai/clip-vit-base-patch32", "auto", True, "facebook/dinov2-small"),
         ("builtin", "mine", True, "mine"),
-        ("builtin", "auto", False, "none"),
+        ("builtin", "auto", False, "builtin"),
         ("none", "auto", True, "none"),
     ],
 )

@@ -277,6 +277,13 @@ def test_without_dense_features_no_dense_entry_is_made_or_read(photos, config, s
     assert reader.feature_statistics().dense is None
 
 
+def test_photos_with_fine_crops_alone_have_dense_features_where_there_are_such(photos, config, store):
+    reader = prepare(photos, None, config, SCALES, store, "cpu", fine=[NAMES[1]]).reader
+    assert [name for name in NAMES if reader.dense(name) is not None] == [NAMES[1]]
+    assert [tuple(dense.shape) for dense in reader.dense_features(NAMES)] == [(6, 6, 8)]
+    assert reader.dense_dim == 8 and reader.bytes_of(NAMES[1]) > reader.bytes_of(NAMES[0])
+
+
 def test_regions_are_read_as_their_source_made_them(photos, config, store):
     source = FelzenszwalbRegions()
     reader = run(photos, config, store, regions=source).reader
@@ -369,7 +376,8 @@ def test_statistics_are_numpys_in_float64(store):
         store.write("clip", str(index), {"features": features, "valid": torch.ones(6 + index, 7)}, settings)
         store.write("dense", str(index), {"features": features * 2 - 100}, {})
         maps[index] = store.read("clip", str(index))["features"].numpy().astype(np.float64).reshape(-1, 4)
-    reader = TargetReader(store, [str(index) for index in maps])
+    names = [str(index) for index in maps]
+    reader = TargetReader(store, names, names)
     pixels = np.concatenate(list(maps.values()))
     found = reader.feature_statistics()
     np.testing.assert_allclose(found.clip.mean, pixels.mean(0), rtol=1e-6)
@@ -391,7 +399,7 @@ def test_the_deviation_of_a_constant_channel_is_floored(store):
     store.write(
         "clip", "a", {"features": features, "valid": torch.ones(8, 8)}, {"size": [9, 9], "crop_sides": [3]}
     )
-    std = TargetReader(store, ["a"], with_dense=False).feature_statistics().clip.std
+    std = TargetReader(store, ["a"]).feature_statistics().clip.std
     assert std[0] == pytest.approx(0.01 * float(std[1]) / 2, rel=1e-3)
 
 
