@@ -83,11 +83,13 @@ def check_encoders(clip: str, dense: str) -> None:
         folders = {option: f"DIR/{name.split('/')[-1]}" for option, name in missing.items()}
         fetch = "; ".join(f"hf download {missing[o]} --local-dir {folders[o]}" for o in missing)
         use = " ".join(f"{spoken(option)} {folder}" for option, folder in folders.items())
+        small = f"use the small encoders that come with this package: {spoken(CLIP_OPTION)} {BUILTIN}"
+        without = f"do without dense features, which makes words less sharp: {spoken(DENSE_OPTION)} none"
+        way_out = small if CLIP_OPTION in missing else without
         raise UserError(
             f"{' and '.join(missing.values())}: neither folders here nor in the Hugging Face cache, and "
-            f"the download fails. Either use the small encoders that come with this package: "
-            f"{spoken(CLIP_OPTION)} {BUILTIN}. Or, on a machine with Internet: {fetch}; copy DIR here, and "
-            f"use {use}"
+            f"the download fails. Either {way_out}. Or, on a machine with Internet: {fetch}; copy DIR here, "
+            f"and use {use}"
         )
 
 

@@ -30,9 +30,8 @@ class PreparationConfig:
     """CLIP in Hugging Face format: a name, a folder, or "builtin". Queries need the same one. The paper uses
     this architecture fine-tuned on landmarks."""
     dense: str = "auto"
-    """Vision transformer whose patch tokens sharpen semantics that are trained with the scene: a name, a
-    folder, or "none" to do without. auto: none for other runs; for such a run facebook/dinov2-small, or the
-    built-in one with the built-in CLIP."""
+    """Vision transformer whose patch tokens sharpen what crops blur: a name, a folder, or "none" to do
+    without. auto: facebook/dinov2-small, or the built-in one with the built-in CLIP."""
     scale_range: tuple[float, float] | None = None
     """Sides of the smallest and largest crop, in COLMAP units ("physical") or in photo widths ("relative").
     Default: proposed from the scene."""
@@ -47,8 +46,8 @@ class PreparationConfig:
     crops: Literal["auto", "pyramid", "fine"] = "auto"
     """What training photos are read at. pyramid: crops of all sizes, half a side apart, averaged (Lang3D-XL's
     targets). fine: the smallest, and 0.7 of them a third of a side apart: three times as many in all. auto:
-    fine where features are gathered onto Gaussians, which sharpens nothing; pyramid where they are trained
-    through the downsampler, which does. Held-out photos have the pyramid, as the 2-D teacher that is
+    fine where features are gathered onto Gaussians; pyramid where they are trained through the downsampler,
+    which sharpens. Held-out photos have the pyramid, as the 2-D teacher that is
     scored."""
     pixel_distance: DistanceRule = "median"
     """Distance of a photo's subject: from the camera to the median of its tracked points, to their mean,

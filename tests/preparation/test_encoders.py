@@ -265,6 +265,13 @@ def test_whoever_is_offline_is_told_of_both_encoders_and_both_ways_out():
     assert "--pipeline.datamanager.dense DIR/dinov2-small" in message
 
 
+def test_whoever_lacks_dense_features_alone_may_do_without():
+    with pytest.raises(
+        UserError, match=r"Either do without .*--pipeline.datamanager.dense none\. Or, .* hf download"
+    ):
+        check_encoders("builtin", "facebook/dinov2-small")
+
+
 def test_each_command_is_told_its_own_options():
     token = option_prefix.set("--")
     try:
