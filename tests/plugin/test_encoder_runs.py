@@ -17,10 +17,12 @@ def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
     """The finished short run of an encoder by name, "none" for colors alone; each is made once."""
 
     @cache
-    def made(name: str):
+    def made(name: str, dense: bool = True):
         semantics = name != "none"
         encoder = EncoderConfig(name, autoencoder_steps=20) if semantics else EncoderConfig()
         changes = {"pipeline__model__encoder": encoder}
+        if not dense:
+            changes["pipeline__datamanager__dense"] = "none"
         folder = tmp_path_factory.mktemp(name)
         trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 6, semantics, **changes)
         trainer.setup()
@@ -69,10 +71,21 @@ def test_only_fmgs_has_an_alignment_loss(run):
 def test_gathered_features_come_near_the_targets_and_nothing_is_learned_before(run, name):
     trainer = run(name)
     assert set(trainer.pipeline.last_losses) == {"rgb"}
-    assert trainer.pipeline.datamanager.config.dense == "none"
+    datamanager = trainer.pipeline.datamanager
+    assert set(datamanager.next_train(0)[1]) == {"image", "image_idx", "name"}  # no step waits for a target
+    assert {"clip_target", "dense_target"} < set(next(datamanager.train_photos())[1])
+    assert not any("dense_target" in batch for _, batch in datamanager.fixed_indices_eval_dataloader)
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert metrics["clip_l1"] < metrics["clip_l1_of_mean"] * 1.5
     assert not trainer.pipeline.model.gauss_params["codes"].requires_grad
+
+
+def test_dense_features_sharpen_words_and_leave_all_else_as_it_is(run):
+    sharp, without = (dict(run("lifting", dense).pipeline.model.gauss_params) for dense in (True, False))
+    codes, others = sharp.pop("codes"), without.pop("codes")
+    assert codes.shape == others.shape and (codes != others).any()
+    for name, value in sharp.items():
+        assert torch.equal(value, without[name]), name
 
 
 @pytest.mark.parametrize(
@@ -98,5 +111,5 @@ def test_crops_of_one_size_are_the_middle_of_the_range(train, scene, tmp_path):
     options = {"scale_mode": "relative", "scale_range": (0.4, 0.9), "scales": 1}
     options |= {"cache_dir": tmp_path / "targets", "crops": "pyramid"}
     trainer = train(scene, iterations=2, **{f"pipeline__datamanager__{k}": v for k, v in options.items()})
-    _, batch = trainer.pipeline.datamanager.next_train(0)
+    _, batch = next(trainer.pipeline.datamanager.train_photos())
     assert batch["crop_sides"] == [pytest.approx(0.6, abs=0.02)]
