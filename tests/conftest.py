@@ -10,6 +10,7 @@
 """
 
 import os
+import sys
 from collections import Counter
 from copy import deepcopy
 from pathlib import Path
@@ -34,6 +35,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests first: at the end, one of them would leave the other process idle."""
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Commands get their server where tests are run that may need it."""
+    if session.items and "processes" in sys.modules and not session.config.option.collectonly:
+        sys.modules["processes"].start_server()
 
 
 @pytest.fixture(scope="session")
