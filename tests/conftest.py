@@ -1,10 +1,12 @@
 """What tests share: small scenes, tiny encoders, and short training runs.
 
 - `scene`, `tiny_clip`, `tiny_dense`: read-only, made once per process that tests.
-- `train`: a short training with settings of your own. A step takes 60 ms: take as few as the law needs, and a
-  module's fixture where several tests only look at the same run.
+- `train`: a short training with settings of your own, which learns codes in 40 small steps. It takes half a
+  second and 15 ms per step: take as few as the law needs, and a module's fixture where several tests only
+  look at the same run.
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
-  `processes.Process(function, …)`: a function in one.
+  `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
+  told `--pipeline.model.encoder.compression.steps 40`.
 - `worker_tasks`: work for several processes; tests that need a Ray cluster belong into test_ray.py, which
   has one.
 """
@@ -26,8 +28,6 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     torch.set_num_threads(1)
-# Tests use the torch backend; tests/rendering asks for the compiled kernels by name.
-os.environ.setdefault("LANG3DXL_CPU_KERNELS", "torch")
 torch.set_num_threads(min(torch.get_num_threads(), 2))
 
 
