@@ -96,7 +96,8 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, **ch
     config.pipeline.datamanager.clip = str(clip) if semantics else "none"
     config.pipeline.datamanager.dense = str(dense) if semantics else "none"
     config.viewer.quit_on_train_completion = True
-    config.pipeline.model.encoder.compression.steps = 40
+    compression = config.pipeline.model.encoder.compression
+    compression.steps, compression.batch = 40, 512
     for path, value in changes.items():
         *owners, name = path.split("__")
         owner = config
