@@ -66,10 +66,10 @@ def test_torch_trains_what_the_compiled_kernels_train(train, scene, monkeypatch)
     found = []
     for kernels in ("numba", "torch"):
         monkeypatch.setenv("LANG3DXL_CPU_KERNELS", kernels)
-        losses = train(scene, iterations=6).pipeline.last_losses
+        losses = train(scene, iterations=2).pipeline.last_losses  # more, and Adam turns rounding into signs
         found.append({name: loss.item() for name, loss in losses.items()})
     assert {"rgb", "clip", "dense"} <= set(found[0])
-    assert found[0] == pytest.approx(found[1], rel=1e-3)
+    assert found[0] == pytest.approx(found[1], rel=1e-5)
 
 
 def test_densification_carries_the_codes(train, scene):
