@@ -1,15 +1,18 @@
 """What tests share: small scenes, tiny encoders, and short training runs.
 
 - `scene`, `tiny_clip`, `tiny_dense`: read-only, made once per process that tests.
-- `train`: a short training with settings of your own. A step takes 60 ms: take as few as the law needs, and a
-  module's fixture where several tests only look at the same run.
+- `train`: a short training with settings of your own, which learns codes in 40 small steps. It takes half a
+  second and 15 ms per step: take as few as the law needs, and a module's fixture where several tests only
+  look at the same run.
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
-  `processes.Process(function, …)`: a function in one.
+  `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
+  told `--pipeline.model.encoder.compression.steps 40`.
 - `worker_tasks`: work for several processes; tests that need a Ray cluster belong into test_ray.py, which
   has one.
 """
 
 import os
+import sys
 from collections import Counter
 from copy import deepcopy
 from pathlib import Path
@@ -25,8 +28,6 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     torch.set_num_threads(1)
-# Tests use the torch backend; tests/rendering asks for the compiled kernels by name.
-os.environ.setdefault("LANG3DXL_CPU_KERNELS", "torch")
 torch.set_num_threads(min(torch.get_num_threads(), 2))
 
 
@@ -34,6 +35,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests first: at the end, one of them would leave the other process idle."""
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Commands get their server where tests are run that may need it."""
+    if session.items and "processes" in sys.modules and not session.config.option.collectonly:
+        sys.modules["processes"].start_server()
 
 
 @pytest.fixture(scope="session")
@@ -89,7 +96,8 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, **ch
     config.pipeline.datamanager.clip = str(clip) if semantics else "none"
     config.pipeline.datamanager.dense = str(dense) if semantics else "none"
     config.viewer.quit_on_train_completion = True
-    config.pipeline.model.encoder.compression.steps = 40
+    compression = config.pipeline.model.encoder.compression
+    compression.steps, compression.batch = 40, 512
     for path, value in changes.items():
         *owners, name = path.split("__")
         owner = config

@@ -18,26 +18,47 @@ import sys
 import tempfile
 from collections.abc import Callable
 from importlib.metadata import entry_points
+from multiprocessing import forkserver, resource_tracker, util
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 _SERVER = multiprocessing.get_context("forkserver")
-_SERVER.set_forkserver_preload(
-    [
-        "numpy",  # before pycolmap
-        "lang3dxl_ns.cli",
-        "lang3dxl_ns.plugin.load_scene",
-        "nerfstudio.scripts.train",
-        "nerfstudio.scripts.eval",
-        "nerfstudio.scripts.render",
-        "nerfstudio.scripts.exporter",
-        "nerfstudio.scripts.viewer.run_viewer",
-        "pycolmap",
-        "transformers.models.clip.modeling_clip",
-        "transformers.models.clip.tokenization_clip",
-        "transformers.models.dinov2.modeling_dinov2",
-    ]
-)
+_LIBRARIES = [
+    "numpy",  # before pycolmap
+    "lang3dxl_ns.cli",
+    "lang3dxl_ns.plugin.load_scene",
+    "nerfstudio.scripts.train",
+    "nerfstudio.scripts.eval",
+    "nerfstudio.scripts.render",
+    "nerfstudio.scripts.exporter",
+    "nerfstudio.scripts.viewer.run_viewer",
+    "pycolmap",
+    "transformers.models.clip.modeling_clip",
+    "transformers.models.clip.tokenization_clip",
+    "transformers.models.dinov2.modeling_dinov2",
+]
+
+
+def start_server() -> None:
+    """Start the server as a fork of this process, where collecting the tests has imported nearly all of the
+    libraries; before the first test, so that it inherits nothing of any."""
+    resource_tracker.ensure_running()
+    with mock.patch.object(util, "spawnv_passfds", _fork):
+        forkserver.ensure_running()
+
+
+def _fork(_path: str, _arguments: list[str], descriptors: list[int]) -> int:
+    """What `ensure_running` starts by a new interpreter: the server, with these files alone open."""
+    if pid := os.fork():
+        return pid
+    try:
+        kept = sorted(descriptors)
+        for last, following in zip([2, *kept], [*kept, os.sysconf("SC_OPEN_MAX")], strict=True):
+            os.closerange(last + 1, following)
+        forkserver.main(*descriptors, _LIBRARIES)
+    finally:  # at the end of the tests, which it learns by SystemExit
+        os._exit(0)
 
 
 class Process:

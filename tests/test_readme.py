@@ -5,9 +5,7 @@ import re
 import sys
 from pathlib import Path
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 from processes import output
 
 pytestmark = pytest.mark.slow
@@ -64,6 +62,9 @@ def test_questions_from_python(demo_output, folder):
 
 
 def test_the_notebook_runs_from_top_to_bottom(demo_output, folder):
+    import nbformat  # here: they take five seconds to load, in every process that collects tests
+    from nbclient import NotebookClient
+
     notebook = nbformat.read(ROOT / "docs" / "tour.ipynb", as_version=4)
     client = NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}})
     client.execute()

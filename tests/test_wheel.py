@@ -43,34 +43,25 @@ def test_commands_run_from_it_alone(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
 
-    def run(*words: str) -> str:
-        code = (
-            "import lang3dxl_ns, sys; from lang3dxl_ns.cli import main; main(); print(lang3dxl_ns.__file__)"
-        )
-        call = [sys.executable, "-c", code, *words]
-        done = subprocess.run(
-            call, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300
-        )
-        assert done.returncode == 0, done.stderr
-        assert str(tmp_path / "installed") in done.stdout
-        return done.stdout
-
-    assert "holyscenes/milano" in run("preset")
-    run(
-        "demo-scene",
-        "--out",
-        "scene",
-        "--photos",
-        "4",
-        "--test-views",
-        "0",
-        "--width",
-        "96",
-        "--height",
-        "72",
+    commands = [
+        "preset",
+        "demo-scene --out scene --photos 4 --test-views 0 --width 96 --height 72",
+        "prepare --data scene --clip builtin --scale-range 0.5 1.5 --dense-tokens 8",
+    ]
+    code = "import lang3dxl_ns, sys; from lang3dxl_ns.cli import main; print(lang3dxl_ns.__file__)\n"
+    code += "for words in sys.argv[1:]: main(words.split())"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *commands],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
-    settings = ("--scale-range", "0.5", "1.5", "--dense-tokens", "8")
-    assert "Targets of 4 photos" in run("prepare", "--data", "scene", "--clip", "builtin", *settings)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(str(tmp_path / "installed"))
+    assert "holyscenes/milano" in done.stdout
+    assert "Targets of 4 photos" in done.stdout
     page = tmp_path / "installed" / "lang3dxl_ns" / "query" / "web"
     assert {path.name for path in page.iterdir()} >= {"index.html", "page.js", "splats.js", "LICENSES.txt"}
 

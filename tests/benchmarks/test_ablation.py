@@ -239,10 +239,13 @@ def test_new_weights_of_the_same_name_make_runs_anew(tmp_path, monkeypatch):
 def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 
-    scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, photos=10, width=128, test_views=6))
+    sizes = {"photos": 10, "test_views": 6, "width": 128, "height": 96, "workers": 1}
+    scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, **sizes))
     out = tmp_path / "out"
     names = (FULL, TEACHER, LIMIT, CHANCE, CLIPSEG, "lifting")
-    command = Ablation(out, (scene,), steps=(4, 6), dense_tokens=8, rows=names, clipseg=str(tmp_path / "no"))
+    few = "--pipeline.model.encoder.compression.steps 40"  # learning codes takes 15 seconds otherwise
+    short = {"steps": (4, 6), "dense_tokens": 8, "ns_train": few}
+    command = Ablation(out, (scene,), rows=names, clipseg=str(tmp_path / "no"), **short)
     command.main()
     lengths = json.loads((out / "ablation.json").read_text())["lengths"]
     assert list(lengths) == ["4", "6"]

@@ -15,6 +15,9 @@ from lang3dxl_ns.common.reports import write_atomically
 from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
+SMALL = {"clip": "builtin", "scale": 1.0, "ns_train": "--pipeline.model.encoder.compression.steps 40"}
+"""Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
+
 
 @pytest.fixture(scope="session")
 def landmark(tmp_path_factory):
@@ -70,7 +73,7 @@ def table(out, name):
 def test_a_downloaded_folder_becomes_a_table(downloaded, tmp_path):
     benchmark, data, scene = downloaded
     out = tmp_path / "out"
-    benchmark(data=data, out=out, clip="builtin", iterations=4, scale=1.0).main()
+    benchmark(data=data, out=out, iterations=4, **SMALL).main()
     results = json.loads((out / scene / "scores.json").read_text())["results"]
     assert results["protocol"]["seen_in_training"] == results["protocol"]["evaluated_photos"] == 4
     rows = table(out, benchmark.name)
@@ -86,7 +89,7 @@ def test_finished_scenes_are_kept_stopped_ones_go_on_and_other_settings_begin_an
     out = tmp_path / "out" / "milano"
     log, report = out / "finished.log", out / "scores.json"
     data = as_holyscenes(landmark, tmp_path / "data")
-    command = HolyScenes(data=data, out=out.parent, clip="builtin", iterations=8, scale=1.0)
+    command = HolyScenes(data=data, out=out.parent, iterations=8, **SMALL)
     command.main()
     results = json.loads(report.read_text())["results"]
     (run,) = out.glob("runs/*/lang3dxl/*/config.yml")

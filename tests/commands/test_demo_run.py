@@ -12,12 +12,14 @@ pytestmark = pytest.mark.slow
 
 
 SCENE = {"photos": 8, "test_views": 6, "quick": True, "wild": False}
+FEW = "--pipeline.model.encoder.compression.steps 40"
+"""Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
 
 @pytest.fixture(scope="module")
 def demo(tiny_clip, tiny_dense, tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    settings = Demo(out=out, clip=str(tiny_clip), dense=str(tiny_dense), steps=6, **SCENE)
+    settings = Demo(out=out, clip=str(tiny_clip), dense=str(tiny_dense), steps=6, ns_train=FEW, **SCENE)
     settings.main()
     return settings
 
@@ -85,7 +87,7 @@ def test_ctrl_c_while_training_keeps_the_run(demo, tmp_path, monkeypatch):
         return original(self, *args)
 
     monkeypatch.setattr(Lang3DXLModel, "get_loss_dict", interrupted)
-    settings = Demo(out=tmp_path, steps=6, clip=demo.clip, dense=demo.dense, **SCENE)
+    settings = Demo(out=tmp_path, steps=6, clip=demo.clip, dense=demo.dense, ns_train=FEW, **SCENE)
     with pytest.raises(SystemExit, match="same command continues"):
         settings.main()
     checkpoints = tmp_path / "run" / "lang3dxl" / "demo" / "nerfstudio_models"

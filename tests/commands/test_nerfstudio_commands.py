@@ -10,6 +10,8 @@ from processes import output as command
 from processes import run as attempt
 
 pytestmark = pytest.mark.slow
+FEW = ("--pipeline.model.encoder.compression.steps", 40)
+"""Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +24,7 @@ def run(scene, tiny_clip, tiny_dense, folder) -> Path:
     """A run folder made by ns-train."""
     command(
         *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 30, "--vis", "tensorboard"),
-        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
         *("--output-dir", folder / "outputs", "--timestamp", "first"),
         cwd=folder,
         shell=True,
@@ -47,7 +49,7 @@ def test_eval(run, folder):
 def test_resume(run, scene, tiny_clip, tiny_dense, folder):
     output = command(
         *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 40, "--vis", "tensorboard"),
-        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
         *(
             "--output-dir",
             folder / "outputs",
@@ -117,7 +119,7 @@ def test_transforms_json_scenes_train_too(scene, tiny_clip, tiny_dense, folder):
     data = transforms_scene(scene, folder / "transforms_scene")
     output = command(
         *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 5, "--vis", "tensorboard"),
-        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
         *("--output-dir", folder / "outputs", "nerfstudio-data"),
         cwd=folder,
     )
@@ -128,7 +130,7 @@ def test_transforms_json_without_points_takes_relative_crops(scene, tiny_clip, t
     data = transforms_scene(scene, folder / "no_points", points=False)
     output = command(
         *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 3, "--vis", "tensorboard"),
-        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense),
+        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
         *("--pipeline.model.random-init", "True", "--pipeline.model.num-random", 200),
         *("--output-dir", folder / "outputs", "nerfstudio-data"),
         cwd=folder,

@@ -87,7 +87,8 @@ def test_a_stopped_evaluation_leaves_the_report_that_was_there(tmp_path):
 
 @pytest.mark.slow
 def test_a_stopped_comparison_ends_its_runs(tmp_path):
-    scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, photos=10, width=128))
+    sizes = {"photos": 8, "test_views": 0, "width": 128, "height": 96, "workers": 1}
+    scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, **sizes))
     words = [sys.executable, "-m", "lang3dxl_ns.cli", "benchmark", "ablation", "--scene", str(scene)]
     words += ["--out", str(tmp_path), "--rows", "full", "hash", "--dense-tokens", "8", "--workers", "2"]
     # Started truly: all that belongs to it is a process group of its own.

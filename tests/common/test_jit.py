@@ -1,21 +1,16 @@
 """Compiled kernels: logged once, cached on disk, compiled anew without a writable cache."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from processes import Process
 
 from lang3dxl_ns.common.jit import in_threads
 
-PROGRAM = """
-import numpy as np
-from kernel_module import doubled
-print(doubled(np.arange(3.0)))
-"""
 MODULE = """
 from lang3dxl_ns.common.jit import kernel
 
@@ -25,18 +20,22 @@ def doubled(values):
 """
 
 
+def call_the_kernel(folder: Path, environment: dict[str, str]) -> None:
+    os.environ.update(environment)
+    sys.path.insert(0, str(folder))
+    from kernel_module import doubled
+
+    print(doubled(np.arange(3.0)))
+
+
 @pytest.fixture
 def run(tmp_path):
-    """Run a program that calls a kernel in a separate process; returns its output."""
+    """Call a kernel in a separate process; returns its output."""
     (tmp_path / "kernel_module.py").write_text(MODULE)
 
     def program(**environment: str) -> str:
-        path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM],
-            env={**os.environ, "PYTHONPATH": path, **environment},
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
+        done = Process(call_the_kernel, tmp_path, environment).wait()
+        assert done.returncode == 0, done.stderr
         return done.stdout
 
     return program

@@ -28,6 +28,7 @@ def write(out, **changes):
         "seed": SEED,
         "family": "mosque",
         "photos": PHOTOS,
+        "test_views": 6,
         "width": SIZE[0],
         "height": SIZE[1],
         "workers": 1,

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from conftest import make_trainer
 from label_sets import box_object, write_labels, write_plain
 from PIL import Image
 
@@ -24,19 +25,24 @@ def label(scene, folder, numbers):
     return folder
 
 
-@pytest.fixture
-def pipeline(train, scene):
-    return train(scene, iterations=2).pipeline
+@pytest.fixture(scope="module")
+def trainer(scene, tiny_clip, tiny_dense, tmp_path_factory):
+    """A finished run of two steps, to evaluate."""
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path_factory.mktemp("run"), iterations=2)
+    trainer.setup()
+    trainer.train()
+    return trainer
 
 
 @pytest.fixture
-def evaluate(pipeline):
+def evaluate(trainer, monkeypatch):
     """What ns-eval calls, after changes to the pipeline's configuration."""
+    pipeline = trainer.pipeline
 
     def run(**changes):
         pipeline.__dict__.pop("scorer", None)
         for name, value in changes.items():
-            setattr(pipeline.config, name, value)
+            monkeypatch.setattr(pipeline.config, name, value)
         return pipeline.get_average_eval_image_metrics(get_std=True)
 
     return run
@@ -98,8 +104,7 @@ def test_labels_in_json_are_scored_at_the_photos_size_by_langsplats_measures(eva
     assert results["protocol"]["layout"] == "lerf_ovs"
 
 
-def test_evaluate_run_writes_the_report_of_a_run(train, scene, tmp_path):
-    trainer = train(scene, iterations=2)
+def test_evaluate_run_writes_the_report_of_a_run(trainer, scene, tmp_path):
     truth = label(scene, tmp_path / "truth", (0, 1))
     config = str(trainer.base_dir / "config.yml")
     common = ["evaluate", "run", config, "--ground-truth", str(truth), "--split", "seen"]

@@ -61,6 +61,17 @@ def test_two_runs_with_one_seed_agree(train, scene, tmp_path):
         assert torch.equal(first[name], second[name]), name
 
 
+def test_torch_trains_what_the_compiled_kernels_train(train, scene, monkeypatch):
+    """Where numba is missing, torch takes their place; all other tests of training take the kernels."""
+    found = []
+    for kernels in ("numba", "torch"):
+        monkeypatch.setenv("LANG3DXL_CPU_KERNELS", kernels)
+        losses = train(scene, iterations=2).pipeline.last_losses  # more, and Adam turns rounding into signs
+        found.append({name: loss.item() for name, loss in losses.items()})
+    assert {"rgb", "clip", "dense"} <= set(found[0])
+    assert found[0] == pytest.approx(found[1], rel=1e-5)
+
+
 def test_densification_carries_the_codes(train, scene):
     trainer = train(scene, iterations=20, pipeline__model__densify_grad_thresh=1e-7)
     model = trainer.pipeline.model

@@ -34,10 +34,9 @@ def verdicts(folder, **settings):
 @pytest.fixture(scope="module")
 def landmarks(tmp_path_factory):
     folder = tmp_path_factory.mktemp("landmarks")
+    sizes = {"photos": 24, "test_views": 0, "width": 240, "height": 180}
     return {
-        wild: write_scene(
-            DemoScene(out=folder / f"wild-{wild}", seed=4, photos=24, wild=wild, width=240, height=180)
-        )
+        wild: write_scene(DemoScene(out=folder / f"wild-{wild}", seed=4, wild=wild, **sizes))
         for wild in (True, False)
     }
 
