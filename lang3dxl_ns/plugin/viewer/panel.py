@@ -57,6 +57,7 @@ class AskPanel(ViewerControl):
         guard_viewers()  # before nerfstudio starts a server
         keep_frames_recognizable()
         self._pipeline = pipeline
+        self._listing = threading.Lock()
         self._results: viser.GuiFolderHandle | None = None
         self._tours: list[Tour] = []
         self._drawn: list[Any] = []
@@ -192,7 +193,8 @@ class AskPanel(ViewerControl):
 
     def _ask(self) -> None:
         text = self._question.value.strip()
-        self._clear_results()
+        with self._listing:
+            self._clear_results()
         if not text:
             self.conversation.forget()
             self._show_output("rgb")
@@ -209,9 +211,10 @@ class AskPanel(ViewerControl):
             return
         self._say("Looking for the best viewpoints…")
         found = self.conversation.find()
-        if found is not self.conversation.found:
-            return  # there is a newer question
-        self._show_results(found)
+        with self._listing:
+            if found is not self.conversation.found:
+                return  # there is a newer question
+            self._show_results(found)
         self._say("  \n".join(filter(None, (self._summary(found), self.conversation.advice()))))
         self._rerender()
 

@@ -116,6 +116,23 @@ def test_a_button_may_be_pressed_as_soon_as_it_is_there(panel, monkeypatch):
     assert said and all("1 of" in place for place in said)
 
 
+def test_a_new_question_waits_until_the_places_of_the_last_are_listed(panel, monkeypatch):
+    askers, add_button = [], panel._gui.add_button
+
+    def interrupt(label, **options):
+        panel._question.value = ""
+        askers.append(threading.Thread(target=panel._guarded(panel._ask)))
+        askers[-1].start()
+        askers[-1].join(1.0)
+        return add_button(label, **options)
+
+    monkeypatch.setattr(panel._gui, "add_button", interrupt)
+    type_in(panel, "dome; portal")
+    assert askers and [asker.join(10) for asker in askers]
+    assert panel._finder.wait() and panel._message.content == INVITATION
+    assert panel._results is None and not panel._tours
+
+
 def test_outputs_are_in_the_order_in_which_they_are_wanted(panel, viewer):
     type_in(panel, "dome; rose window")
     outputs = frame(viewer)
