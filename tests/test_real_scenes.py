@@ -31,7 +31,7 @@ def test_a_short_run_shows_the_facade_and_beats_the_mean_feature(train, real_sce
         # random weights follow them: what was learned must at least serve the photos it was learned from.
         assert metrics["psnr"] > 10.0
         datamanager, model = trainer.pipeline.datamanager, trainer.pipeline.model.eval()
-        camera, batch = datamanager.next_train(0)
+        camera, batch = next(datamanager.train_photos())
         learned = model.feature_metrics(camera, batch)
         assert learned["clip_l1"] < 0.7 * learned["clip_l1_of_mean"]
 

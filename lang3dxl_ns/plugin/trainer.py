@@ -204,13 +204,14 @@ class Lang3DXLTrainer(Trainer):
         second time, since the first may compile kernels."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         middle = int((cameras.width * cameras.height).flatten().argsort()[len(cameras) // 2])
-        model.eval()
-        for _ in range(2):
-            start = perf_counter()
-            model.get_outputs(cameras[middle : middle + 1])
-            synchronize()
-        rendering = perf_counter() - start
-        model.train()
+        with self.train_lock:  # the viewer may render too
+            model.eval()
+            for _ in range(2):
+                start = perf_counter()
+                model.get_outputs(cameras[middle : middle + 1])
+                synchronize()
+            rendering = perf_counter() - start
+            model.train()
         count = self.config.max_num_iterations
         seconds = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings]
         CONSOLE.log(f"training: {roughly(seconds)} for {count:,} iterations, more if Gaussians multiply")
