@@ -70,7 +70,7 @@ class SemanticEncoder(nn.Module, ABC):
 
     def learn_gaussians(
         self,
-        features: Float[Tensor, "n clip+dense"],
+        features: Float[Tensor, "n clip"],
         mass: Float[Tensor, " n"],
         advance: Callable[[], None] = lambda: None,
         basis: PrincipalBasis | None = None,

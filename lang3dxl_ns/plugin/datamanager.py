@@ -124,7 +124,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if self.targets is not None:
             prepared = set(self.targets.names)  # without damaged photos
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
-            facts.statistics = self.targets.feature_statistics(names)
+            facts.statistics = self.targets.feature_statistics(names, self.config.targets_in_steps)
             facts.clip_targets = partial(self.targets.clip_features, names)
             if self.targets.dense_dim:
                 facts.dense_targets = partial(self.targets.dense_features, names)
@@ -183,8 +183,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if self.targets is not None:
             plan = plan_crops(list(self.photos.values()), self._reconstruction(), config)
             sizes = novel_pixel_sizes(views, config) if plan.pixel_sizes is not None else None
-            clip_alone = replace(config, dense="none") if config.crops == "fine" else config
-            prepare(dataset.photos, sizes, clip_alone, plan.scales, FeatureStore(self.cache_dir), self.device)
+            config = config if config.targets_in_steps else replace(config, dense="none")
+            prepare(dataset.photos, sizes, config, plan.scales, FeatureStore(self.cache_dir), self.device)
         return dataset
 
     @cached_property
@@ -242,8 +242,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @cached_property
     def _train_cache(self) -> PhotoCache:
         _ = self.targets  # so that they are not made in the cache's thread
-        shown = self.config.targets_in_steps
-        return PhotoCache(lambda index: self._read(self.train_dataset, index, shown), self.cache_bytes)
+        read = partial(self._read, self.train_dataset, with_targets=self.config.targets_in_steps)
+        return PhotoCache(read, self.cache_bytes)
 
     @property
     def cache_bytes(self) -> float:

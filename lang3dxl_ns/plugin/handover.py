@@ -49,7 +49,7 @@ class SceneFacts:
     clip_targets: Callable[[], Iterator[Float[Tensor, "hd wd c"]]] | None = None
     """The CLIP targets of the training photos, one at a time."""
     dense_targets: Callable[[], Iterator[Float[Tensor, "t t d"]]] | None = None
-    """Their dense features; none without a dense encoder."""
+    """Their dense features; None without a dense encoder."""
 
     def into(self, metadata: dict[str, Any]) -> None:
         """Put them where nerfstudio carries them from dataset to model."""

@@ -69,11 +69,8 @@ class Lang3DXLModel(RenderingModel):
         self.semantic_field = self.downsampler = None
         statistics = self.facts.statistics
         if statistics is not None:
-            # Where features are gathered, dense ones sharpen them and are not kept.
-            clip, learned = statistics.clip, self.config.encoder.learns_from_renderings
-            dense = statistics.dense if learned else None
-            shown = FeatureStatistics(clip, dense)
-            self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean, shown)
+            clip, dense = statistics.clip, statistics.dense
+            self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean, statistics)
         self.look = None
         self.appearance = None
         if looks:

@@ -63,12 +63,11 @@ class TargetReader:
         fine: Collection[str] = (),
     ) -> None:
         self.names, self._fine = list(names), frozenset(fine)
-        self._store, self._with_regions = store, frozenset(with_regions)
-        self._with_dense = [name for name in self.names if name in frozenset(with_dense)]
+        self._store = store
+        self._with_dense, self._with_regions = frozenset(with_dense), frozenset(with_regions)
         self.clip_dim: int = store.shapes(self._clip_kind(self.names[0]), self.names[0])["features"][-1]
-        self.dense_dim: int = (
-            store.shapes(DENSE, self._with_dense[0])["features"][-1] if self._with_dense else 0
-        )
+        first = next((name for name in self.names if name in self._with_dense), None)
+        self.dense_dim: int = 0 if first is None else store.shapes(DENSE, first)["features"][-1]
 
     def _clip_kind(self, name: str) -> str:
         return FINE if name in self._fine else CLIP
@@ -119,12 +118,14 @@ class TargetReader:
                     f"`lang3dxl prepare` again, or give {CLIP_OPTION} the model that made the targets"
                 )
 
-    def feature_statistics(self, names: Sequence[str] | None = None, sample: int = 100) -> FeatureStatistics:
+    def feature_statistics(
+        self, names: Sequence[str] | None = None, with_dense: bool = True, sample: int = 100
+    ) -> FeatureStatistics:
         """Mean and deviation per channel over at most `sample` photos, evenly spaced in `names` (or all)."""
         names = self.names if names is None else list(names)
         names = names[:: -(-len(names) // sample)]
         clip = _statistics(self.clip(name).features for name in names)
-        dense = _statistics(self.dense_features(names)) if self._with_dense else None
+        dense = _statistics(self.dense_features(names)) if with_dense and self.dense_dim else None
         return FeatureStatistics(clip, dense)
 
 
