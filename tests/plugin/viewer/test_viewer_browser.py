@@ -105,9 +105,11 @@ def page(address):
 
 
 def picture(page) -> np.ndarray:
-    """[h, w, 3] pixels of the view, without the panel."""
-    canvas = page.locator("canvas").first.bounding_box()
-    shot = page.screenshot(clip={**canvas, "width": min(canvas["width"], 450)})
+    """[h, w, 3] pixels of the view, without the panel: always as many, also while the page is laid out."""
+    corner = page.locator("canvas").first.bounding_box()
+    shot = page.screenshot(
+        clip={"x": round(corner["x"]), "y": round(corner["y"]), "width": 450, "height": 340}
+    )
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 
