@@ -49,8 +49,6 @@ class Ablation:
     """Foreground, as in `lang3dxl prepare`; "none": the whole photo."""
     scale: float = 0.5
     """Size of the training photos relative to those on disk. Words are scored at half the size."""
-    dense_tokens: int = 48
-    """Dense tokens per side of a photo."""
     ns_train: str = ""
     """Extra flags of `ns-train lang3dxl`, for all rows, in one string: --ns-train="--pipeline.model.…"."""
     clipseg: str = "CIDAS/clipseg-rd64-refined"
@@ -68,7 +66,7 @@ class Ablation:
         with_regions = any((scene / "regions").is_dir() for scene in scenes.values())
         rows = choose_rows(self.rows, min(self.steps) < SHORT_FIELD_RUN, with_regions)
         settings = RunSettings(
-            self.clip, self.dense, self.foreground, self.scale, self.dense_tokens, self.ns_train, self.clipseg
+            self.clip, self.dense, self.foreground, self.scale, self.ns_train, self.clipseg
         )
         runs = [
             Run(row, path, label, seed, steps)

@@ -54,7 +54,6 @@ class RunSettings:
     dense: str
     foreground: str
     scale: float
-    dense_tokens: int
     flags: str
     """Extra flags of `ns-train lang3dxl`."""
     clipseg: str
@@ -172,7 +171,6 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
     config.timestamp = f"{run.row.name}-{run.seed}"
     data = config.pipeline.datamanager
     data.foreground, data.camera_res_scale_factor = settings.foreground, settings.scale
-    data.dense_tokens = settings.dense_tokens
     if settings.flags:
         config = tyro.cli(type(config), args=shlex.split(settings.flags), default=config)
         data = config.pipeline.datamanager

@@ -144,7 +144,8 @@ class Demo:
         config.timestamp = RUN.name
         config.pipeline.datamanager.foreground = "none"  # score every pixel, sky and people too
         config.pipeline.datamanager.camera_res_scale_factor = 0.5  # words are scored at half the size
-        config.pipeline.datamanager.dense_tokens = 32 if self.quick else 48
+        if self.quick:
+            config.pipeline.datamanager.dense_tokens = 32
         config.logging.steps_per_log = 50
         if self.ns_train:
             config = tyro.cli(type(config), args=shlex.split(self.ns_train), default=config)

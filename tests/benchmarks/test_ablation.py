@@ -27,7 +27,9 @@ BY_NAME = {row.name: row for row in ROWS}
 
 
 def settings(scale: float = 1.0) -> RunSettings:
-    return RunSettings("builtin", "builtin", "none", scale, 8, "", "nothing")
+    return RunSettings(
+        "builtin", "builtin", "none", scale, "--pipeline.datamanager.dense-tokens 8", "nothing"
+    )
 
 
 def runs_of(*names: str, seeds: int = 1, scene: str = "here") -> list[Run]:
@@ -243,8 +245,9 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, **sizes))
     out = tmp_path / "out"
     names = (FULL, TEACHER, LIMIT, CHANCE, CLIPSEG, "lifting")
-    few = "--pipeline.model.encoder.compression.steps 40"  # learning codes takes 15 seconds otherwise
-    short = {"steps": (4, 6), "dense_tokens": 8, "ns_train": few}
+    few = "--pipeline.datamanager.dense-tokens 8"
+    few += " --pipeline.model.encoder.compression.steps 40"  # learning codes takes 15 seconds otherwise
+    short = {"steps": (4, 6), "ns_train": few}
     command = Ablation(out, (scene,), rows=names, clipseg=str(tmp_path / "no"), **short)
     command.main()
     lengths = json.loads((out / "ablation.json").read_text())["lengths"]

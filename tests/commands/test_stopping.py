@@ -90,7 +90,8 @@ def test_a_stopped_comparison_ends_its_runs(tmp_path):
     sizes = {"photos": 8, "test_views": 0, "width": 128, "height": 96, "workers": 1}
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, **sizes))
     words = [sys.executable, "-m", "lang3dxl_ns.cli", "benchmark", "ablation", "--scene", str(scene)]
-    words += ["--out", str(tmp_path), "--rows", "full", "hash", "--dense-tokens", "8", "--workers", "2"]
+    words += ["--out", str(tmp_path), "--rows", "full", "hash", "--workers", "2"]
+    words += ["--ns-train=--pipeline.datamanager.dense-tokens 8"]
     # Started truly: all that belongs to it is a process group of its own.
     command = subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
