@@ -8,7 +8,10 @@ from typing import Any
 
 from lang3dxl_ns.common.errors import UserError
 
-FULL, TEACHER, LIMIT, CHANCE, CLIPSEG = "full", "teacher", "limit", "chance", "clipseg"
+FULL, TEACHER, LIMIT, CHANCE = "full", "teacher", "limit", "chance"
+CLIPSEG, LANGSAM = "clipseg", "langsam"
+SEGMENTERS = (CLIPSEG, LANGSAM)
+"""Rows of networks that segment a picture by text."""
 BOUNDS = (TEACHER, LIMIT, CHANCE)
 """Rows that every run of the full method includes: figures with these prefixes."""
 _FIELD, _DATA = "pipeline.model.semantic_field.", "pipeline.datamanager."
@@ -31,7 +34,7 @@ class Row:
     @property
     def trains(self) -> bool:
         """Whether the row needs its own training run."""
-        return self.name not in (*BOUNDS, CLIPSEG)
+        return self.name not in (*BOUNDS, *SEGMENTERS)
 
     @property
     def own_targets(self) -> bool:
@@ -51,6 +54,7 @@ ROWS = (
     Row(LIMIT, "2-D", "exact labels, lifted to the Gaussians and rendered back"),
     Row(CHANCE, "2-D", "a map without information"),
     Row(CLIPSEG, "2-D", "CLIPSeg", published="mAP .56"),
+    Row(LANGSAM, "2-D", "LangSAM: GroundingDINO's boxes, masks by SAM", published="mAP .25"),
     _encoder("feature3dgs", "Feature 3DGS: wide codes, linear layer", "L1 .149, PSNR 13.3"),
     _encoder("fmgs", "FMGS: hash grid over places, whole features rendered", "mAP .51; L1 .180, PSNR 11.6"),
     _encoder("langsplat", "LangSplat: per-scene autoencoder to 3 numbers", "mAP .19"),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from multiprocessing import active_children
 from pathlib import Path
 
-from lang3dxl_ns.baselines.rows import BOUNDS, CLIPSEG, FULL, Row, choose_rows
+from lang3dxl_ns.baselines.rows import BOUNDS, FULL, SEGMENTERS, Row, choose_rows
 from lang3dxl_ns.benchmarks.ablation_report import write_ablation
 from lang3dxl_ns.benchmarks.landmarks import Landmarks, landmark_scenes
 from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
@@ -53,6 +53,8 @@ class Ablation:
     """Extra flags of `ns-train lang3dxl`, for all rows, in one string: --ns-train="--pipeline.model.…"."""
     clipseg: str = "CIDAS/clipseg-rd64-refined"
     """CLIPSeg: a Hugging Face name or a folder. If unavailable, its row says "not run here"."""
+    langsam: tuple[str, str] = ("IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base")
+    """LangSAM's GroundingDINO and SAM, likewise."""
     workers: int = 1
     """Concurrent runs. They slow each other down: keep 1 where seconds matter."""
 
@@ -66,7 +68,7 @@ class Ablation:
         with_regions = any((scene / "regions").is_dir() for scene in scenes.values())
         rows = choose_rows(self.rows, min(self.steps) < SHORT_FIELD_RUN, with_regions)
         settings = RunSettings(
-            self.clip, self.dense, self.foreground, self.scale, self.ns_train, self.clipseg
+            self.clip, self.dense, self.foreground, self.scale, self.ns_train, self.clipseg, self.langsam
         )
         runs = [
             Run(row, path, label, seed, steps)
@@ -74,7 +76,7 @@ class Ablation:
             for steps in sorted(self.steps)
             for label, path in scenes.items()
             for row in rows
-            if row.trains or (row.name == CLIPSEG and seed == 0)
+            if row.trains or (row.name in SEGMENTERS and seed == 0)
         ]
         figures, failed = make_all(
             runs, ScoredRuns(self.out, settings), lambda *found: self._write(rows, *found), self.workers

@@ -83,7 +83,7 @@ class _Benchmark:
         flags = {k: v for k, v in self._flags(scene).items() if k not in _OF_THE_COMMAND}
         words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
         flags_of_all = shlex.join([*words, *shlex.split(self.ns_train)])
-        settings = RunSettings(self.clip, "auto", self.foreground, self.scale, flags_of_all, "none")
+        settings = RunSettings(self.clip, "auto", self.foreground, self.scale, flags_of_all)
         return KeptRuns(self.out, settings, scene.truth)
 
     def _flags(self, scene: BenchmarkScene) -> dict[str, str]:

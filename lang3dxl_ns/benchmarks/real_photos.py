@@ -56,7 +56,7 @@ class RealPhotos:
 
     def main(self) -> None:
         scenes = _labels(self.scene)
-        settings = RunSettings(self.clip, self.dense, "auto", self.scale, self.ns_train, "none")
+        settings = RunSettings(self.clip, self.dense, "auto", self.scale, self.ns_train)
         runs = [
             Run(row, path, label, 0, self.iterations)
             for label, path in scenes.items()

@@ -20,14 +20,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from lang3dxl_ns.baselines.rows import CLIPSEG, Row
+from lang3dxl_ns.baselines.rows import CLIPSEG, SEGMENTERS, Row
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import host_peak, in_own_process, write_atomically
 
 if TYPE_CHECKING:
-    from lang3dxl_ns.evaluation.scores import MapScorer
+    from lang3dxl_ns.evaluation.ground_truth import GroundTruth
     from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+    from lang3dxl_ns.preparation.segmentation import TextSegmenter
+    from lang3dxl_ns.scene.photo import Photo
 
 _LIBRARIES = ("lang3dxl_ns.plugin.trainer_config", "lang3dxl_ns.methods")
 """Imports of a run's process, preloaded because they take ten seconds."""
@@ -56,8 +58,10 @@ class RunSettings:
     scale: float
     flags: str
     """Extra flags of `ns-train lang3dxl`."""
-    clipseg: str
+    clipseg: str = ""
     """Name or folder of CLIPSeg."""
+    langsam: tuple[str, str] = ("", "")
+    """Names or folders of LangSAM's GroundingDINO and SAM."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +131,8 @@ class ScoredRuns:
     def _made_with(self, run: Run) -> dict[str, Any]:
         made_with = {"scene": str(run.scene), "changes": dict(run.row.changes), **asdict(self.settings)}
         made_with["clip_weights"] = self._clip_weights
-        if run.row.name != CLIPSEG:
-            del made_with["clipseg"]
+        for name in set(SEGMENTERS) - {run.row.name}:
+            del made_with[name]
         return json.loads(json.dumps(made_with))
 
 
@@ -200,7 +204,7 @@ def apply_changes(config: Any, changes: Mapping[str, Any]) -> None:
 
 def _in_process(run: Run, settings: RunSettings, work: Path, log: Path) -> dict[str, float]:
     write_output_to(log)
-    work_on = _score_clipseg if run.row.name == CLIPSEG else _train_and_score
+    work_on = _score_segmenter if run.row.name in SEGMENTERS else _train_and_score
     return work_on(run, settings, work)
 
 
@@ -300,34 +304,40 @@ def _now() -> float:
     return time.perf_counter()
 
 
-def _score_clipseg(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
-    """AP of CLIPSeg in the held-out photos themselves, by the same rules."""
-    from lang3dxl_ns.evaluation.aggregate import average
+def _score_segmenter(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
+    """AP of CLIPSeg or LangSAM in the very pictures that are scored, by the same rules."""
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-    from lang3dxl_ns.evaluation.scores import MapScorer
-    from lang3dxl_ns.preparation.segmentation import ClipSeg, find_text_segmenter
+    from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 
-    segmenter = ClipSeg(find_text_segmenter(settings.clipseg, sam="").words, "cpu")
+    words, sam = (settings.clipseg, "") if run.row.name == CLIPSEG else settings.langsam
+    segmenter = load_text_segmenter(find_text_segmenter(words, sam), "cpu")
     config = run_configuration(run, settings, work)
     config.pipeline.datamanager.clip = config.pipeline.datamanager.dense = "none"
-    datamanager = config.pipeline.datamanager.setup(device="cpu", test_mode="test")
-    scorer = MapScorer(GroundTruth(run.scene / "ground_truth"))
-    categories, photos = scorer.truth.categories, []
-    for photo in datamanager.eval_dataset.photos:
-        maps = dict(zip(categories, segmenter.probabilities(photo.read_uint8(), categories), strict=True))
-        photos.append(score_photo(maps, scorer, photo.name, (photo.height, photo.width)))
-    return average(photos)
+    data = config.pipeline.datamanager.setup(device="cpu", test_mode="test")
+    found = _score_pictures(segmenter, GroundTruth(run.scene / "ground_truth"), data.eval_dataset.photos)
+    if data.test_views is not None:
+        truth = GroundTruth(data.test_views.folder / "ground_truth", "plain")
+        scores = _score_pictures(segmenter, truth, data.test_dataset.photos)
+        found |= {f"test_{name}": value for name, value in scores.items()}
+    return found
 
 
-def score_photo(
-    maps: dict[str, Any], scorer: MapScorer, name: str, size: tuple[int, int]
+def _score_pictures(
+    segmenter: TextSegmenter, truth: GroundTruth, photos: Sequence[Photo]
 ) -> dict[str, float]:
-    """Figures of maps of a whole photo, by category."""
-    from lang3dxl_ns.evaluation.scores import resize_map
+    from lang3dxl_ns.evaluation.aggregate import average
+    from lang3dxl_ns.evaluation.scores import MapScorer, resize_map
 
-    small = scorer.truth.scoring_size(*size)
-    resized = {category: resize_map(scores[None], small)[0] for category, scores in maps.items()}
-    figures: dict[str, float] = {}
-    for prefix, variant in scorer.variants(resized).items():
-        figures |= scorer.scores(name, variant, prefix)
-    return figures
+    scorer, scored = MapScorer(truth), []
+    for photo in photos:
+        found = segmenter.probabilities(photo.read_uint8(), truth.categories)
+        small = resize_map(found, truth.scoring_size(photo.height, photo.width))
+        variants = scorer.variants(dict(zip(truth.categories, small, strict=True)))
+        scored.append(
+            {
+                k: v
+                for prefix, maps in variants.items()
+                for k, v in scorer.scores(photo.name, maps, prefix).items()
+            }
+        )
+    return average(scored)

@@ -9,7 +9,8 @@ from torch import Tensor
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map
 from lang3dxl_ns.preparation.encoders import ImageTextEncoder
-from lang3dxl_ns.query.text import TextEncoder
+from lang3dxl_ns.query.relevancy import CANONICAL
+from lang3dxl_ns.query.text import Prompt, TextConfig, TextEncoder
 
 
 class LanguageScorer(MapScorer):
@@ -21,9 +22,11 @@ class LanguageScorer(MapScorer):
 
     def __init__(self, truth: GroundTruth, encoder: ImageTextEncoder) -> None:
         super().__init__(truth)
-        text = TextEncoder(encoder.encode_texts)
-        self.queries = text.plain_queries(truth.categories)
+        self.queries = TextEncoder(encoder.encode_texts).plain_queries(truth.categories)
         """Queries of the categories, in their order."""
+        published = TextEncoder(encoder.encode_texts, TextConfig(combine="joined", negatives=CANONICAL))
+        self.published_queries = published.queries([Prompt(category) for category in truth.categories])
+        """As published: a specialist word joined with common ones, against canonical phrases alone."""
 
     def named(self, maps: Float[Tensor, "q H W"], size: tuple[int, int]) -> Maps:
         """Maps of the categories, at `size`, by name."""

@@ -200,17 +200,23 @@ class MapScorer:
         self._scored: set[str] = set()
 
     def variants(
-        self, maps: Maps, keep: Bool[Tensor, "H W"] | None = None, temperature: float = 1.0
+        self,
+        maps: Maps,
+        keep: Bool[Tensor, "H W"] | None = None,
+        temperature: float = 1.0,
+        of_published_prompts: Maps | None = None,
     ) -> dict[str, Maps]:
         """The maps to score, by the prefix of their figures.
 
         For masks: "" blurred, "raw_" unprocessed, "authors_" `as_published`. For LERF-OVS, whose measures
         include smoothing: "" unprocessed. keep: maps are 0 outside, before and after the blur.
+        of_published_prompts: what "authors_" is made of, if not `maps`.
         """
         raw = inside(maps, keep)
         if self.truth.layout == "lerf_ovs":
             return {"": raw}
-        published = as_published(inside(softened(maps, temperature), keep))
+        of_published_prompts = maps if of_published_prompts is None else of_published_prompts
+        published = as_published(inside(softened(of_published_prompts, temperature), keep))
         return {"": inside(blurred(raw), keep), "raw_": raw, "authors_": published}
 
     def scores(

@@ -227,7 +227,11 @@ class Lang3DXLPipeline(VanillaPipeline):
         raw = scorer.named(self.relevancy(camera, scorer.queries.to(self.device)), size)
         synchronize()
         evaluated.metrics["query_seconds"] = perf_counter() - start
-        variants = scorer.variants(raw, keep, TEMPERATURE)
+        published = None
+        if scorer.truth.layout != "lerf_ovs":  # which is scored in one way only
+            queries = scorer.published_queries.to(self.device)
+            published = scorer.named(self.relevancy(camera, queries), size)
+        variants = scorer.variants(raw, keep, TEMPERATURE, published)
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
         evaluated.field_maps, evaluated.teacher_maps = variants[""], teacher
         truths = _truths(scorer.truth, photo, map_size(raw))

@@ -39,6 +39,9 @@ class TextSegmenter(Protocol):
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
         """Mask of any of the prompts, at the size of the image, on the CPU."""
 
+    def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
+        """Confidence in every prompt at every pixel, 0…1, at the size of the image, on the CPU."""
+
 
 @dataclass(frozen=True)
 class SegmenterFiles:
@@ -99,7 +102,7 @@ class ClipSeg:
 
     @torch.no_grad()
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Probability of every prompt in every pixel, at the size of the image, on the CPU."""
+        """As `TextSegmenter.probabilities`."""
         inputs = self._processor(
             text=list(prompts),
             images=[_picture(image)] * len(prompts),
@@ -114,7 +117,7 @@ class ClipSeg:
 
 
 class BoxesAndSam:
-    """GroundingDINO (Liu et al. 2023) finds boxes, SAM (Kirillov et al. 2023) segments each."""
+    """GroundingDINO (Liu et al. 2023) finds boxes, SAM (Kirillov et al. 2023) segments each: LangSAM."""
 
     def __init__(self, words: ModelFiles, sam: ModelFiles, device: torch.device | str) -> None:
         from transformers import (
@@ -129,12 +132,29 @@ class BoxesAndSam:
         self._sam = load_weights(SamModel, sam, device)
         self._sam_processor = _load_processor(SamProcessor, sam)
 
-    @torch.no_grad()
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
-        """As `TextSegmenter.segment`. One pass per prompt, so that prompts don't compete."""
-        boxes = torch.cat([self.boxes(image, prompt) for prompt in prompts])
+        """As `TextSegmenter.segment`."""
+        return (self.probabilities(image, prompts) > 0).any(dim=0)
+
+    def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
+        """As `TextSegmenter.probabilities`: the score of the best box whose mask covers the pixel, else 0.
+
+        The detector sees one prompt at a time, so that prompts don't compete.
+        """
+        found = [self.boxes(image, prompt) for prompt in prompts]
+        masks = self._masks(image, torch.cat([boxes for boxes, _ in found])).float()
+        maps = torch.zeros(len(prompts), *image.shape[:2])
+        first = 0
+        for one, (_, scores) in zip(maps, found, strict=True):
+            for mask, score in zip(masks[first : first + len(scores)], scores, strict=True):
+                torch.maximum(one, mask * score, out=one)
+            first += len(scores)
+        return maps
+
+    @torch.no_grad()
+    def _masks(self, image: UInt8[Tensor, "h w 3"], boxes: Float[Tensor, "n 4"]) -> Bool[Tensor, "n h w"]:
         if not len(boxes):
-            return torch.zeros(image.shape[:2], dtype=torch.bool)
+            return torch.zeros(0, *image.shape[:2], dtype=torch.bool)
         inputs = self._sam_processor(
             images=_picture(image), input_boxes=[boxes.tolist()], return_tensors="pt"
         ).to(self._sam.device, torch.float32)
@@ -144,19 +164,22 @@ class BoxesAndSam:
             inputs["original_sizes"].cpu(),
             reshaped_input_sizes=inputs["reshaped_input_sizes"].cpu(),
         )
-        return masks[0].any(dim=(0, 1))
+        return masks[0][:, 0]
 
     @torch.no_grad()
-    def boxes(self, image: UInt8[Tensor, "h w 3"], prompt: str) -> Float[Tensor, "n 4"]:
-        """Left, top, right and bottom of what the prompt names, in pixels."""
+    def boxes(
+        self, image: UInt8[Tensor, "h w 3"], prompt: str
+    ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
+        """Left, top, right and bottom of what the prompt names, in pixels; and the scores."""
         caption = prompt.strip().lower().rstrip(".") + "."  # the form that the detector was trained with
         inputs = self._detector_processor(images=_picture(image), text=caption, return_tensors="pt")
         output = self._detector(**inputs.to(self._detector.device))
         scores = output.logits[0].sigmoid().amax(dim=-1)
-        centers, sizes = output.pred_boxes[0][scores >= _BOX_THRESHOLD].cpu().chunk(2, dim=-1)
+        kept = scores >= _BOX_THRESHOLD
+        centers, sizes = output.pred_boxes[0][kept].cpu().chunk(2, dim=-1)
         height, width = image.shape[:2]
         corners = torch.cat([centers - sizes / 2, centers + sizes / 2], dim=-1).clamp(0, 1)
-        return corners * torch.tensor([width, height, width, height])
+        return corners * torch.tensor([width, height, width, height]), scores[kept].cpu()
 
 
 class AutomaticSam:

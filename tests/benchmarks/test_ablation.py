@@ -8,8 +8,20 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from tiny_models import make_tiny_grounding_dino, make_tiny_sam
 
-from lang3dxl_ns.baselines.rows import CHANCE, CLIPSEG, FULL, LIMIT, ROWS, SYSTEMS, TEACHER, Row, choose_rows
+from lang3dxl_ns.baselines.rows import (
+    CHANCE,
+    CLIPSEG,
+    FULL,
+    LANGSAM,
+    LIMIT,
+    ROWS,
+    SYSTEMS,
+    TEACHER,
+    Row,
+    choose_rows,
+)
 from lang3dxl_ns.benchmarks.ablation import Ablation, bound_figures, make_all
 from lang3dxl_ns.benchmarks.ablation_report import mark_front, spread, table_of_runs, write_ablation
 from lang3dxl_ns.benchmarks.landmarks import LANDMARKS, TEST, VALIDATION
@@ -103,12 +115,12 @@ def test_no_runs_at_a_time_is_an_error(tmp_path):
 
 def test_clipsegs_folder_decides_about_its_own_row_alone(tmp_path):
     made: list[str] = []
-    runs = runs_of(FULL, CLIPSEG)
+    runs = runs_of(FULL, CLIPSEG, LANGSAM)
     for folder in ("here", "there"):
         store = Counting(tmp_path, made)
         store.settings = replace(store.settings, clipseg=folder)
         make_all(runs, store, lambda *_: None)
-    assert made == ["here/full/1200-0", "here/clipseg/1200-0", "here/clipseg/1200-0"]
+    assert made == [f"here/{name}/1200-0" for name in (FULL, CLIPSEG, LANGSAM, CLIPSEG)]
 
 
 def test_a_figure_that_is_not_finite_gives_no_result(tmp_path, monkeypatch):
@@ -244,11 +256,14 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     sizes = {"photos": 10, "test_views": 6, "width": 128, "height": 96, "workers": 1}
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, **sizes))
     out = tmp_path / "out"
-    names = (FULL, TEACHER, LIMIT, CHANCE, CLIPSEG, "lifting")
+    names = (FULL, TEACHER, LIMIT, CHANCE, CLIPSEG, LANGSAM, "lifting")
+    detector = make_tiny_grounding_dino(tmp_path / "detector", seed=2)
+    sam = make_tiny_sam(tmp_path / "sam", seed=2)
     few = "--pipeline.datamanager.dense-tokens 8"
     few += " --pipeline.model.encoder.compression.steps 40"  # learning codes takes 15 seconds otherwise
     short = {"steps": (4, 6), "ns_train": few}
-    command = Ablation(out, (scene,), rows=names, clipseg=str(tmp_path / "no"), **short)
+    short |= {"clipseg": str(tmp_path / "no"), "langsam": (str(detector), str(sam))}
+    command = Ablation(out, (scene,), rows=names, **short)
     command.main()
     lengths = json.loads((out / "ablation.json").read_text())["lengths"]
     assert list(lengths) == ["4", "6"]
@@ -256,6 +271,8 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
         assert [bool(row["mean"]) for row in rows] == [row["row"] != CLIPSEG for row in rows]
         assert next(row for row in rows if row["row"] == CLIPSEG)["not_run"]
         means = {row["row"]: row["mean"] for row in rows if row["mean"]}
+        assert 0 < means[LANGSAM]["test_map"]["mean"] < means[TEACHER]["test_map"]["mean"]
+        del means[LANGSAM]  # scored where others are tested, not where they are trained
         for split in ("", "test_", "seen_"):
             scores = {name: values[f"{split}map"]["mean"] for name, values in means.items()}
             assert scores[CHANCE] < scores[TEACHER] and 2 * scores[CHANCE] < scores[LIMIT]

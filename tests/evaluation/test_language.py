@@ -6,6 +6,8 @@ from label_sets import write_plain
 
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.language import LanguageScorer
+from lang3dxl_ns.evaluation.scores import MapScorer
+from lang3dxl_ns.query.relevancy import CANONICAL
 
 
 class OneHot:
@@ -32,3 +34,25 @@ def test_field_and_teacher_are_scored_by_the_same_rules(tmp_path):
     teacher = scorer.teacher_maps(features, size)
     assert scorer.scores("0001.jpg", field)["ap_domes"] == 1.0
     assert scorer.scores("0001.jpg", teacher, "teacher_")["teacher_ap_domes"] == 1.0
+
+
+def test_published_prompts_are_joined_with_common_words_and_compete_with_canonical_phrases_alone(tmp_path):
+    mask = np.zeros((40, 60), bool)
+    mask[8:24, 16:48] = True
+    for category in ("domes", "portals"):
+        write_plain(tmp_path, category, "0001", mask)
+    encoder = OneHot(["domes", "portals", "doorway, gate, entrance, portals", "object"])
+    published = LanguageScorer(GroundTruth(tmp_path), encoder).published_queries
+    cosines = published.cosines(torch.eye(8)[[0, 2]])  # features of a dome, and of a portal by many names
+    relevancy = published.relevancy_of_cosines(cosines)
+    assert (relevancy > 0.5).tolist() == [[True, False], [False, True]]
+    assert len(published.vectors) == 2 + len(CANONICAL)
+
+
+def test_the_published_variant_alone_is_made_of_published_prompts(tmp_path):
+    write_plain(tmp_path, "domes", "0001", np.eye(40, 60, dtype=bool))
+    scorer = MapScorer(GroundTruth(tmp_path))
+    ours, theirs = {"domes": torch.rand(20, 30)}, {"domes": torch.rand(20, 30)}
+    mixed = scorer.variants(ours, of_published_prompts=theirs)
+    for prefix, maps in {"": ours, "raw_": ours, "authors_": theirs}.items():
+        assert torch.equal(mixed[prefix]["domes"], scorer.variants(maps)[prefix]["domes"])

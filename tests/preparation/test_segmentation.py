@@ -84,9 +84,10 @@ def test_boxes_are_those_of_transformers_own_postprocessing(models):
         output, inputs.input_ids, threshold=0.3, target_sizes=[(60, 90)]
     )
     found = load_text_segmenter(find_text_segmenter(models["grounding"], models["sam"]), "cpu")
-    boxes = found.boxes(IMAGE, " Tower. ")
+    boxes, scores = found.boxes(IMAGE, " Tower. ")
     largest = torch.tensor([90.0, 60.0, 90.0, 60.0])
     torch.testing.assert_close(boxes, expected["boxes"].clamp(min=0).minimum(largest), rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(scores, expected["scores"], rtol=1e-4, atol=1e-5)
     assert len(boxes) > 1
 
 
@@ -105,10 +106,24 @@ def test_a_prompt_is_put_as_the_detector_was_trained_with(models, monkeypatch):
 
 def test_one_box_and_no_box_give_a_mask_too(models, monkeypatch):
     found = load_text_segmenter(find_text_segmenter(models["grounding"], models["sam"]), "cpu")
-    monkeypatch.setattr(found, "boxes", lambda image, prompt: torch.tensor([[10.0, 10.0, 40.0, 50.0]]))
+    monkeypatch.setattr(found, "boxes", lambda *_: (torch.tensor([[10.0, 10.0, 40.0, 50.0]]), torch.ones(1)))
     assert found.segment(IMAGE, ["tower"]).shape == (60, 90)
-    monkeypatch.setattr(found, "boxes", lambda image, prompt: torch.zeros(0, 4))
+    monkeypatch.setattr(found, "boxes", lambda *_: (torch.zeros(0, 4), torch.zeros(0)))
     assert not found.segment(IMAGE, ["tower", "sky"]).any()
+
+
+def test_a_pixel_has_the_score_of_the_best_box_whose_mask_covers_it(models, monkeypatch):
+    found = load_text_segmenter(find_text_segmenter(models["grounding"], models["sam"]), "cpu")
+    scores = {"tower": torch.tensor([0.4, 0.9, 0.5]), "sky": torch.zeros(0), "dome": torch.tensor([0.7])}
+    monkeypatch.setattr(
+        found, "boxes", lambda _, prompt: (torch.zeros(len(scores[prompt]), 4), scores[prompt])
+    )
+    masks = torch.zeros(4, 60, 90, dtype=torch.bool)
+    masks[0, :30], masks[1, 10:20], masks[2, 25:40], masks[3, :, :5] = True, True, True, True
+    monkeypatch.setattr(found, "_masks", lambda *_: masks)
+    tower, sky, dome = found.probabilities(IMAGE, list(scores))
+    assert tower[[0, 15, 27, 35, 50], 0].tolist() == pytest.approx([0.4, 0.9, 0.5, 0.5, 0])
+    assert not sky.any() and torch.equal(dome, 0.7 * masks[3])
 
 
 def test_automatic_masks_cover_the_image_at_its_own_size(models, monkeypatch):
