@@ -41,10 +41,11 @@ def sharpen(
     total = share.new_zeros(_GROUPS).index_add_(0, group, share)
     weight = (share / total[group].clamp_min(torch.finfo(share.dtype).tiny))[:, None]
     means = features.new_zeros(_GROUPS, features.shape[1])
-    for rows in torch.arange(len(features), device=mass.device).split(_ROWS):
+    parts = seen.nonzero()[:, 0].split(_ROWS)
+    for rows in parts:
         means.index_add_(0, group[rows], weight[rows] * features[rows])
     sharp = features.clone()
-    for rows in seen.nonzero()[:, 0].split(_ROWS):
+    for rows in parts:
         sharp[rows] = sharp[rows].lerp(means[group[rows]], _SHARE)
     return sharp
 
@@ -53,6 +54,7 @@ def _groups(dense: Float[Tensor, "n r"], mass: Float[Tensor, " n"]) -> Int[Tenso
     """The nearest of k-means centroids; Gaussians count by √mass, so that small things have groups too."""
     from sklearn.cluster import KMeans
 
+    dense = dense - dense.mean(0)  # distances of what is far from 0 would cancel in float32
     chosen = torch.arange(len(dense))
     if len(dense) > _SAMPLE:
         chosen = torch.linspace(0, len(dense) - 1, _SAMPLE, dtype=torch.float64).long()

@@ -16,6 +16,7 @@ from lang3dxl_ns.numerics import (
     principal_basis,
     rasterizer,
     relevancy,
+    sharpening,
 )
 from lang3dxl_ns.numerics.measure import Case
 
@@ -30,6 +31,7 @@ GROUPS = (
     relevancy,
     principal_basis,
     gathering,
+    sharpening,
     compression,
 )
 
