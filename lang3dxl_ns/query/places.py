@@ -1,15 +1,12 @@
-"""Places in 3D: back-projection of matching pixels, and boxes around them."""
+"""Places in 3D: boxes around matching Gaussians."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
-
-from lang3dxl_ns.scene.camera import Camera
 
 _OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
@@ -38,18 +35,6 @@ class Box:
     def center(self) -> tuple[float, ...]:
         """The box's center."""
         return tuple((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
-
-
-def world_points(
-    camera: Camera, depth: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
-) -> Float[Tensor, "n 3"]:
-    """World positions of the masked pixels' centers, from depth along the camera's axis."""
-    rows, columns = mask.nonzero().T
-    view, k = camera.view_matrix.to(depth), camera.intrinsics.to(depth)
-    z = depth[rows, columns]
-    x = (columns + 0.5 - k[0, 2]) / k[0, 0] * z
-    y = (rows + 0.5 - k[1, 2]) / k[1, 1] * z
-    return (torch.stack([x, y, z], dim=1) - view[:3, 3]) @ view[:3, :3]
 
 
 def strongest_match(

@@ -1,25 +1,9 @@
-"""Back-projection of matches to 3D, and their boxes."""
+"""Boxes around matches in 3D."""
 
 import pytest
 import torch
 
-from lang3dxl_ns.query.places import strongest_match, world_points
-from lang3dxl_ns.scene.camera import Camera
-
-
-def test_points_project_back_to_their_pixels():
-    generator = torch.Generator().manual_seed(0)
-    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator)).Q
-    view = torch.eye(4)
-    view[:3, :3], view[:3, 3] = rotation, torch.tensor([0.3, -0.2, 1.0])
-    camera = Camera(view, torch.tensor([[40.0, 0, 11.0], [0, 50.0, 7.0], [0, 0, 1]]), 20, 12)
-    depth = 1 + torch.rand(12, 20, generator=generator)
-    mask = torch.rand(12, 20, generator=generator) > 0.5
-    seen = world_points(camera, depth, mask) @ rotation.T + view[:3, 3]
-    torch.testing.assert_close(seen[:, 2], depth[mask])
-    pixels = seen @ camera.intrinsics.T / seen[:, 2:]
-    rows, columns = mask.nonzero().T
-    torch.testing.assert_close(pixels[:, :2], torch.stack([columns, rows], 1) + 0.5)
+from lang3dxl_ns.query.places import strongest_match
 
 
 def clouds(*places: float, count: int = 500) -> torch.Tensor:

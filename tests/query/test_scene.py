@@ -9,7 +9,6 @@ from painted_scene import DISTANCE, DOME, WINDOWS, fill, painted_gaussians, pain
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.places import world_points
 from lang3dxl_ns.query.scene import QueryConfig
 from lang3dxl_ns.scene.camera import camera_to_world
 
@@ -21,9 +20,11 @@ def scene():
 
 def painted(camera, word: int) -> torch.Tensor:
     """Pixels of a camera whose middle shows a word."""
-    everywhere = torch.ones(camera.height, camera.width, dtype=torch.bool)
-    points = world_points(camera, DISTANCE * everywhere, everywhere)[:, :2]
-    return (word_at(points) == word).view(camera.height, camera.width)
+    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    pixels = torch.stack([columns + 0.5, rows + 0.5, torch.ones(rows.shape)], -1)
+    seen = DISTANCE * pixels @ camera.intrinsics.inverse().T  # in the camera's frame
+    points = (seen - camera.view_matrix[:3, 3]) @ camera.view_matrix[:3, :3]
+    return word_at(points.reshape(-1, 3)[:, :2]).view(rows.shape) == word
 
 
 def wider(mask: torch.Tensor) -> torch.Tensor:
