@@ -11,7 +11,7 @@ import inspect
 from collections.abc import Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +131,7 @@ class ImageTextEncoder:
     def encode_images(self, crops: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n c"]:
         """Embeddings of square crops, RGB in 0…1, on the encoder's device; other sizes are resized first."""
         crops = _resize(crops.to(self._device, torch.float32), self.crop_size)
-        with _half_precision_on_cuda(self._device):
+        with _precision_of_images(self._device):
             output = self._model.get_image_features(pixel_values=(crops - self._mean) / self._std)
         return output.pooler_output.float()
 
@@ -346,6 +346,24 @@ def _resize(images: Float[Tensor, "n 3 h w"], side: int) -> Float[Tensor, "n 3 s
     if images.shape[-2:] == (side, side):
         return images
     return F.interpolate(images, (side, side), mode="bicubic", antialias=True).clamp(0.0, 1.0)
+
+
+def _precision_of_images(device: torch.device) -> torch.autocast:
+    """16 bits where the hardware multiplies them: float16 on a GPU, bfloat16 on some CPUs."""
+    if device.type == "cpu":
+        return torch.autocast("cpu", dtype=torch.bfloat16, enabled=_multiplies_bfloat16())
+    return _half_precision_on_cuda(device)
+
+
+@cache
+def _multiplies_bfloat16() -> bool:
+    """Whether this machine's CPU does. Elsewhere bfloat16 is slower than float32."""
+    try:
+        from llvmlite.binding import get_host_cpu_features
+    except ImportError:
+        return False
+    features = get_host_cpu_features()
+    return bool(features.get("avx512bf16") or features.get("amx-bf16"))
 
 
 def _half_precision_on_cuda(device: torch.device) -> torch.autocast:

@@ -38,8 +38,8 @@ from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetRe
 from lang3dxl_ns.preparation.workers import Workers
 from lang3dxl_ns.scene.photo import Photo
 
-_CROP_RULE = 3
-"""Increased when the crops or their average change, so that older entries are made again."""
+_CROP_RULE = 4
+"""Increased when crops, their encoding or their average change, so that older entries are made again."""
 _CHECKERS = 4
 """Threads that check photos."""
 _PATIENCE_S = 1.0

@@ -38,9 +38,10 @@ def clip(clip_folder):
     return load_image_text_encoder(str(clip_folder), "cpu")
 
 
-def test_image_embeddings_are_those_of_transformers_own_pipeline(clip, clip_folder):
+def test_image_embeddings_are_those_of_transformers_own_pipeline(clip, clip_folder, monkeypatch):
     from transformers import CLIPImageProcessor, CLIPModel
 
+    monkeypatch.setattr(encoders, "_multiplies_bfloat16", lambda: False)
     levels = torch.randint(0, 256, (5, 3, 32, 32), generator=torch.manual_seed(0), dtype=torch.uint8)
     pixels = CLIPImageProcessor.from_pretrained(clip_folder)(list(levels), return_tensors="pt")[
         "pixel_values"
@@ -52,6 +53,19 @@ def test_image_embeddings_are_those_of_transformers_own_pipeline(clip, clip_fold
     embeddings = clip.encode_images(levels / 255)
     assert embeddings.shape == (5, clip.dim) == (5, 64)
     torch.testing.assert_close(embeddings, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_bfloat16_changes_image_embeddings_by_half_a_percent_at_most_and_texts_not_at_all(monkeypatch):
+    clip = load_image_text_encoder("builtin", "cpu")
+    crops = torch.rand(9, 3, 48, 48, generator=torch.Generator().manual_seed(0))
+    found = []
+    for multiplies in (False, True):
+        monkeypatch.setattr(encoders, "_multiplies_bfloat16", lambda it=multiplies: it)
+        found.append((clip.encode_images(crops), clip.encode_texts(["dome"])))
+    (exact, text), (rounded, same) = found
+    assert rounded.dtype == torch.float32 and torch.equal(text, same)
+    assert not torch.equal(exact, rounded)
+    assert ((rounded - exact).norm(dim=1) < 0.005 * exact.norm(dim=1)).all()
 
 
 def test_text_embeddings_are_those_of_transformers_own_pipeline_one_by_one(clip, clip_folder):
