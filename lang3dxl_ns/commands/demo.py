@@ -61,7 +61,7 @@ class Demo:
     test_views: int = 24
     """Novel views with exact labels to score, besides the held-out photos; 0: none."""
     quick: bool = False
-    """Two minutes instead of ten: fewer photos and iterations, less accurate words."""
+    """Half the time: fewer photos and iterations, less accurate words."""
     clip: str = "builtin"
     """CLIP: "builtin", a Hugging Face name, a folder, or "none" for colors only."""
     dense: str = "builtin"
@@ -255,7 +255,7 @@ def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, thresholds: di
     real, rendered = photo.images["img"].cpu().chunk(2, dim=1)
     scorer, truth = trainer.pipeline.scorer, {}
     if scorer is not None:
-        size = next(iter(photo.field_maps.values())).shape
+        size = next(iter(photo.maps.values())).shape
         truth = scorer.truth.masks(photo.name, (size[0], size[1]))
     codes = photo.images.get("bottleneck", rendered)
     return PictureRow(
@@ -263,7 +263,7 @@ def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, thresholds: di
         photo=real.numpy(),
         rendering=rendered.numpy(),
         codes=codes.cpu().numpy(),
-        relevancy={prompt: m.cpu().numpy() for prompt, m in photo.field_maps.items()},
+        relevancy={prompt: m.cpu().numpy() for prompt, m in photo.maps.items()},
         truth={prompt: mask for prompt, mask in truth.items() if mask.any()},
         thresholds=thresholds,
     )

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
+
+from lang3dxl_ns.evaluation.scores import resize_map
+from lang3dxl_ns.query.heat_maps import overlay
 
 COLUMNS = 4
 """Prompts shown per photo."""
@@ -69,14 +73,10 @@ def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
 
 def _draw_prompt(axis, prompt: str, row: PictureRow) -> None:
     height, width = row.truth[prompt].shape
-    extent = (0, width, height, 0)
-    gray = row.rendering.mean(axis=2)
-    axis.imshow(gray, cmap="gray", extent=extent, vmin=0, vmax=1)
-    score = row.relevancy[prompt]
-    low = row.thresholds[prompt]
-    high = max(float(score.max()), low + 1e-6)
-    opacity = 0.75 * np.clip((score - low) / (high - low), 0, 1) ** 0.5
-    axis.imshow(score, cmap="turbo", extent=extent, vmin=low, vmax=high, alpha=opacity)
+    gray = torch.from_numpy(row.rendering).mean(dim=2).expand(3, -1, -1)
+    picture = resize_map(gray, (height, width)).permute(1, 2, 0).clamp(0, 1)
+    found = overlay(picture, torch.from_numpy(row.relevancy[prompt]).float(), row.thresholds[prompt])
+    axis.imshow(found.numpy(), extent=(0, width, height, 0))
     axis.contour(
         row.truth[prompt].astype(float),
         levels=[0.5],

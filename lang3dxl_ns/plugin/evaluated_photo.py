@@ -23,11 +23,8 @@ class EvaluatedPhoto:
     images: dict[str, Tensor]
     """`img` (photo beside rendering, [H, 2W, 3]); with semantics `bottleneck`; with appearance `fitted`, the
     rendering in the look of the half-image protocol."""
-    field_maps: Maps
-    """Relevancy by category as scored without prefix: blurred, at half the photo's size; empty without
-    ground truth."""
-    teacher_maps: Maps
-    """The same for the photo's own CLIP target."""
+    maps: Maps
+    """Relevancy by category, as queries show it, at the size of scoring; empty without ground truth."""
     masked: bool = False
     """Whether the maps are restricted to a foreground mask."""
 

@@ -207,7 +207,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
         metrics |= self.model.feature_metrics(camera, batch)
         metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
-        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, {}, "mask" in batch)
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, "mask" in batch)
         if score is not None:
             score(camera, evaluated, batch, photo)
         return evaluated
@@ -233,7 +233,7 @@ class Lang3DXLPipeline(VanillaPipeline):
             published = scorer.named(self.relevancy(camera, queries), size)
         variants = scorer.variants(raw, keep, TEMPERATURE, published)
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
-        evaluated.field_maps, evaluated.teacher_maps = variants[""], teacher
+        evaluated.maps = inside(raw, keep)
         truths = _truths(scorer.truth, photo, map_size(raw))
         for prefix, maps in (variants | {"teacher_": teacher}).items():
             evaluated.metrics |= scorer.scores(photo.name, maps, prefix, truths)
@@ -281,7 +281,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         for photo in self.evaluate(split):
             if output_path is not None:
                 photo.write_pictures(output_path)
-            photo.images, photo.field_maps, photo.teacher_maps = {}, {}, {}  # too large for all photos
+            photo.images, photo.maps = {}, {}  # too large for all photos
             evaluated.append(photo)
         results = average([photo.metrics for photo in evaluated], get_std)
         if get_std:
