@@ -333,11 +333,5 @@ def _score_pictures(
         found = segmenter.probabilities(photo.read_uint8(), truth.categories)
         small = resize_map(found, truth.scoring_size(photo.height, photo.width))
         variants = scorer.variants(dict(zip(truth.categories, small, strict=True)))
-        scored.append(
-            {
-                k: v
-                for prefix, maps in variants.items()
-                for k, v in scorer.scores(photo.name, maps, prefix).items()
-            }
-        )
+        scored.append(scorer.scores_of(photo.name, variants))
     return average(scored)

@@ -99,9 +99,7 @@ def score_predictions(
             size = truth.scoring_size(*truth.size(key))
             truths = truth.truths(key, size)
             found: Maps = {category: predicted.read(category, key, size) for category in truths}
-            figures[key] = {}
-            for prefix, variant in scorer.variants(found, keeps[key], temperature).items():
-                figures[key] |= scorer.scores(key, variant, prefix, truths)
+            figures[key] = scorer.scores_of(key, scorer.variants(found, keeps[key], temperature), truths)
     masked = sum(keep is not None for keep in keeps.values())
     statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"
     protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(

@@ -199,6 +199,11 @@ class MapScorer:
         """By category, the photos left out because their label of it is empty."""
         self._scored: set[str] = set()
 
+    @property
+    def smooths(self) -> bool:
+        """Whether the measures smooth maps themselves, so that there is one variant only."""
+        return self.truth.layout == "lerf_ovs"
+
     def variants(
         self,
         maps: Maps,
@@ -213,7 +218,7 @@ class MapScorer:
         of_published_prompts: what "authors_" is made of, if not `maps`.
         """
         raw = inside(maps, keep)
-        if self.truth.layout == "lerf_ovs":
+        if self.smooths:
             return {"": raw}
         of_published_prompts = maps if of_published_prompts is None else of_published_prompts
         published = as_published(inside(softened(of_published_prompts, temperature), keep))
@@ -233,12 +238,21 @@ class MapScorer:
                 self._scored.add(category)
             else:
                 self.without.setdefault(category, set()).add(photo)
-        return score_maps(maps, truths, prefix, smooth=self.truth.layout == "lerf_ovs")
+        return score_maps(maps, truths, prefix, self.smooths)
+
+    def scores_of(
+        self, photo: str, variants: Mapping[str, Maps], truths: Mapping[str, Truth] | None = None
+    ) -> dict[str, float]:
+        """`scores` of maps by their prefix, together."""
+        found: dict[str, float] = {}
+        for prefix, maps in variants.items():
+            found |= self.scores(photo, maps, prefix, truths)
+        return found
 
     def protocol(self, mask: str) -> dict[str, Any]:
         """What the figures mean, for a report. mask: how the foreground was treated."""
         truth = self.truth
-        size = "the labels'" if truth.layout == "lerf_ovs" else "half the photo's"
+        size = "the labels'" if self.smooths else "half the photo's"
         return {
             "ground_truth": str(truth.folder),
             "layout": truth.layout,

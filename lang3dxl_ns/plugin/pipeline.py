@@ -228,15 +228,14 @@ class Lang3DXLPipeline(VanillaPipeline):
         synchronize()
         evaluated.metrics["query_seconds"] = perf_counter() - start
         published = None
-        if scorer.truth.layout != "lerf_ovs":  # which is scored in one way only
+        if not scorer.smooths:
             queries = scorer.published_queries.to(self.device)
             published = scorer.named(self.relevancy(camera, queries), size)
         variants = scorer.variants(raw, keep, TEMPERATURE, published)
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
         evaluated.maps = inside(raw, keep)
         truths = _truths(scorer.truth, photo, map_size(raw))
-        for prefix, maps in (variants | {"teacher_": teacher}).items():
-            evaluated.metrics |= scorer.scores(photo.name, maps, prefix, truths)
+        evaluated.metrics |= scorer.scores_of(photo.name, variants | {"teacher_": teacher}, truths)
         evaluated.metrics |= bounds(inside(resized(limit(camera), size), keep), truths)
 
     @torch.no_grad()

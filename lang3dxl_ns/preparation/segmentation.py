@@ -142,13 +142,11 @@ class BoxesAndSam:
         The detector sees one prompt at a time, so that prompts don't compete.
         """
         found = [self.boxes(image, prompt) for prompt in prompts]
-        masks = self._masks(image, torch.cat([boxes for boxes, _ in found])).float()
+        masks = iter(self._masks(image, torch.cat([boxes for boxes, _ in found])))
         maps = torch.zeros(len(prompts), *image.shape[:2])
-        first = 0
         for one, (_, scores) in zip(maps, found, strict=True):
-            for mask, score in zip(masks[first : first + len(scores)], scores, strict=True):
-                torch.maximum(one, mask * score, out=one)
-            first += len(scores)
+            for score in scores:
+                torch.maximum(one, next(masks) * score, out=one)
         return maps
 
     @torch.no_grad()
