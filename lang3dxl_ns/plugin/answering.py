@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
-from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor
 
+from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.query.answer import Asked
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import Parameter
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.plugin.splatfacto import RGB2SH, num_sh_bases
 from lang3dxl_ns.scene.geometry import sphere_around
 
 FIRST_OPACITY = 0.1
@@ -69,9 +70,7 @@ def color_parameters(config: Lang3DXLModelConfig, colors: Float[Tensor, "n 3"]) 
 
 def _spacing(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
     points = means.numpy()
-    from sklearn.neighbors import NearestNeighbors  # takes a second; only training needs it
-
-    distances = NearestNeighbors(n_neighbors=4).fit(points).kneighbors(points)[0][:, 1:]
+    distances = cKDTree(points).query(points, k=4)[0][:, 1:]
     spacing = torch.from_numpy(distances).float().mean(dim=-1, keepdim=True)
     # Coincident points would make Gaussians of zero size.
     return spacing.clamp_min(1e-3 * float(spacing.median().clamp_min(1e-6)))

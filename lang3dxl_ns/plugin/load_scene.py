@@ -12,23 +12,21 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from jaxtyping import Float
 from nerfstudio.data.scene_box import SceneBox
-from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import view_of
-from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.light import harmonics, in_light
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
-from lang3dxl_ns.plugin.saved_config import read_config
+from lang3dxl_ns.plugin.saved_config import read_model_config
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, load_image_text_encoder
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.find_run import find_config
@@ -39,6 +37,9 @@ from lang3dxl_ns.query.splat_file import GaussianArrays
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera
+
+if TYPE_CHECKING:  # training's
+    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 
 NOT_A_CHECKPOINT = (
     *(OSError, EOFError, RuntimeError, pickle.UnpicklingError),
@@ -100,10 +101,10 @@ def load_scene(
     run's.
     """
     path = find_config(run)
-    config = read_config(path)
+    settings_of_model, checkpoints = read_model_config(path)
     file = SceneFile.read(path.parent / SCENE_FILE)
     device = torch.device(device or best_device())
-    model = _load_model(config, path.parent, file, device)
+    model = _load_model(settings_of_model, path.parent / checkpoints, file, device)
     return scene_of_model(model, file, path.parent, settings)
 
 
@@ -183,15 +184,15 @@ def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
     return encoder.encode_texts
 
 
-def _load_model(run: TrainerConfig, folder: Path, file: SceneFile, device: torch.device) -> Lang3DXLModel:
-    path, checkpoint = latest_checkpoint(folder / run.relative_model_dir)
+def _load_model(config: Any, checkpoints: Path, file: SceneFile, device: torch.device) -> Lang3DXLModel:
+    path, checkpoint = latest_checkpoint(checkpoints)
     state = checkpoint["pipeline"]
-    if not isinstance(run.pipeline.model, Lang3DXLModelConfig):
-        raise UserError(f"{folder} is a run of another method: train one with ns-train lang3dxl")
+    if not isinstance(config, Lang3DXLModelConfig):
+        raise UserError(f"{checkpoints.parent} is a run of another method: train one with ns-train lang3dxl")
     names, metadata = [photo.name for photo in file.photos if photo.split == "train"], dict[str, Any]()
     SceneFacts(names).into(metadata)
     # The checkpoint brings its own Gaussians: start with the fewest possible.
-    start = replace(run.pipeline.model, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
+    start = replace(config, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
     model = start.setup(
         scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
         num_train_data=len(names),

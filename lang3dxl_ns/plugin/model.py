@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import color_correct
-from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
@@ -38,6 +37,7 @@ from lang3dxl_ns.plugin.initialization import (
 )
 from lang3dxl_ns.plugin.model_config import make_strategy
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
+from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import FeatureStatistics
 from lang3dxl_ns.scene.geometry import center_and_radius
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
-
 from lang3dxl_ns.baselines.encoders import EncoderConfig
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.components.appearance import AppearanceConfig
@@ -14,6 +12,7 @@ from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.optimizers import run_length_weight
+from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
 
 SHORT_FIELD_RUN = 5_000
 """Runs with fewer iterations use the field's `short` preset, if they train it with the scene."""

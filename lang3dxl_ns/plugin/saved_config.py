@@ -9,12 +9,14 @@ from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from importlib.metadata import entry_points
 from pathlib import Path, PurePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
-from nerfstudio.engine.trainer import TrainerConfig
 
 from lang3dxl_ns.common.errors import UserError
+
+if TYPE_CHECKING:  # with nerfstudio's trainer, which takes two seconds to load and which queries don't need
+    from nerfstudio.engine.trainer import TrainerConfig
 
 TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
 _PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
@@ -29,8 +31,27 @@ def read_config(path: Path) -> TrainerConfig:
 
     Raises UserError for a missing or damaged file, one of another version, and one that asks for more.
     """
+    from nerfstudio.engine.trainer import TrainerConfig
+
+    (config,) = _read(path, [()])
+    if not isinstance(config, TrainerConfig):
+        raise _no_config(path)
+    return config
+
+
+def read_model_config(path: Path) -> tuple[Any, Path]:
+    """The model's settings of a run, and the folder of its checkpoints, relative to the run's: as
+    `read_config`, but without loading what the other settings belong to."""
+    model, checkpoints = _read(path, [("pipeline", "model"), ("relative_model_dir",)])
+    if not is_dataclass(model) or not isinstance(checkpoints, Path):
+        raise _no_config(path)
+    return model, checkpoints
+
+
+def _read(path: Path, places: Sequence[Sequence[str]]) -> list[Any]:
+    """The settings at these places of a file, each named from the outermost in; None where there are none."""
     try:
-        config = yaml.load(path.read_text(), Loader=_SettingsLoader)
+        found = _construct(path.read_text(), places)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
         raise UserError(f"{path} is not a file: pass the config.yml of a run") from error
     except (
@@ -41,13 +62,35 @@ def read_config(path: Path) -> TrainerConfig:
             f"{path} can't be read ({error}): it is damaged, or from a version whose settings are no longer "
             "known; restore it, or train anew"
         ) from error
-    if not isinstance(config, TrainerConfig):
-        raise UserError(f"{path} is not the config.yml of a nerfstudio run")
-    if odd := next(_differences(config), None):
+    odd = (line for settings in found if is_dataclass(settings) for line in _differences(settings))
+    if first := next(odd, None):
         raise UserError(
-            f"{path} {odd}: it is truncated, or from another version; copy it again, or train anew"
+            f"{path} {first}: it is truncated, or from another version; copy it again, or train anew"
         )
-    return config
+    return found
+
+
+def _construct(text: str, places: Sequence[Sequence[str]]) -> list[Any]:
+    loader = _SettingsLoader(text)
+    try:
+        root = loader.get_single_node()
+        if why := _asks_for(root):
+            raise yaml.constructor.ConstructorError(None, None, f"it asks to {why}")
+        nodes = [_at(root, place) for place in places]
+        return [None if node is None else loader.construct_document(node) for node in nodes]
+    finally:
+        loader.dispose()
+
+
+def _at(node: yaml.Node | None, place: Sequence[str]) -> yaml.Node | None:
+    for name in place:
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        node = next((value for key, value in pairs if key.value == name), None)
+    return node
+
+
+def _no_config(path: Path) -> UserError:
+    return UserError(f"{path} is not the config.yml of a nerfstudio run")
 
 
 def _differences(settings: Any, place: str = "") -> Iterator[str]:
@@ -75,7 +118,7 @@ def check_command_line(arguments: Sequence[str]) -> None:
     them, which is the earliest moment a plugin can check. The YAML nodes are inspected, not constructed.
     """
     for path in _load_configs(arguments):
-        if os.environ.get(TRUST_VARIABLE) != "1" and (why := _asks_for(path)):
+        if os.environ.get(TRUST_VARIABLE) != "1" and (why := _file_asks_for(path)):
             sys.exit(
                 f"Error: {path} asks to {why}, which settings never need: nothing in it was run. If you "
                 f"trust its author, set {TRUST_VARIABLE}=1"
@@ -91,14 +134,17 @@ def _load_configs(arguments: Sequence[str]) -> Iterator[Path]:
                 yield path
 
 
-def _asks_for(path: Path) -> str | None:
-    """What a file's settings should not ask for, in a few words; None if there is nothing."""
+def _file_asks_for(path: Path) -> str | None:
     try:
-        root = yaml.compose(path.read_text(), Loader=yaml.Loader)
+        return _asks_for(yaml.compose(path.read_text(), Loader=yaml.Loader))
     except (yaml.YAMLError, OSError, ValueError):
         return None  # the command can't read it either
     except RecursionError:  # the command, called from fewer functions, might
         return "nest more deeply than settings do"
+
+
+def _asks_for(root: yaml.Node | None) -> str | None:
+    """What settings should not ask for, in a few words; None if there is nothing."""
     known = {"torch", *_PACKAGES, *_plugins()}
     for tag in _tags(root):
         kind, _, name = tag.removeprefix(_PYTHON).partition(":")
