@@ -19,7 +19,7 @@ def real_scene(request, real_scenes, tmp_path):
 
 @pytest.mark.slow
 def test_a_short_run_shows_the_facade_and_beats_the_mean_feature(train, real_scene):
-    trainer = train(real_scene, iterations=300, pipeline__datamanager__camera_res_scale_factor=0.25)
+    trainer = train(real_scene, iterations=150, pipeline__datamanager__camera_res_scale_factor=0.2)
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert all(map(math.isfinite, metrics.values()))
     if real_scene.name == "sceaux":
@@ -27,9 +27,9 @@ def test_a_short_run_shows_the_facade_and_beats_the_mean_feature(train, real_sce
         assert metrics["clip_l1"] < metrics["clip_l1_of_mean"]
         assert metrics["clip_cosine"] > metrics["clip_cosine_of_mean"]
     else:
-        # Exposures differ by 1.5 EV. Nothing here corrects for them yet, and the features of a CLIP with
-        # random weights follow them: what was learned must at least serve the photos it was learned from.
-        assert metrics["psnr"] > 10.0
+        # Exposures differ by 1.5 EV, which a look fitted on half a photo makes up for. The features of a CLIP
+        # with random weights follow them: what was learned must serve the photos it was learned from.
+        assert metrics["half_psnr"] > 17.0
         datamanager, model = trainer.pipeline.datamanager, trainer.pipeline.model.eval()
         camera, batch = next(datamanager.train_photos())
         learned = model.feature_metrics(camera, batch)

@@ -58,10 +58,10 @@ class Demo:
     wild: bool = True
     """Photos like those from the Internet: sizes, lenses, weather, exposures and passers-by vary.
     --no-wild: one camera, one sun, no people."""
-    test_views: int = 24
-    """Novel views with exact labels to score, besides the held-out photos; 0: none."""
+    test_views: int | None = None
+    """Novel views with exact labels to score, besides the held-out photos; 24, or 8 with --quick; 0: none."""
     quick: bool = False
-    """Half the time: fewer photos and iterations, less accurate words."""
+    """Half the time: fewer photos, views and iterations, less accurate words."""
     clip: str = "builtin"
     """CLIP: "builtin", a Hugging Face name, a folder, or "none" for colors only."""
     dense: str = "builtin"
@@ -95,7 +95,7 @@ class Demo:
         with stages.stage("evaluate"):
             photos = list(trainer.pipeline.evaluate("held-out"))
             splits = {"Held-out photos": photos}
-            if self.test_views:
+            if trainer.pipeline.datamanager.test_views is not None:
                 splits = {"Test views": list(trainer.pipeline.evaluate("test")), **splits}
             report = self._report(splits, trainer)
         report |= stages.figures()
@@ -119,7 +119,7 @@ class Demo:
         photos = self.photos or (24 if self.quick else 48)
         folder = out / "scene"
         wanted: dict[str, Any] = {"seed": self.seed, "photos": photos, "wild": self.wild}
-        wanted["test_views"] = self.test_views
+        wanted["test_views"] = (8 if self.quick else 24) if self.test_views is None else self.test_views
         if self.family != "auto":
             wanted["family"] = self.family
         if not (folder / "scene.json").exists():
