@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -23,6 +24,7 @@ from lang3dxl_ns.benchmarks.dense_rasterizer import (
     count_pairs,
     render_dense,
 )
+from lang3dxl_ns.benchmarks.rasterizer_peers import load_peer, name_peers
 from lang3dxl_ns.benchmarks.rasterizer_scenes import (
     CHANNELS,
     COLORS,
@@ -48,13 +50,17 @@ from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.rasterize import Backend
 
 OURS, TORCH, DENSE, GSPLAT = "lang3dxl", "torch kernels", "dense tiles", "gsplat"
+Method: TypeAlias = str | Path
+"""One of the four above, or a peer's file."""
 
 
 # --- measuring --------------------------------------------------------------------------------------------
 
 
-def forward(problem: Problem, method: str) -> tuple[Float[Tensor, "h w 6"], Float[Tensor, "h w 1"]]:
+def forward(problem: Problem, method: Method) -> tuple[Float[Tensor, "h w 6"], Float[Tensor, "h w 1"]]:
     """Image and alpha by one of the methods compared."""
+    if isinstance(method, Path):
+        return load_peer(method)[1](problem)
     if method == DENSE:
         return render_dense(problem)
     backend: Backend = "gsplat" if method == GSPLAT else "torch"
@@ -65,13 +71,13 @@ def forward(problem: Problem, method: str) -> tuple[Float[Tensor, "h w 6"], Floa
     return rendering.image, rendering.alpha
 
 
-def forward_only(problem: Problem, method: str) -> Tensor:
+def forward_only(problem: Problem, method: Method) -> Tensor:
     """The image, without keeping anything for a backward pass."""
     with torch.no_grad():
         return forward(problem, method)[0]
 
 
-def forward_backward(problem: Problem, method: str) -> tuple[Tensor, tuple[Tensor, ...]]:
+def forward_backward(problem: Problem, method: Method) -> tuple[Tensor, tuple[Tensor, ...]]:
     """The image and the gradients of the problem's leaves."""
     image, alpha = forward(problem, method)
     upstream = (problem.image_gradient, problem.alpha_gradient)
@@ -134,7 +140,7 @@ def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
 
 
 def prepared_pass(
-    case: Case, scene: Path | None, device: str, threads: int, seed: int, method: str
+    case: Case, scene: Path | None, device: str, threads: int, seed: int, method: Method
 ) -> Callable[[], object]:
     """For `peak_memory`: forward and backward, with the libraries already loaded by a tiny rendering."""
     torch.set_num_threads(threads)
@@ -148,7 +154,7 @@ def prepared_pass(
 
 @dataclass
 class RasterizerBenchmark:
-    """Measure time, memory and error of the rasterizer, beside a dense one and, on a GPU, gsplat."""
+    """Measure time, memory and error of the rasterizer, beside a dense one, peers and, on a GPU, gsplat."""
 
     out: Path
     """Folder for rasterizer.md, rasterizer.json and rasterizer.png."""
@@ -160,6 +166,13 @@ class RasterizerBenchmark:
     """Widths and heights, pixels."""
     recipes: tuple[Recipe, ...] = ("A", "B")
     """A: random small Gaussians. B: sizes and opacities as in training."""
+    peers: tuple[Path, ...] = ()
+    """Other rasterizers to measure: Python files that define NAME, a string, and render(problem), which
+    returns the image [h w c] and alpha [h w 1], differentiable in problem.leaves. It gets problem.gaussians
+    (means [n 3], world units; quats [n 4], w x y z of any length; scales [n 3], standard deviations in world
+    units, not logarithms; opacities [n], 0 to 1, not logits), problem.channels [n c], problem.background [c],
+    problem.camera (view_matrix [4 4], world to camera, x right, y down, z forward; intrinsics [3 3], pixels,
+    pixel centers at +0.5; width, height)."""
     threads: int = 1
     """CPU threads. With one, processor time is measured, otherwise wall time."""
     repeats: int = 5
@@ -225,14 +238,14 @@ def _measure(plan: RasterizerBenchmark) -> dict[str, Any]:
 
 def _measure_case(case: Case, plan: RasterizerBenchmark) -> dict[str, Any]:
     problem = make_problem(case, plan.scene, plan.device, seed=plan.seed)
-    methods = [OURS, DENSE, GSPLAT] if plan.device == "cuda" else [OURS, TORCH, DENSE]
+    own = [OURS, DENSE, GSPLAT] if plan.device == "cuda" else [OURS, TORCH, DENSE]
+    methods: dict[str, Method] = {**{name: name for name in own}, **name_peers(plan.peers, own)}
     kept, evaluated = count_pairs(problem)
     need = evaluated * DENSE_BYTES_PER_PAIR / 1e9
-    differentiated = [method for method in methods if method != DENSE or need <= plan.baseline_gigabytes]
-    forward_ms = _median_ms({method: partial(forward_only, problem, method) for method in methods}, plan)
-    both_ms = _median_ms(
-        {method: partial(forward_backward, problem, method) for method in differentiated}, plan
-    )
+    forward_ms = _median_ms({name: partial(forward_only, problem, m) for name, m in methods.items()}, plan)
+    if need > plan.baseline_gigabytes:
+        del methods[DENSE]
+    both_ms = _median_ms({name: partial(forward_backward, problem, m) for name, m in methods.items()}, plan)
 
     # The dense baseline is the independent reference where it fits: float64 takes twice the memory.
     reference_method = DENSE if 2 * need <= plan.baseline_gigabytes else OURS
@@ -247,8 +260,10 @@ def _measure_case(case: Case, plan: RasterizerBenchmark) -> dict[str, Any]:
         "forward_ms": forward_ms,
         "forward_backward_ms": both_ms,
         "reference": reference_method,
-        "error": {m: error_against(forward_backward(problem, m), reference) for m in differentiated},
-        "peak_mib": {m: peak_memory(prepared_pass, *setup, m) / MEBIBYTE for m in differentiated},
+        "error": {
+            name: error_against(forward_backward(problem, m), reference) for name, m in methods.items()
+        },
+        "peak_mib": {name: peak_memory(prepared_pass, *setup, m) / MEBIBYTE for name, m in methods.items()},
     }
 
 
@@ -280,6 +295,7 @@ backward. **Quote the ratios**: times don't carry over to another machine.
 {TORCH}: the rasterizer in torch operations, for other devices and where numba is missing.
 {DENSE}: the same rendering rules in plain torch with autograd, in tiles of {DENSE_TILE} pixels (the
 fastest size); – where its backward pass would need more than {results["baseline_gigabytes"]:g} GB.
+Any further names are other rasterizers, from files given with `--peers`; their rules may differ.
 
 {markdown_table(header, [_time_row(case, others) for case in results["cases"]])}
 
@@ -309,13 +325,17 @@ def _case_cells(case: dict[str, Any]) -> list[str]:
 def _time_row(case: dict[str, Any], others: list[str]) -> list[str]:
     forward_ms, both_ms = case["forward_ms"], case["forward_backward_ms"]
 
-    def pair(name: str, unit_forward: float, unit_both: float, style: str) -> str:
-        both = format(both_ms[name] / unit_both, style) if name in both_ms else "–"
-        return f"{format(forward_ms[name] / unit_forward, style)} / {both}"
+    def pair(name: str, unit_forward: float, unit_both: float) -> str:
+        both = _number(both_ms[name] / unit_both) if name in both_ms else "–"
+        return f"{_number(forward_ms[name] / unit_forward)} / {both}"
 
     cells = [*_case_cells(case), f"{case['kept_pairs'] / 1e6:.2f} M"]
-    cells += [pair(name, 1, 1, ",.0f") for name in (OURS, *others)]
-    return cells + [pair(name, forward_ms[OURS], both_ms[OURS], ".2g") for name in others]
+    cells += [pair(name, 1, 1) for name in (OURS, *others)]
+    return cells + [pair(name, forward_ms[OURS], both_ms[OURS]) for name in others]
+
+
+def _number(value: float) -> str:
+    return f"{value:,.{1 if value < 10 else 0}f}"
 
 
 def _error_rows(case: dict[str, Any]) -> Iterable[list[str]]:
@@ -334,7 +354,7 @@ def _error_rows(case: dict[str, Any]) -> Iterable[list[str]]:
 
 def _pass_row(row: dict[str, Any]) -> list[str]:
     alone = row["ms"]["colors alone"]
-    return [*_case_cells(row), *(f"{ms:,.0f} (×{ms / alone:.2f})" for ms in row["ms"].values())]
+    return [*_case_cells(row), *(f"{_number(ms)} (×{ms / alone:.2f})" for ms in row["ms"].values())]
 
 
 def _plot(results: dict[str, Any]) -> bytes:
@@ -347,7 +367,7 @@ def _plot(results: dict[str, Any]) -> bytes:
     methods = list(cases[0]["forward_ms"])
     sizes = sorted({(case["width"], case["height"]) for case in cases})
     colors = dict(zip(sizes, ("#7fb3d5", "#2471a3", "#0b2545", "#6c3483"), strict=False))
-    styles = dict(zip(methods, ("o-", "s--", "^:", "v-."), strict=False))
+    styles = dict(zip(methods, cycle(("o-", "s--", "^:", "v-.", "D--", "P:")), strict=False))
     recipes = {"A": "A: random small Gaussians", "B": "B: as in training"}
     drawn = [recipe for recipe in recipes if any(case["recipe"] == recipe for case in cases)]
     figure = Figure(figsize=(4.6 * len(drawn), 4.2), layout="constrained")
@@ -370,10 +390,11 @@ def _plot(results: dict[str, Any]) -> bytes:
         panel.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("forward + backward, ms")
     keys = [Line2D([], [], color=colors[size], linewidth=3, label=f"{size[0]}×{size[1]}") for size in sizes]
-    keys += [
+    figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), frameon=False)
+    keys = [
         Line2D([], [], color="0.35", marker=styles[m][0], linestyle=styles[m][1:], label=m) for m in methods
     ]
-    figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), frameon=False)
+    figure.legend(handles=keys, loc="outside upper center", ncols=2 * len(drawn), frameon=False)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=150)
     return file.getvalue()
