@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+import threading
 from typing import Any
 
 import numpy as np
@@ -10,13 +12,28 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lang3dxl_ns.common.jit import in_threads, kernel
+from lang3dxl_ns.common.jit import in_threads, kernel, ranges
 from lang3dxl_ns.rendering.fused_plan import make_plan
 from lang3dxl_ns.rendering.fused_tiles import CHANNELS_FROM, PIXELS, WAVE, backward_tiles, composite_tiles
 from lang3dxl_ns.rendering.tile_plan import LOG2_E
 
 PARTS_PER_THREAD = 8
 """Tiles may stop early, by an unknown amount: small parts spread the rest over the threads."""
+
+
+class _Kept(threading.local):
+    """Memory kept from one backward pass to the next: new pages cost more than the sums themselves."""
+
+    memory = np.empty(0, np.uint8)
+
+    def take(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        size = math.prod(shape) * dtype.itemsize
+        if len(self.memory) < size:
+            self.memory = np.empty(size, np.uint8)
+        return self.memory[:size].view(dtype).reshape(shape)
+
+
+_kept = _Kept()
 
 
 class FusedCompositing(torch.autograd.Function):
@@ -53,8 +70,8 @@ class FusedCompositing(torch.autograd.Function):
             image.numpy(), features.numpy(), alpha.numpy(), keep, wave_starts, records, ends,
         )  # fmt: skip
         threads = torch.get_num_threads()
-        tiles = _cut(rows, PARTS_PER_THREAD * threads if threads > 1 else 1)
-        in_threads(composite_tiles, [(*part, *shared) for part in tiles])
+        parts = _cut(rows, PARTS_PER_THREAD * threads if threads > 1 else 1)
+        in_threads(composite_tiles, [(np.arange(*part), *shared) for part in parts])
         ctx.save_for_backward(means2d, conics, opacities)
         ctx.set_materialize_grads(False)
         ctx.plan, ctx.wave_starts, ctx.records, ctx.ends = plan, wave_starts, records, ends
@@ -70,22 +87,28 @@ class FusedCompositing(torch.autograd.Function):
             opacities.new_zeros(ctx.height, ctx.width, size) if slope is None else slope.contiguous()
             for slope, size in zip(upstream, ctx.sizes, strict=True)
         )
-        tiles = _cut(ctx.ends, torch.get_num_threads())
-        # Every part has its own sums, so that the result doesn't depend on the order of threads.
-        sums = np.zeros((len(tiles), len(plan.order), CHANNELS_FROM + plan.table.shape[1]), plan.splats.dtype)
+        threads = torch.get_num_threads()
+        parts = [
+            np.arange(*part) for part in _cut(ctx.ends, PARTS_PER_THREAD * threads if threads > 1 else 1)
+        ]
+        # Every thread has fixed tiles and its own sums, so that the result doesn't depend on their order.
+        dealt = [np.concatenate(parts[k::threads]) for k in range(min(threads, len(parts)))]
+        columns = CHANNELS_FROM + plan.table.shape[1]
+        sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
         shared = (
             plan.splats, plan.table, plan.attached, plan.starts, plan.ranks, ctx.width, ctx.height,
             *(slope.numpy() for slope in slopes), ctx.wave_starts, ctx.records, ctx.ends, ctx.absgrad,
         )  # fmt: skip
-        in_threads(backward_tiles, [(*part, *shared, sums[k]) for k, part in enumerate(tiles)])
+        in_threads(backward_tiles, [(tiles, *shared, sums[k]) for k, tiles in enumerate(dealt)])
         found = [
             torch.zeros_like(part) for part in (means2d.view(-1, 2), conics, opacities, means2d.view(-1, 2))
         ]
         found += [opacities.new_zeros(len(opacities), size) for size in ctx.sizes[:2]]
-        _collect(
+        arrays = (
             plan.order, conics.numpy(), opacities.numpy(), plan.attached, sums,
             *(part.numpy() for part in found),
         )  # fmt: skip
+        in_threads(_collect, [(*part, *arrays) for part in ranges(len(plan.order), least=4096)])
         position, conic, opacity, absolutes, channels, detached = found
         if ctx.absgrad:
             means2d.absgrad = absolutes.view_as(means2d)
@@ -102,11 +125,23 @@ def _cut(work: np.ndarray, parts: int) -> list[tuple[int, int]]:
 
 @kernel
 def _collect(
-    order, conics, opacities, attached, sums, position, conic, opacity, absolutes, channels, detached
+    first,
+    last,
+    order,
+    conics,
+    opacities,
+    attached,
+    sums,
+    position,
+    conic,
+    opacity,
+    absolutes,
+    channels,
+    detached,
 ) -> None:
-    """Gradients per Gaussian, from the sums of all parts."""
+    """Gradients of a range of Gaussians, from the sums of all threads."""
     row = np.empty(sums.shape[2], sums.dtype)
-    for rank in range(len(order)):
+    for rank in range(first, last):
         row[:] = sums[0, rank]
         for part in range(1, len(sums)):
             row += sums[part, rank]

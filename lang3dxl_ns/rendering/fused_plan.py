@@ -68,9 +68,11 @@ def make_plan(
     attached = _rounded_up(channels.shape[1] + 1)
     splats = np.empty((count, SPLAT_COLUMNS), positions.dtype)
     table = np.empty((count, attached + _rounded_up(detached.shape[1])), positions.dtype)
-    _pack(
-        order, positions, form, spread, opacity, attached_channels, detached_channels, attached, splats, table
-    )
+    arrays = (
+        order, positions, form, spread, opacity, attached_channels, detached_channels, attached,
+        splats, table,
+    )  # fmt: skip
+    in_threads(_pack, [(*part, *arrays) for part in ranges(count, least=4096)])
 
     sizes = np.zeros(columns * rows + 1, np.int64)
     bands = ranges(rows)
@@ -114,9 +116,11 @@ def _find_visible(means2d, variances, opacities, width, height, boxes, visible):
 
 
 @kernel
-def _pack(order, means2d, conics, variances, opacities, channels, detached, attached, splats, table) -> None:
-    """Gather the compositing data of each Gaussian, contiguous and in depth order."""
-    for rank in range(len(order)):
+def _pack(
+    first, last, order, means2d, conics, variances, opacities, channels, detached, attached, splats, table
+) -> None:
+    """Gather the compositing data of a range of Gaussians, contiguous and in depth order."""
+    for rank in range(first, last):
         g = order[rank]
         splats[rank, 0], splats[rank, 1] = means2d[g, 0], means2d[g, 1]
         splats[rank, 2] = conics[g, 1] / conics[g, 0]

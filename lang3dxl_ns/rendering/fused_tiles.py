@@ -118,15 +118,15 @@ def _alpha(dx, dy, shear, steepness, rise, log2_opacity):
 
 @kernel
 def composite_tiles(
-    first, last, splats, table, attached, starts, ranks, width, height, image, features, alphas, keep,
+    tiles, splats, table, attached, starts, ranks, width, height, image, features, alphas, keep,
     wave_starts, records, ends,
 ):  # fmt: skip
-    """Composite a range of tiles into the maps."""
+    """Composite some tiles into the maps."""
     channels = table.shape[1]
     transmittance, sums = _aligned(PIXELS, splats), _aligned(channels * PIXELS, splats)
     across, down, lines = _pixel_centers(splats)
     masks = np.empty(WAVE, np.int64)
-    for tile in range(first, last):
+    for tile in tiles:
         corner_x, corner_y, live = _blocks_inside(tile, width, height)
         transmittance[:] = 1
         sums[:] = 0
@@ -178,16 +178,17 @@ def composite_tiles(
 
 @kernel
 def backward_tiles(
-    first, last, splats, table, attached, starts, ranks, width, height, image, features, alphas,
+    tiles, splats, table, attached, starts, ranks, width, height, image, features, alphas,
     wave_starts, records, ends, absolutes, sums,
 ):  # fmt: skip
-    """Add the gradients of a range of tiles to sums per visible Gaussian.
+    """Sum the gradients of some tiles per visible Gaussian.
 
     Wave by wave from the back: alpha and weight are recomputed front to back, then used in reverse.
     With v = Σ channel × upstream, and B the same for everything behind, composited over black, the gradient
     with respect to ln(alpha) is weight·(v − B), and B in front of the Gaussian is B + alpha·(v − B).
     """
     channels = table.shape[1]
+    sums[:] = 0
     upstream = _aligned(channels * PIXELS, splats)
     upstream[:] = 0
     transmittance, behind = _aligned(PIXELS, splats), _aligned(PIXELS, splats)
@@ -199,7 +200,7 @@ def backward_tiles(
     masks, slots = np.empty(WAVE, np.int64), np.empty(WAVE + 1, np.int64)
     across, down, lines = _pixel_centers(splats)
     zero = lines * 0.0
-    for tile in range(first, last):
+    for tile in tiles:
         corner_x, corner_y, inside = _blocks_inside(tile, width, height)
         behind[:] = 0
         if not ends[tile]:
