@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import threading
 from typing import Any
@@ -19,6 +18,7 @@ from lang3dxl_ns.rendering.tile_plan import LOG2_E
 
 PARTS_PER_THREAD = 8
 """Tiles may stop early, by an unknown amount: small parts spread the rest over the threads."""
+_MOST_KEPT = 64 * 2**20  # bytes
 
 
 class _Kept(threading.local):
@@ -27,7 +27,10 @@ class _Kept(threading.local):
     memory = np.empty(0, np.uint8)
 
     def take(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        """An array of arbitrary content, valid until the thread takes the next one."""
         size = math.prod(shape) * dtype.itemsize
+        if size > _MOST_KEPT:
+            return np.empty(shape, dtype)
         if len(self.memory) < size:
             self.memory = np.empty(size, np.uint8)
         return self.memory[:size].view(dtype).reshape(shape)
@@ -69,9 +72,7 @@ class FusedCompositing(torch.autograd.Function):
             plan.splats, plan.table, plan.attached, plan.starts, plan.ranks, width, height,
             image.numpy(), features.numpy(), alpha.numpy(), keep, wave_starts, records, ends,
         )  # fmt: skip
-        threads = torch.get_num_threads()
-        parts = _cut(rows, PARTS_PER_THREAD * threads if threads > 1 else 1)
-        in_threads(composite_tiles, [(np.arange(*part), *shared) for part in parts])
+        in_threads(composite_tiles, [(tiles, *shared) for tiles in _parts(rows)])
         ctx.save_for_backward(means2d, conics, opacities)
         ctx.set_materialize_grads(False)
         ctx.plan, ctx.wave_starts, ctx.records, ctx.ends = plan, wave_starts, records, ends
@@ -88,9 +89,7 @@ class FusedCompositing(torch.autograd.Function):
             for slope, size in zip(upstream, ctx.sizes, strict=True)
         )
         threads = torch.get_num_threads()
-        parts = [
-            np.arange(*part) for part in _cut(ctx.ends, PARTS_PER_THREAD * threads if threads > 1 else 1)
-        ]
+        parts = _parts(ctx.ends)
         # Every thread has fixed tiles and its own sums, so that the result doesn't depend on their order.
         dealt = [np.concatenate(parts[k::threads]) for k in range(min(threads, len(parts)))]
         columns = CHANNELS_FROM + plan.table.shape[1]
@@ -115,30 +114,20 @@ class FusedCompositing(torch.autograd.Function):
         return position.view_as(means2d), conic, opacity, channels, detached, *[None] * 5
 
 
-def _cut(work: np.ndarray, parts: int) -> list[tuple[int, int]]:
-    """Ranges of tiles with about equal work; empty tiles count a little too."""
+def _parts(work: np.ndarray) -> list[np.ndarray]:
+    """Consecutive tiles with about equal work, several parts per thread; empty tiles count a little too."""
+    threads = torch.get_num_threads()
+    parts = PARTS_PER_THREAD * threads if threads > 1 else 1
     ends = np.cumsum(work + 8.0)
     limits = np.searchsorted(ends, np.linspace(0, ends[-1], parts + 1)[1:-1])
-    borders = [0, *limits.tolist(), len(work)]
-    return [(a, b) for a, b in itertools.pairwise(borders) if a < b]
+    return [tiles for tiles in np.split(np.arange(len(work)), limits) if len(tiles)]
 
 
 @kernel
 def _collect(
-    first,
-    last,
-    order,
-    conics,
-    opacities,
-    attached,
-    sums,
-    position,
-    conic,
-    opacity,
-    absolutes,
-    channels,
+    first, last, order, conics, opacities, attached, sums, position, conic, opacity, absolutes, channels,
     detached,
-) -> None:
+) -> None:  # fmt: skip
     """Gradients of a range of Gaussians, from the sums of all threads."""
     row = np.empty(sums.shape[2], sums.dtype)
     for rank in range(first, last):
