@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import active_children
 from pathlib import Path
+from typing import TypeVar
 
 from lang3dxl_ns.baselines.rows import BOUNDS, FULL, SEGMENTERS, Row, choose_rows
 from lang3dxl_ns.benchmarks.ablation_report import write_ablation
@@ -14,6 +15,8 @@ from lang3dxl_ns.benchmarks.landmarks import Landmarks, landmark_scenes
 from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import command_line, progress_bar
+
+Found = TypeVar("Found")
 
 
 @dataclass
@@ -76,7 +79,7 @@ class Ablation:
             for steps in sorted(self.steps)
             for label, path in scenes.items()
             for row in rows
-            if row.trains or (row.name in SEGMENTERS and seed == 0)
+            if row.trains or (row.name in SEGMENTERS and seed == 0 and steps == min(self.steps))
         ]
         figures, failed = make_all(
             runs, ScoredRuns(self.out, settings), lambda *found: self._write(rows, *found), self.workers
@@ -85,7 +88,16 @@ class Ablation:
 
     def _write(self, rows: list[Row], figures: dict[Run, dict], failed: dict[Run, str]) -> None:
         command = command_line("lang3dxl benchmark ablation", self)
-        write_ablation(self.out, command, rows, figures | bound_figures(rows, figures), failed)
+        figures = self._at_all_lengths(figures | bound_figures(rows, figures))
+        write_ablation(self.out, command, rows, figures, self._at_all_lengths(failed))
+
+    def _at_all_lengths(self, found: dict[Run, Found]) -> dict[Run, Found]:
+        """What segmenters see doesn't depend on the training's length: they run once."""
+        return {
+            replace(run, steps=steps): value
+            for run, value in found.items()
+            for steps in (self.steps if run.row.name in SEGMENTERS else [run.steps])
+        }
 
 
 def make_all(

@@ -279,6 +279,7 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
         assert means[FULL]["test_map"] != means[FULL]["seen_map"] != means[FULL]["map"]
     assert "test views" in (out / "ablation.md").read_text()
     assert not list(out.glob("work*"))
+    assert [path.name for path in out.glob("results/scene/langsam/*.json")] == ["4-0.json"]  # once for both
     stamp = (out / "results/scene/full/4-0.json").stat().st_mtime_ns
     command.main()
     assert (out / "results/scene/full/4-0.json").stat().st_mtime_ns == stamp
