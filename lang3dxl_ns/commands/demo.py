@@ -61,7 +61,7 @@ class Demo:
     test_views: int | None = None
     """Novel views with exact labels to score, besides the held-out photos; 24, or 8 with --quick; 0: none."""
     quick: bool = False
-    """Half the time: fewer photos, views and iterations, less accurate words."""
+    """A third of the time: fewer photos, views and iterations, less accurate words."""
     clip: str = "builtin"
     """CLIP: "builtin", a Hugging Face name, a folder, or "none" for colors only."""
     dense: str = "builtin"
