@@ -157,7 +157,8 @@ def test_rooms_below_the_plugin_load_neither_nerfstudio_nor_cuda_code():
 def test_the_entry_point_imports_no_heavy_library_and_other_methods_work_without_transformers(tmp_path):
     """nerfstudio's own imports aside, registering the method loads no transformers (which is missing here)
     and no pycolmap."""
-    (tmp_path / "transformers.py").write_text("raise ImportError('no transformers here')\n")
+    missing = "print('transformers was asked for')\nraise ImportError('no transformers here')\n"
+    (tmp_path / "transformers.py").write_text(missing)
     code = f"""
 import sys
 sys.path.insert(0, {str(tmp_path)!r})

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.benchmarks.rasterizer_scenes import CHANNELS, Problem
+from lang3dxl_ns.rendering import Camera, Gaussians
 
 DENSE_TILE = 16
 """Pixels per side. Of 16, 32 and 64 the fastest in all measured cases, hence the fairest comparison."""
@@ -23,7 +24,7 @@ def render_dense(problem: Problem) -> tuple[Float[Tensor, "h w 6"], Float[Tensor
     """
     columns = -(-problem.camera.width // DENSE_TILE)
     payload = torch.cat([problem.channels, torch.ones_like(problem.channels[:, :1])], dim=1)
-    tiles = _dense_tiles(problem)
+    tiles = _dense_tiles(problem.gaussians, problem.camera)
     maps = [(weights @ payload.index_select(0, index)).unflatten(0, size) for index, weights, size in tiles]
     rows = [torch.cat(maps[first : first + columns], dim=1) for first in range(0, len(maps), columns)]
     image, alpha = torch.cat(rows).split([CHANNELS, 1], dim=2)
@@ -31,19 +32,19 @@ def render_dense(problem: Problem) -> tuple[Float[Tensor, "h w 6"], Float[Tensor
 
 
 @torch.no_grad()
-def count_pairs(problem: Problem) -> tuple[int, int]:
+def count_pairs(gaussians: Gaussians, camera: Camera) -> tuple[int, int]:
     """Pairs of pixel and Gaussian: those that contribute, and those that `render_dense` evaluates."""
-    counts = [(int((weights > 0).sum()), weights.numel()) for _, weights, _ in _dense_tiles(problem)]
+    tiles = _dense_tiles(gaussians, camera)
+    counts = [(int((weights > 0).sum()), weights.numel()) for _, weights, _ in tiles]
     kept, evaluated = (sum(column) for column in zip(*counts, strict=True))
     return kept, evaluated
 
 
 def _dense_tiles(
-    problem: Problem,
+    gaussians: Gaussians, camera: Camera
 ) -> Iterator[tuple[Int[Tensor, " m"], Float[Tensor, "p m"], tuple[int, int]]]:
     """For every tile, row by row: its Gaussians front to back, their weights in each pixel, its size."""
-    camera = problem.camera
-    order, centers, conics, opacities, reach = _splats(problem)
+    order, centers, conics, opacities, reach = _splats(gaussians, camera)
     with torch.no_grad():
         low, high = centers - reach, centers + reach
     for top in range(0, camera.height, DENSE_TILE):
@@ -64,9 +65,8 @@ def _dense_tiles(
             yield order[index], torch.where(after > 1e-4, alpha * before, 0.0), (bottom - top, right - left)
 
 
-def _splats(problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+def _splats(gaussians: Gaussians, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Of all Gaussians in front of the camera, front to back: index, center, conic, opacity, extents."""
-    gaussians, camera = problem.gaussians, problem.camera
     rotation, offset = camera.view_matrix[:3, :3], camera.view_matrix[:3, 3]
     points = gaussians.means @ rotation.T + offset
     with torch.no_grad():

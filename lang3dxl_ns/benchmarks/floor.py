@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
 from lang3dxl_ns.benchmarks.dense_rasterizer import count_pairs
-from lang3dxl_ns.benchmarks.rasterizer_scenes import Problem
+from lang3dxl_ns.common.reports import interleaved_times
 from lang3dxl_ns.rendering import Camera, Gaussians
 
 _FLOAT = 4  # bytes
@@ -48,17 +45,9 @@ def measure_speed(side: int = 1024, values: int = 2**25) -> Speed:
     """The best of ten products of side × side matrices, and of ten copies of an array."""
     a, b = torch.randn(2, side, side)
     source, target = torch.ones(2, values)
-    product, copy = _fastest(lambda: a @ b), _fastest(lambda: target.copy_(source))
-    return Speed(2 * side**3 / product, 2 * _FLOAT * values / copy)
-
-
-def _fastest(work: Callable[[], object], repeats: int = 10) -> float:
-    def seconds() -> float:
-        start = time.perf_counter()
-        work()
-        return time.perf_counter() - start
-
-    return min(seconds() for _ in range(repeats))
+    work = {"product": lambda: a @ b, "copy": lambda: target.copy_(source)}
+    seconds = {name: min(times) for name, times in interleaved_times(work, repeats=10).items()}
+    return Speed(2 * side**3 / seconds["product"], 2 * _FLOAT * values / seconds["copy"])
 
 
 def step_work(gaussians: Gaussians, camera: Camera, channels: int, parameters: int) -> dict[str, Work]:
@@ -67,7 +56,7 @@ def step_work(gaussians: Gaussians, camera: Camera, channels: int, parameters: i
     Networks that learn looks or semantics are not counted, so the floor is below what a step needs.
     """
     count, pixels = len(gaussians.means), camera.width * camera.height
-    pairs = contributing_pairs(gaussians, camera)
+    pairs, _ = count_pairs(gaussians.detach(), camera.detach())
     image = _FLOAT * pixels * (channels + 1)
     scene = _FLOAT * parameters
     photo = _FLOAT * pixels * 3
@@ -81,11 +70,3 @@ def step_work(gaussians: Gaussians, camera: Camera, channels: int, parameters: i
         "backward": Work(backward + 2 * loss, 2 * scene + 2 * image + 2 * photo),
         "optimizer": Work(12 * parameters, 7 * scene),  # reads value, gradient, two moments; writes three
     }
-
-
-def contributing_pairs(gaussians: Gaussians, camera: Camera) -> int:
-    """Pairs of a pixel and a Gaussian that is part of its color."""
-    nothing: Any = torch.empty(0)
-    problem = Problem(gaussians.detach(), camera.detach(), nothing, nothing, nothing, nothing)
-    with torch.no_grad():
-        return count_pairs(problem)[0]

@@ -240,7 +240,7 @@ def _measure_case(case: Case, plan: RasterizerBenchmark) -> dict[str, Any]:
     problem = make_problem(case, plan.scene, plan.device, seed=plan.seed)
     own = [OURS, DENSE, GSPLAT] if plan.device == "cuda" else [OURS, TORCH, DENSE]
     methods: dict[str, Method] = {**{name: name for name in own}, **name_peers(plan.peers, own)}
-    kept, evaluated = count_pairs(problem)
+    kept, evaluated = count_pairs(problem.gaussians, problem.camera)
     need = evaluated * DENSE_BYTES_PER_PAIR / 1e9
     forward_ms = _median_ms({name: partial(forward_only, problem, m) for name, m in methods.items()}, plan)
     if need > plan.baseline_gigabytes:

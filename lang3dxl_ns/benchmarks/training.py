@@ -77,7 +77,7 @@ def _train_and_evaluate(settings: TrainingBenchmark) -> dict[str, Any]:
         "metrics": metrics,
         "seconds_per_step": step,
         "split_seconds": split,
-        "floor_seconds": _floor(trainer),
+        "floor_seconds": _floor(trainer) if name == "rgb" else None,
         "training_seconds": total,
         "peak_memory_mb": torch.cuda.max_memory_allocated() / 2**20
         if cuda
@@ -98,7 +98,7 @@ def _floor(trainer: Any) -> dict[str, float]:
     view = to_rasterizer(camera, camera.camera_to_worlds[0])
     work = step_work(model.activated(model.gauss_params), view, 3, parameters)
     speed = measure_speed()
-    return {part: work.seconds(speed) for part, work in work.items()}
+    return {part: least.seconds(speed) for part, least in work.items()}
 
 
 def _time_parts(trainer: Any) -> None:

@@ -1,8 +1,12 @@
 """Splatfacto without torch's compiler, which takes a second to load for a function never called here."""
 
-from unittest import mock
+from nerfstudio.utils import misc
 
-with mock.patch("nerfstudio.utils.misc.torch_compile", return_value=lambda function: function):
+_compile = misc.torch_compile
+misc.torch_compile = lambda *_, **__: lambda function: function
+try:
     from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig, num_sh_bases
+finally:
+    misc.torch_compile = _compile
 
 __all__ = ["RGB2SH", "SplatfactoModel", "SplatfactoModelConfig", "num_sh_bases"]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from splat_clouds import gradients, make_cloud, maps
 
-from lang3dxl_ns.rendering import fused_plan, rasterize
+from lang3dxl_ns.rendering import fused_compositing, fused_plan, rasterize
 from lang3dxl_ns.rendering.simd import LANES, exp2, load, store
 
 
@@ -35,8 +35,10 @@ def rendered(cloud, threads, **settings):
         torch.set_num_threads(before)
 
 
-def test_any_number_of_threads_gives_the_same():
-    cloud = make_cloud(2000, 70, 50, size=0.06)
+@pytest.mark.parametrize(("count", "size"), [(2000, 0.06), (12_000, 0.02)])
+def test_any_number_of_threads_gives_the_same(count, size):
+    """Many enough in the second case that threads share their packing and collecting."""
+    cloud = make_cloud(count, 70, 50, size=size)
     alone, alone_gradients = rendered(cloud, 1)
     for threads in (2, 5):
         found, found_gradients = rendered(cloud, threads)
@@ -46,6 +48,16 @@ def test_any_number_of_threads_gives_the_same():
         for name, value in alone_gradients.items():
             torch.testing.assert_close(found_gradients[name], value, rtol=1e-4, atol=1e-5)
             assert torch.equal(found_gradients[name], again_gradients[name]), name
+
+
+def test_what_an_earlier_scene_left_in_kept_memory_changes_nothing(monkeypatch):
+    small = make_cloud(200, 40, 30)
+    rendered(make_cloud(2000, 70, 50, size=0.06), 2)
+    _, after_a_larger_one = rendered(small, 2)
+    monkeypatch.setattr(fused_compositing, "_MOST_KEPT", 0)
+    _, in_memory_of_its_own = rendered(small, 2)
+    for name, value in in_memory_of_its_own.items():
+        assert torch.equal(after_a_larger_one[name], value), name
 
 
 @pytest.mark.parametrize("channels", [1, 4, 9])
