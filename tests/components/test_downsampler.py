@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from downsampler_by_loops import dense_kernel, reference_mean
 
 from lang3dxl_ns.components.downsampler import (
     AttenuatedDownsampler,
@@ -41,60 +42,6 @@ def downsampler(kernel="pyramid", hidden=0, bound=10.0, channels=4, trained=Fals
     if trained:
         module.network[-1].weight.data = seeded(*module.network[-1].weight.shape)
     return module
-
-
-# ------------------------------------------------------------------ reference, by loops over pixels
-
-
-def axis_window(size, center, side):
-    """Average over [center ± side/2], pixel piece by pixel piece, each sampled at its middle."""
-    weights = np.zeros(size)
-    for pixel in range(size):
-        start, end = max(center - side / 2, pixel), min(center + side / 2, pixel + 1)
-        if end > start:
-            for p in range(size):
-                hat = np.interp((start + end) / 2, np.arange(size) + 0.5, np.eye(size)[p])
-                weights[p] += (end - start) / side * hat
-    return weights
-
-
-def axis_footprint(size, cells, cell, side, finest):
-    """One cell of a crop grid's axis after the resize of that grid to the finest one."""
-    shift = side / 2
-    count = cells if finest else max(1, math.floor(size / shift + 1e-6))
-    weights = np.zeros(size)
-    for crop in range(count):
-        share = np.interp((cell + 0.5) / cells, (np.arange(count) + 0.5) / count, np.eye(count)[crop])
-        weights += share * axis_window(size, (crop + 0.5) * size / count, side)
-    return weights
-
-
-def dense_kernel(name, size, grid, sides):
-    """[hd, wd, h, w]"""
-    (h, w), (hd, wd) = size, grid
-    if name == "pyramid":
-        squares = [
-            sides[0] * w * 2 ** (j / 2) for j in range(40) if 2 ** (j / 2) <= sides[-1] / sides[0] + 1e-6
-        ]
-        boxes = [(side, side, (2 * math.sqrt(2)) ** -j * side**2) for j, side in enumerate(squares)]
-    elif name == "footprint":
-        boxes = [(side * w, side * w, 1.0) for side in sides]
-    else:
-        boxes = [(h / hd, w / wd, 1.0)]
-    kernel = np.zeros((hd, wd, h, w))
-    for i, k, (j, (high, wide, mass)) in itertools.product(range(hd), range(wd), enumerate(boxes)):
-        if name == "footprint":
-            y, x = axis_footprint(h, hd, i, high, j == 0), axis_footprint(w, wd, k, wide, j == 0)
-        else:
-            y, x = axis_window(h, (i + 0.5) * h / hd, high), axis_window(w, (k + 0.5) * w / wd, wide)
-        kernel[i, k] += mass * np.outer(y, x)
-    return torch.from_numpy(kernel / sum(mass for _, _, mass in boxes))
-
-
-def reference_mean(kernel, features, logits, mask):
-    weights = torch.where(kernel * mask > 1e-12, (kernel * mask).clamp(min=1e-300).log() + logits, -math.inf)
-    weights = torch.softmax(weights.flatten(2), dim=-1).nan_to_num()
-    return weights @ features.flatten(0, 1)
 
 
 @pytest.mark.parametrize("mean", [mean_with_one_maximum, mean_with_window_maxima])
