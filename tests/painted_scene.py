@@ -11,15 +11,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lang3dxl_ns.query.engine import PerGaussian
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
-from lang3dxl_ns.query.match import View
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.scene import QueryConfig, Scene
-from lang3dxl_ns.query.splat_file import GaussianArrays
-from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.gathering import filled_pixels
-from lang3dxl_ns.scene.camera import Camera, Lens, camera_to_world
+from lang3dxl_ns.rendering.splats import Splats, harmonics_of
+from lang3dxl_ns.scene.camera import Lens, camera_to_world
 
 WORDS = ("wall", "dome", "window", "object")
 DISTANCE = 5.0
@@ -72,37 +68,38 @@ def painted_gaussians() -> dict[str, Tensor]:
     }
 
 
-def activated(gaussians: dict[str, Tensor]) -> Gaussians:
-    g = gaussians
-    return Gaussians(g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(1))
-
-
-def render(camera: Camera, carried: Tensor | None) -> View:
+def painted_splats() -> Splats:
     """Gray for walls, brighter for every further word."""
     g = painted_gaussians()
     colors = (g["words"][:, None] / 3.0).expand(-1, 3)
-    drawn = rasterize(activated(g), camera, colors, features=carried, render_depth=True)
-    return View(camera, drawn.image, drawn.features, drawn.alpha[..., 0], drawn.depth[..., 0])
-
-
-def paint(camera: Camera, look: str | None) -> GaussianArrays:
-    g = painted_gaussians()
-    colors = (g["words"][:, None] / 3.0).expand(-1, 3)
-    return GaussianArrays.of(activated(g), colors)
-
-
-def fill(camera: Camera, weight: Tensor) -> Tensor:
-    gaussians = activated(painted_gaussians())
-    return filled_pixels(
-        lambda carried: rasterize(gaussians, camera, carried).image, weight, len(gaussians.means)
+    return Splats(
+        g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(1), harmonics_of(colors)
     )
 
 
-def engine() -> PerGaussian:
-    words = painted_gaussians()["words"]
-    rows = features()[words]
-    rows[-1] = 0  # nobody has seen it
-    return PerGaussian(GaussianFeatures(rows, None, (rows != 0).any(1)))
+class Painted(SemanticEncoder):
+    """Codes are the features themselves, decoded Gaussian by Gaussian."""
+
+    name = "painted"
+    per_gaussian = True
+
+    def __init__(self) -> None:
+        super().__init__(CHANNELS, 0)
+
+    def initial_codes(self, count, generator=None):
+        return None
+
+    def forward(self, rendered):
+        return rendered, None
+
+    def parameter_groups(self):
+        return {}
+
+
+def painted_codes() -> Tensor:
+    rows = features()[painted_gaussians()["words"]]
+    rows[-1] = torch.nan  # nobody has seen it
+    return rows
 
 
 def photo(name: str, x: float, y: float, split="train", focal: int = 96, size: int = 96) -> ScenePhoto:
@@ -113,21 +110,22 @@ def photo(name: str, x: float, y: float, split="train", focal: int = 96, size: i
     return ScenePhoto(name, split, camera_to_world(view).tolist(), lens)
 
 
-def painted_scene(cache_dir: Path | None = None, config: QueryConfig | None = None, **changes) -> Scene:
+def painted_file() -> SceneFile:
     photos = [
         photo("left/0001.jpg", -1.5, -1),
         photo("right/0002.jpg", 1.5, 1.5),
         photo("all/0003.jpg", 0, 0, focal=70),
     ]
     photos.append(photo("held/0004.jpg", 0.5, 0.5, "eval"))
-    file = SceneFile(photos, "clip", "0123", 1.0, torch.eye(4)[:3].tolist(), "nowhere")
-    gaussians = painted_gaussians()
-    parts = {"render": render, "fill": fill, "engine": engine, "gaussians": gaussians, "file": file}
-    parts |= {
-        "encode_texts": encode_texts,
-        "state": gaussians,
-        "paint": paint,
-        "cache_dir": cache_dir,
-        "config": config,
+    return SceneFile(photos, "clip", "0123", 1.0, torch.eye(4)[:3].tolist(), "nowhere")
+
+
+def painted_scene(cache: Path | None = None, config: QueryConfig | None = None, **changes) -> Scene:
+    parts = {
+        "splats": painted_splats(),
+        "file": painted_file(),
+        "decoder": Painted(),
+        "codes": painted_codes(),
     }
+    parts |= {"encode_texts": encode_texts, "cache": cache, "config": config}
     return Scene(**{**parts, **changes})

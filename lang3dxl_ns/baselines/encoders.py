@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from jaxtyping import Float
 from torch import Tensor
@@ -13,11 +13,14 @@ from lang3dxl_ns.baselines.feature3dgs import Feature3DGS
 from lang3dxl_ns.baselines.fmgs import PlaceField
 from lang3dxl_ns.baselines.langsplat import LangSplat
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressedField, CompressionConfig
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
 EncoderName = Literal["lang3dxl", "paper", "feature3dgs", "fmgs", "langsplat", "direct", "lifting"]
+
+NAMES: tuple[str, ...] = get_args(EncoderName)
 
 
 @dataclass
@@ -59,6 +62,19 @@ def make_encoder(
 
     center, radius: of the scene, world units.
     """
+    decoder = _make(config, settings, clip_dim, dense_dim, center, radius)
+    decoder.name = config.name
+    return decoder
+
+
+def _make(
+    config: EncoderConfig,
+    settings: SemanticFieldConfig,
+    clip_dim: int,
+    dense_dim: int,
+    center: Float[Tensor, "3"],
+    radius: float,
+) -> SemanticEncoder:
     if config.name == "feature3dgs":
         return Feature3DGS(clip_dim, dense_dim)
     if config.name == "fmgs":
@@ -71,4 +87,6 @@ def make_encoder(
         return LiftedFeatures(clip_dim, dense_dim)
     if config.name == "paper":
         return SemanticField(settings, clip_dim, dense_dim)
-    return CompressedField(settings, clip_dim, config.compression)
+    if config.name == "lang3dxl":
+        return CompressedField(settings, clip_dim, config.compression)
+    raise UserError(f"there is no feature decoder {config.name!r}: choose one of {', '.join(NAMES)}")

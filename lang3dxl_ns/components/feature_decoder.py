@@ -31,6 +31,8 @@ class SemanticEncoder(nn.Module, ABC):
         self.register_buffer("output_mean", torch.zeros(clip_dim + dense_dim))
         self.register_buffer("output_std", torch.ones(clip_dim + dense_dim))
 
+    name = ""
+    """What `baselines.encoders.make_encoder` makes it by."""
     bounded = False
     """Whether codes are squashed by a sigmoid before they are decoded."""
     per_gaussian = False

@@ -1,4 +1,4 @@
-"""Rendering of Gaussians in a photo's look, with what they carry."""
+"""Raster of Gaussians in a photo's look, with what they carry."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lang3dxl_ns.plugin.answering import AnsweringModel
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
-from lang3dxl_ns.rendering import Gaussians, Rendering, rasterize, spherical_harmonics
+from lang3dxl_ns.rendering import Gaussians, Raster, rasterize, spherical_harmonics
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.scene.camera import Camera, in_view
@@ -158,7 +158,7 @@ class RenderingModel(AnsweringModel):
 
     def _render(
         self, camera: Cameras, features: Tensor | None, keep: Tensor | None
-    ) -> tuple[Rendering, Float[Tensor, "3"]]:
+    ) -> tuple[Raster, Float[Tensor, "3"]]:
         g = {name: p if keep is None else p[keep] for name, p in self.gauss_params.items()}
         if features is not None and keep is not None:
             features = features[keep]

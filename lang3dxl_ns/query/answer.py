@@ -1,19 +1,16 @@
-"""Heat maps and overlays for viewers and renders, from a rendered view and prompts."""
+"""Answers as pictures: heat maps and overlays of a rendered view, for viewers and renders."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
-from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.threshold import EVEN, matching
+from lang3dxl_ns.query.question import Question
+from lang3dxl_ns.rendering.render import Rendering
 
 
 @dataclass(frozen=True)
@@ -26,63 +23,28 @@ class Display:
     """Opacity of the heat map over the image, 0…1."""
     color_map: str = "turbo"
     """Name of a matplotlib color map."""
-
-
-NOTHING = Queries(torch.zeros(0, 0), (), ())
-"""No prompts."""
-
-
-@dataclass(frozen=True)
-class Asked:
-    """The current prompts, and how views display their matches."""
-
-    engine: QueryEngine | None = None
-    """None while no prompt can be answered."""
-    queries: Queries = NOTHING
-    confining: int = 0
-    """How many of the last queries restrict where the others may match; these are not displayed."""
-    min_alpha: float = 0.3
-    """Coverage below which a pixel shows nothing."""
-    thresholds: tuple[float, ...] = ()
-    """Relevancy above which each query matches, of the scene; empty: `EVEN` for all."""
     highest: float | None = None
     """Relevancy for the color map's last color; None: the highest of each view."""
-    display: Display = field(default_factory=Display)
-
-    @cached_property
-    def carried(self) -> Float[Tensor, "n d"] | None:
-        """Values that Gaussians carry in a rendering that answers the prompts; computed once."""
-        return self.engine.carried(self.queries) if self.engine is not None and len(self.queries) else None
-
-    @torch.no_grad()
-    def outputs(
-        self,
-        image: Float[Tensor, "h w 3"],
-        rendered: Float[Tensor, "h w d"] | None,
-        alpha: Float[Tensor, "h w"],
-    ) -> dict[str, Float[Tensor, "h w k"]]:
-        """`relevancy_0` … [h, w, 1], one per prompt, and `overlay`, the heat map of their maximum over the
-        image (the image itself without prompts). rendered: the composited `carried` values."""
-        if self.engine is None or rendered is None or not len(self.queries):
-            return {"overlay": image}
-        maps = self.engine.maps(rendered, self.queries) * (alpha >= self.min_alpha)
-        own = self.thresholds or (EVEN,) * len(maps)
-        if self.confining:
-            maps, within = maps.tensor_split([-self.confining])
-            maps = maps * matching(within, own[len(maps) :]).any(0)
-        asked = self.display.threshold
-        thresholds = own[: len(maps)] if asked is None else (asked,) * len(maps)
-        return relevancy_outputs(image, maps.unbind(), self.display, thresholds, self.highest)
 
 
-def relevancy_outputs(
-    image: Float[Tensor, "h w 3"],
-    maps: Sequence[Float[Tensor, "h w"]],
-    display: Display,
-    thresholds: Sequence[float],
-    highest: float | None = None,
+@torch.no_grad()
+def pictures(
+    rendering: Rendering, question: Question | None, display: Display | None = None
 ) -> dict[str, Float[Tensor, "h w k"]]:
-    """`overlay` and `relevancy_0` … from the relevancy maps of one or more prompts."""
-    best, _, lowest = strongest(torch.stack(list(maps)), thresholds)
-    pictures = {"overlay": overlay(image, best, lowest, display.opacity, display.color_map, highest)}
-    return pictures | {f"relevancy_{i}": one[..., None] for i, one in enumerate(maps)}
+    """`overlay`, the heat map of all prompts over the rendering, and `relevancy_0` … [h, w, 1].
+
+    Args:
+        rendering: a view, rendered with the question's channels.
+        question: the prompts; None: the overlay is the rendering itself.
+        display: how matches are displayed.
+
+    Raises:
+        UserError: matplotlib has no color map of this name.
+    """
+    if question is None or rendering.channels is None:
+        return {"overlay": rendering.rgb}
+    display, maps = display or Display(), question.maps(rendering)
+    own = question.thresholds if display.threshold is None else (display.threshold,) * len(maps)
+    best, _, lowest = strongest(maps, own)
+    heat = overlay(rendering.rgb, best, lowest, display.opacity, display.color_map, display.highest)
+    return {"overlay": heat} | {f"relevancy_{i}": one[..., None] for i, one in enumerate(maps)}

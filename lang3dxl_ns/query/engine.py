@@ -1,7 +1,7 @@
 """Query engines: prompts to relevancy maps, decoding Gaussian by Gaussian or pixel by pixel.
 
-Callers treat both alike: composite what Gaussians carry for the prompts, in the pass that renders their
-colors, and let the engine compute maps from the result.
+Callers treat both alike: they composite the engine's channels in the pass that renders colors, and let the
+engine compute maps from the result.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
@@ -21,14 +22,17 @@ from lang3dxl_ns.query.relevancy import TEMPERATURE, Decode, Queries, relevancy_
 class QueryEngine(Protocol):
     """Answers prompts about a scene."""
 
-    def carried(self, queries: Queries) -> Float[Tensor, "n d"]:
-        """Values that Gaussians must carry in a rendering that answers these prompts."""
+    def channels(self, queries: Queries) -> Float[Tensor, "n d"]:
+        """Values that Gaussians carry in a rendering that answers these prompts."""
 
     def maps(self, rendered: Float[Tensor, "h w d"], queries: Queries) -> Float[Tensor, "q h w"]:
-        """Relevancy of every pixel, 0…1, from the carried values composited over black."""
+        """Relevancy of every pixel, 0…1, from these channels composited over black."""
 
     def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
         """Relevancy of every Gaussian by itself, 0…1."""
+
+    def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
+        """Unit CLIP features of some Gaussians; 0 for those visible in no photo."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +40,20 @@ class PerGaussian:
     """One relevancy per Gaussian and prompt, composited: Σ w ρ, not divided by coverage. A pixel's value is
     the share of it covered by matching Gaussians, also at edges and half-transparent places."""
 
-    features: GaussianFeatures
+    decoded: GaussianFeatures
     temperature: float = TEMPERATURE
 
-    def carried(self, queries: Queries) -> Float[Tensor, "n q"]:
+    def channels(self, queries: Queries) -> Float[Tensor, "n q"]:
         return self.of_gaussians(queries).T.contiguous()
 
     def maps(self, rendered: Float[Tensor, "h w q"], queries: Queries) -> Float[Tensor, "q h w"]:
         return rendered.permute(2, 0, 1)
 
     def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
-        return self.features.relevancy(queries, self.temperature)
+        return self.decoded.relevancy(queries, self.temperature)
+
+    def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
+        return self.decoded.features(rows)
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ class PerPixel:
     codes: Float[Tensor, "n d"]
     temperature: float = TEMPERATURE
 
-    def carried(self, queries: Queries) -> Float[Tensor, "n d"]:
+    def channels(self, queries: Queries) -> Float[Tensor, "n d"]:
         return self.codes
 
     def maps(self, rendered: Float[Tensor, "h w d"], queries: Queries) -> Float[Tensor, "q h w"]:
@@ -66,12 +73,15 @@ class PerPixel:
     def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
         return relevancy_of_codes(self.decode, self.codes, queries, temperature=self.temperature)
 
+    def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
+        return F.normalize(self.decode(self.codes[rows]), dim=1)
+
 
 @torch.no_grad()
 def make_engine(
-    encoder: SemanticEncoder, carried: Float[Tensor, "n d"], temperature: float = TEMPERATURE
+    decoder: SemanticEncoder, codes: Float[Tensor, "n d"], temperature: float = TEMPERATURE
 ) -> QueryEngine:
     """The engine for a feature decoder, with its own order of compositing and decoding."""
-    if encoder.per_gaussian:
-        return PerGaussian(GaussianFeatures.of(encoder, carried), temperature)
-    return PerPixel(encoder.decode_clip, carried, temperature)
+    if decoder.per_gaussian:
+        return PerGaussian(GaussianFeatures.of(decoder, codes), temperature)
+    return PerPixel(decoder.decode_clip, codes, temperature)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.memory import with_less_memory
@@ -52,6 +52,12 @@ class GaussianFeatures:
 
         rows = _in_chunks(decode, carried, encoder.clip_dim)
         return cls(rows, head, (rows != 0).any(1))
+
+    @torch.no_grad()
+    def features(self, which: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
+        """Unit features of some Gaussians; 0 where unknown."""
+        rows = self.rows[which].float()
+        return rows if self.head is None else rows @ self.head
 
     @torch.no_grad()
     def cosines(self, queries: Queries) -> Float[Tensor, "n v"]:

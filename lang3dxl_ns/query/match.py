@@ -1,10 +1,11 @@
-"""Results of queries: views, matches, viewpoints, and their pictures."""
+"""Results of queries: views, matches, places, and their pictures. Arrays are NumPy's."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,47 +20,50 @@ from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS, overlay, tinted, with_legend
 from lang3dxl_ns.query.places import Box
 from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.rendering.render import Rendering
 from lang3dxl_ns.scene.camera import Camera
 
 
-@dataclass(repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class View:
-    """A rendering, shared by several prompts. Tensors have no gradient."""
+    """A rendering of the scene, shared by several prompts."""
 
-    camera: Camera
-    image: Float[Tensor, "h w 3"]
-    """Colors, 0…1."""
-    carried: Float[Tensor, "h w d"] | None
-    """Values that Gaussians carried for the prompts, composited over black; None without prompts."""
-    alpha: Float[Tensor, "h w"]
-    """Coverage, 0…1."""
-    depth: Float[Tensor, "h w"]
-    """Along the camera's axis, units of the model's frame."""
+    rendering: Rendering
+    """Its maps as tensors, on the scene's device."""
+    name: str | None = None
+    """The photo that was taken here; None for other cameras."""
     seconds: float = 0.0
     """Rendering time."""
-    counts: Bool[Tensor, "h w"] | None = None
-    """Foreground of the photo at this view; None: everything."""
-    name: str | None = None
-    """Of the photo taken here; None for other cameras."""
-
-    def __post_init__(self) -> None:
-        self.image, self.alpha, self.depth = (t.detach() for t in (self.image, self.alpha, self.depth))
-        self.carried = None if self.carried is None else self.carried.detach()
 
     def __repr__(self) -> str:
         return f"View({_where(self)}, {self.camera.width} × {self.camera.height} pixels)"
 
     @property
+    def camera(self) -> Camera:
+        """Where the view is rendered from."""
+        return self.rendering.camera
+
+    @cached_property
     def pixels(self) -> UInt8[Array, "h w 3"]:
         """The colors as bytes."""
-        return as_bytes(self.image)
+        return as_bytes(self.rendering.rgb)
+
+    @cached_property
+    def alpha(self) -> Float[Array, "h w"]:
+        """Coverage, 0…1."""
+        return self.rendering.alpha.cpu().numpy()
+
+    @cached_property
+    def depth(self) -> Float[Array, "h w"]:
+        """Distance along the camera's axis, units of the model's frame; 0 where nothing is rendered."""
+        return self.rendering.depth.cpu().numpy()
 
     def save(self, path: str | Path) -> Path:
         """Write the rendering as a picture."""
         return save_picture(self.pixels, path)
 
 
-@dataclass(repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Match:
     """Match of a prompt in a view."""
 
@@ -70,21 +74,12 @@ class Match:
     """Share of unrelated words that fit the scene as well: above 0.1 the scene hardly shows the prompt, or
     CLIP doesn't know it."""
     view: View
-    relevancy: Float[Tensor, "h w"]
+    relevancy: Float[Array, "h w"]
     """0…1; above 0.5 where the prompt beats all its competitors, 0 where nothing is rendered."""
-    mask: Bool[Tensor, "h w"]
-    """Above the threshold."""
-    peak: tuple[int, int]
-    """Column and row of the most relevant pixel."""
-    score: float
-    """Relevancy there."""
+    threshold: float
+    """Relevancy above which a pixel matches."""
     seconds: float
     """For all prompts of the call, without rendering."""
-    threshold: float = 0.5
-    """Relevancy above which a pixel matches."""
-
-    def __post_init__(self) -> None:
-        self.relevancy = self.relevancy.detach()
 
     def __repr__(self) -> str:
         return (
@@ -92,14 +87,31 @@ class Match:
             f"{self.area:.1%} of the view)"
         )
 
+    @cached_property
+    def mask(self) -> Bool[Array, "h w"]:
+        """Pixels above the threshold."""
+        return self.relevancy > self.threshold
+
+    @cached_property
+    def peak(self) -> tuple[int, int]:
+        """Column and row of the most relevant pixel."""
+        row, column = np.unravel_index(int(self.relevancy.argmax()), self.relevancy.shape)
+        return int(column), int(row)
+
+    @property
+    def score(self) -> float:
+        """Relevancy at the peak."""
+        return float(self.relevancy.max())
+
     @property
     def area(self) -> float:
         """Share of the view that matches."""
-        return float(self.mask.float().mean())
+        return float(self.mask.mean())
 
     def overlay(self, opacity: float = 0.7, color_map: str = "turbo") -> UInt8[Array, "h w 3"]:
         """The heat map over the rendering. Raises UserError for an unknown matplotlib color map."""
-        return as_bytes(overlay(self.view.image, self.relevancy, self.threshold, opacity, color_map))
+        image = self.view.rendering.rgb.cpu()
+        return as_bytes(overlay(image, torch.from_numpy(self.relevancy), self.threshold, opacity, color_map))
 
     def save(self, path: str | Path) -> Path:
         """Write the overlay as a picture or, if the name ends in .npy, the relevancy (float32)."""
@@ -107,7 +119,7 @@ class Match:
         if path.suffix != ".npy":
             return save_picture(self.overlay(), path)
         content = io.BytesIO()
-        np.save(content, self.relevancy.cpu().numpy().astype(np.float32))
+        np.save(content, self.relevancy.astype(np.float32))
         write_atomically(path, content.getvalue())
         return path
 
@@ -115,15 +127,15 @@ class Match:
 def together(matches: Sequence[Match], opacity: float = 0.7) -> UInt8[Array, "h+legend w 3"]:
     """Several prompts in one view: each in a color of its own, the strongest where they overlap, and a legend
     below. Raises UserError if there is none, or they are of different views."""
-    if not matches or any(match.view.image.shape != matches[0].view.image.shape for match in matches):
+    if not matches or any(match.view.pixels.shape != matches[0].view.pixels.shape for match in matches):
         raise UserError("one picture shows the prompts of one view: pass the matches of a single query")
-    maps = torch.stack([match.relevancy for match in matches])
+    maps = torch.stack([torch.from_numpy(match.relevancy) for match in matches])
     thresholds = [match.threshold for match in matches]
-    picture = as_bytes(tinted(matches[0].view.image, maps, thresholds, opacity))
+    picture = as_bytes(tinted(matches[0].view.rendering.rgb.cpu(), maps, thresholds, opacity))
     return with_legend(picture, [match.prompt.text for match in matches], PROMPT_COLORS)
 
 
-@dataclass(repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Viewpoint:
     """A training camera that shows a match."""
 
@@ -141,15 +153,19 @@ class Viewpoint:
         return f"Viewpoint({self.name!r}, rank {self.rank:.2f}, {self.area:.1%} of it matches)"
 
 
-@dataclass(repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Found:
-    """Matches of a prompt in the scene."""
+    """Match of a prompt in the scene."""
 
     prompt: Prompt
-    viewpoints: list[Viewpoint]
-    """Best first; empty if nothing matches."""
+    views: list[Viewpoint]
+    """Training views that show it, best first; empty if nothing matches."""
     box: Box | None
     """Around the strongest connected match; None if nothing matches."""
+    relevancy: Float[Array, " n"]
+    """Of every Gaussian, 0…1."""
+    gaussians: Bool[Array, " n"]
+    """Those that match: the selection that masks show in 2D."""
     doubt: float
     """As in `Match`."""
     threshold: float
@@ -158,8 +174,9 @@ class Found:
     """The same ranking, also of views in which nothing matches."""
 
     def __repr__(self) -> str:
-        best = f"best {self.viewpoints[0].name!r}" if self.viewpoints else "nothing matches"
-        return f"Found({self.prompt.text!r}: {len(self.viewpoints)} viewpoints, {best})"
+        best = f"best {self.views[0].name!r}" if self.views else "nothing matches"
+        count = int(self.gaussians.sum())
+        return f"Found({self.prompt.text!r}: {len(self.views)} views, {best}, {count:,} Gaussians)"
 
 
 def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Array, "h w 3"]:

@@ -5,6 +5,7 @@ Written when training starts, so that a finished run can be queried without its 
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Sequence
@@ -13,9 +14,12 @@ from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float64
 from numpy import ndarray as Array
+from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
@@ -40,8 +44,8 @@ class ScenePhoto:
     """[3, 4], the model's frame, nerfstudio's camera axes (x right, y up, z backward)."""
     lens: Lens
     """Of the file: masks are drawn on the distorted photo, while views are undistorted."""
-    mask: str | None = None
-    """File of the photo's foreground mask."""
+    mask: str | bytes | None = None
+    """Foreground mask of the photo: its file, or the content of a PNG of the undistorted mask."""
     size: tuple[int, int] | None = None
     """Width and height of the file; None in runs of earlier versions: that of the lens."""
 
@@ -68,7 +72,7 @@ class ScenePhoto:
 
     def photo(self, folder: Path = Path()) -> Photo:
         """The photo in its folder; without its mask if that is gone."""
-        mask = None if self.mask is None else Path(self.mask)
+        mask = Path(self.mask) if isinstance(self.mask, str) else None
         return Photo(
             name=self.name,
             path=folder / self.name,
@@ -76,9 +80,19 @@ class ScenePhoto:
             lens=self.lens,
         )
 
-    def foreground(self) -> Bool[Tensor, "h w"] | None:
-        """The photo's foreground; None if it has no mask, or the mask is gone."""
-        return self.photo().read_mask()
+    def foreground(self, size: tuple[int, int] | None = None) -> Bool[Tensor, "h w"] | None:
+        """The photo's undistorted foreground; None if it has no mask, or the mask is gone.
+
+        size: height and width in pixels; default: as the mask is stored.
+        """
+        if isinstance(self.mask, bytes):
+            pixels = np.array(Image.open(io.BytesIO(self.mask)).convert("1"))
+            mask: Bool[Tensor, "h w"] | None = torch.from_numpy(pixels)
+        else:
+            mask = self.photo().read_mask()
+        if mask is None or size is None:
+            return mask
+        return F.interpolate(mask[None, None].float(), size, mode="nearest-exact")[0, 0].bool()
 
 
 @dataclass(frozen=True)
@@ -114,8 +128,7 @@ class SceneFile:
             content: dict[str, Any] = json.loads(path.read_text())
             if content.pop("version") != _VERSION:
                 raise ValueError("another version wrote it")
-            content["photos"] = [_photo(**photo) for photo in content["photos"]]
-            return _checked(cls(**content))
+            return scene_from_json(content)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise UserError(f"{path} can't be read ({error}): restore it, or train anew") from error
 
@@ -133,6 +146,14 @@ class SceneFile:
         raise UserError(
             f"the scene has no photo {name!r}: there are {len(names)}, such as {', '.join(similar)}"
         )
+
+
+def scene_from_json(content: dict[str, Any]) -> SceneFile:
+    """The description in a JSON object, after validating all its values.
+
+    Raises ValueError, KeyError, TypeError or AttributeError for anything else.
+    """
+    return _checked(SceneFile(**{**content, "photos": [_photo(**photo) for photo in content["photos"]]}))
 
 
 def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:

@@ -1,228 +1,448 @@
-"""Text queries on a trained scene: relevancy maps, matches, best viewpoints."""
+"""`Scene`: a finished scene that one can render and ask, as data."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any, TypeAlias
 
+import numpy as np
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import watched
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.looks import Look, Looks, render_in_look
+from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
-from lang3dxl_ns.query.engine import QueryEngine
+from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.match import Found, Match, View, Viewpoint
 from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.places import strongest_match
 from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.rank_views import rank_views
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.query.splat_file import GaussianArrays, write_gaussians
-from lang3dxl_ns.query.text import Prompt, TextEncoder, parse_prompts
-from lang3dxl_ns.query.threshold import match_thresholds, matching
+from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts
+from lang3dxl_ns.query.threshold import match_thresholds
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
-from lang3dxl_ns.scene.camera import Camera, posed, resized, with_longer_side
+from lang3dxl_ns.query.vocabulary import shipped_vocabulary
+from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering.render import Rendering, composite
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 
 _LEAST_PIXELS = 1.0
 """Pixels of a small view that a match must fill."""
+_ROWS = 65_536
+"""Gaussians decoded at a time."""
 LARGEST = 1920
-"""Longer side of pictures in pixels, where no size is asked for."""
-Place = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
+"""Longer side of pictures in pixels, where no size is requested."""
+NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
+Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
 """A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
+Text: TypeAlias = str | Prompt | Float[Tensor, " c"] | Float[Array, " c"]
+"""A text as `parse_prompts` reads it, or a vector in the space of the scene's CLIP."""
 
 
 class Scene:
-    """A trained scene; `lang3dxl_ns.load_scene(run)` makes one.
+    """A scene: Gaussians, what they mean, and the photos they were made from.
+
+    It is data, and never changes; what is computed from it once (decoded features, the Gaussians that each
+    photo shows) is kept. Any number of threads may use one scene.
 
     Args:
-        render: renders a camera, compositing the values that Gaussians carry [n, d], if any.
-        fill: from a camera and a weight per pixel to the pixels that every Gaussian fills.
-        engine: makes the query engine; called once, at the first query.
-        gaussians: the model's raw parameters (means, codes, …).
-        file: photos and cameras.
-        encode_texts: the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
-        state: all tensors that affect a rendering or decoding; they key the cache.
-        cache_dir: folder for small views and the table; None: no cache.
-        paint: from a camera and a training photo's name (None: the look of the camera's own view) to the
-            Gaussians as arrays, with their colors as seen from there.
+        splats: the Gaussians, in the model's frame.
+        file: photos, cameras, and the CLIP that the features come from.
+        decoder: turns codes into features; None for a scene of colors alone.
+        codes: semantic values of the Gaussians, a row each; NaN for those visible in no photo.
+        looks: lighting of the photos; None where all share one.
+        background: color behind the scene, 0…1; None for black.
+        config: defaults of queries.
+        encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text.
+        cache: file to keep which Gaussians the photos show; None: they are measured in every process.
+        backend: the rasterizer, see `rasterize`.
         watch: called with a short description of slow work; None: a progress bar.
     """
 
     def __init__(
         self,
-        render: Callable[[Camera, Float[Tensor, "n d"] | None], View],
-        fill: Callable[[Camera, Float[Tensor, "h w"]], Float[Tensor, " n"]],
-        engine: Callable[[], QueryEngine],
-        gaussians: Mapping[str, Tensor],
+        splats: Splats,
         file: SceneFile,
-        encode_texts: Callable[[list[str]], Tensor],
-        state: Mapping[str, Tensor],
-        paint: Callable[[Camera, str | None], GaussianArrays],
-        cache_dir: Path | None = None,
+        decoder: SemanticEncoder | None = None,
+        codes: Float[Tensor, "n d"] | None = None,
+        *,
+        looks: Looks | None = None,
+        background: Float[Tensor, "3"] | None = None,
         config: QueryConfig | None = None,
+        encode_texts: EncodeTexts | None = None,
+        cache: Path | None = None,
+        backend: Backend = "auto",
         watch: Callable[[str], None] | None = None,
     ) -> None:
+        self.splats, self.file, self.decoder, self.codes = splats, file, decoder, codes
+        self.looks, self.background, self.backend = looks, background, backend
         self.config = config or QueryConfig()
-        self._watch = watch
-        self._render, self._fill, self._make_engine = render, fill, engine
-        self.gaussians = gaussians
-        self.file = file
-        self.text = TextEncoder(encode_texts, self.config.text)
-        self._state, self._paint, self._cache_dir = state, paint, cache_dir
+        self._encode_texts, self._cache, self._watch = encode_texts, cache, watch
         self._doubt_alone: dict[str, float] = {}
-        """Of texts without their synonyms."""
+        """Doubt about texts without their synonyms."""
 
     def __repr__(self) -> str:
-        photos = self.photos
-        held_out = sum(photo.split == "eval" for photo in photos)
+        held_out = sum(photo.split == "eval" for photo in self.photos)
+        words = f"CLIP {self.file.clip}" if self.decoder is not None else "colors alone"
         return (
-            f"Scene({len(self.gaussians['means']):,} Gaussians, {len(photos)} photos ({held_out} held out) "
-            f"of {self.file.data}, CLIP {self.file.clip})"
+            f"Scene({len(self.splats):,} Gaussians, {len(self.photos)} photos ({held_out} held out) "
+            f"of {self.file.data}, {words})"
         )
 
     @property
     def device(self) -> torch.device:
         """Where the Gaussians are."""
-        return self.gaussians["means"].device
-
-    # ── asking ──────────────────────────────────────────────────────────────────────────────────────
+        return self.splats.means.device
 
     @property
     def photos(self) -> list[ScenePhoto]:
         """Training photos, then held-out ones: names, cameras, poses."""
         return self.file.photos
 
-    def camera(self, place: Place, size: int | None = None) -> Camera:
-        """The given camera, that of a photo by name, or one at a pose (camera → world in the model's frame,
-        nerfstudio's axes) with the first photo's lens. size: of the longer side in pixels; by default a
-        camera's own, and that of the photo's file, at most 1920. Raises UserError for an unknown name."""
+    @cached_property
+    def overview(self) -> ScenePhoto:
+        """The photo that shows the scene as a whole."""
+        return overview(self.photos, tuple(self.splats.means.median(0).values.tolist()))
+
+    # ── looking ─────────────────────────────────────────────────────────────────────────────────────
+
+    def camera(self, place: Place, size: int | None = None, fov: float | None = None) -> Camera:
+        """A camera of the scene.
+
+        Args:
+            place: a camera; a photo by name; or a pose (camera → world in the model's frame, nerfstudio's
+                axes), which gets the first photo's lens.
+            size: longer side in pixels; by default a camera's own, and for photos that of the file, at most
+                1920.
+            fov: vertical field of view in degrees; by default that of the lens.
+
+        Raises:
+            UserError: no photo has this name, or the size or field of view is impossible.
+        """
         size = self.config.size if size is None else size
         if isinstance(place, Camera):
-            return place if size is None else with_longer_side(place, size)
-        photo = self.file.photo(place) if isinstance(place, str) else self.photos[0]
-        camera = (
-            photo.full_camera if isinstance(place, str) else posed(torch.as_tensor(place), photo.full_camera)
-        )
-        return resized(camera, LARGEST) if size is None else with_longer_side(camera, size)
+            camera = place if size is None else with_longer_side(place, size)
+        else:
+            photo = self.file.photo(place) if isinstance(place, str) else self.photos[0]
+            camera = photo.full_camera
+            if not isinstance(place, str):
+                camera = posed(torch.as_tensor(place), camera)
+            camera = resized(camera, LARGEST) if size is None else with_longer_side(camera, size)
+        return camera if fov is None else with_field_of_view(camera, fov)
 
-    def render(self, place: Place, size: int | None = None) -> View:
-        """The scene from a photo's viewpoint by name, a camera or a pose, at a size as for `camera`."""
-        view = self._render(self.camera(place, size), None)
-        view.name = self.file.photo(place).name if isinstance(place, str) else None
-        return view
+    def render(
+        self, place: Place, size: int | None = None, fov: float | None = None, look: str | None = None
+    ) -> View:
+        """The scene from a photo's viewpoint, a camera or a pose.
+
+        Args:
+            place, size, fov: see `camera`.
+            look: training photo whose lighting is used; default: by the scene's rule for this view.
+
+        Raises:
+            UserError: see `camera`; or there is no look of this photo.
+        """
+        return self._view(self.camera(place, size, fov), self._name(place), look=look)
+
+    def draw(
+        self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
+    ) -> Rendering:
+        """Render a camera, as tensors on the scene's device.
+
+        Args:
+            camera: where to render from.
+            channels: further values of the Gaussians to composite.
+            look: the lighting; default: by the scene's rule for this view.
+        """
+        if look is None and self.looks is not None:
+            look = self.looks.of_view(camera)
+        return render_in_look(
+            self.splats, camera, look, channels, background=self.background, backend=self.backend
+        )
+
+    def _view(
+        self,
+        camera: Camera,
+        name: str | None,
+        channels: Float[Tensor, "n d"] | None = None,
+        look: str | None = None,
+    ) -> View:
+        start = time.perf_counter()
+        chosen = self._look(look)
+        return View(self.draw(camera, channels, chosen), name, time.perf_counter() - start)
+
+    def _look(self, photo: str | None) -> Look | None:
+        if photo is None:
+            return None
+        if self.looks is None:
+            raise UserError("all photos of this scene share one lighting: there is no look to choose")
+        return self.looks.of_photo(photo)
+
+    def _name(self, place: Place) -> str | None:
+        return self.file.photo(place).name if isinstance(place, str) else None
+
+    # ── asking ──────────────────────────────────────────────────────────────────────────────────────
+
+    def ask(
+        self,
+        texts: Text | Sequence[Text],
+        *,
+        negatives: Sequence[str] = (),
+        foreground: str | None = None,
+        threshold: float | None = None,
+    ) -> Question:
+        """Put prompts to the scene.
+
+        Args:
+            texts: prompts as `parse_prompts` reads them ("dome; rose window", '"windows" not "arcades"'), or
+                vectors.
+            negatives: phrases that all prompts compete with, besides their own.
+            foreground: prompts that matches must lie on, such as "building"; default: the settings'.
+            threshold: relevancy above which places match, 0…1; default: the settings', or by the scene
+                (`match_thresholds`).
+
+        Raises:
+            UserError: there is no prompt, the threshold is impossible, or the scene has colors alone.
+        """
+        extra = tuple(negatives)
+        prompts = [replace(p, negatives=p.negatives + extra) for p in self.prompts(texts)]
+        within = self.config.foreground if foreground is None else foreground
+        everything = [*prompts, *(self.prompts(within) if within else ())]
+        queries = self.queries(everything)
+        relevancy = self.engine.of_gaussians(queries)
+        doubts = self.doubts.of(relevancy)
+        own = match_thresholds(relevancy, doubts, [bool(prompt.negatives) for prompt in everything])
+        count, requested = len(prompts), self.config.threshold if threshold is None else threshold
+        if requested is not None and not 0 <= requested <= 1:
+            raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
+        return Question(
+            self.engine,
+            tuple(prompts),
+            queries,
+            tuple(doubts[:count]),
+            own[:count] if requested is None else (requested,) * count,
+            own[count:],
+            self.config.min_alpha,
+        )
 
     def query(
         self,
-        texts: str | Sequence[str],
+        texts: Text | Sequence[Text],
         place: Place | None = None,
+        *,
+        negatives: Sequence[str] = (),
         size: int | None = None,
         threshold: float | None = None,
-    ) -> list[Match]:
-        """Matches in a view, one per prompt.
+    ) -> Any:
+        """Matches in a view: a `Match` for one prompt, a list of them for several.
 
         Args:
-            texts: prompts as `parse_prompts` reads them ("dome; rose window", '"windows" not "arcades"').
+            texts, negatives, threshold: see `ask`.
             place: a photo's name (matches are restricted to its foreground), a camera or a pose; None: for
                 each prompt the training view that shows it best.
-            size: of the longer side in pixels, as for `camera`.
-            threshold: relevancy above which a pixel matches; default: the settings', or by the scene
-                (`match_thresholds`).
+            size: longer side in pixels, see `camera`.
 
-        Raises UserError for an empty text or an unknown photo.
+        Raises:
+            UserError: see `ask` and `camera`.
         """
-        prompts = self.prompts(texts)
+        question = self.ask(texts, negatives=negatives, threshold=threshold)
         if place is not None:
-            return self.match(prompts, place, size, threshold)
-        names = self.best_views(prompts)
-        return [self.match([p], n, size, threshold)[0] for p, n in zip(prompts, names, strict=True)]
+            found = self.matches(question, place, size)
+        else:
+            names = self.best_views(question)
+            questions = [self.ask([p], threshold=threshold) for p in question.prompts]
+            found = [self.matches(q, n, size)[0] for q, n in zip(questions, names, strict=True)]
+        return found if _several(texts, found) else found[0]
 
-    def best_views(self, prompts: str | Sequence[str | Prompt]) -> list[str]:
-        """For each prompt the name of the training photo whose view shows it best, or comes closest."""
-        return [(f.viewpoints or f.closest)[0].name for f in self.find(prompts, most=1)]
-
-    def prompts(self, texts: str | Sequence[str | Prompt]) -> list[Prompt]:
-        """Parsed prompts. Raises UserError if there are none."""
-        typed = [texts] if isinstance(texts, str) else texts
-        prompts = [p for text in typed for p in ([text] if isinstance(text, Prompt) else parse_prompts(text))]
-        return prompts or parse_prompts("")
-
-    def match(
-        self,
-        prompts: Sequence[Prompt],
-        place: Place,
-        size: int | None = None,
-        threshold: float | None = None,
-    ) -> list[Match]:
-        """Matches of parsed prompts in a view; see `query`."""
-        confining = self._confining()
-        queries = self.queries([*prompts, *confining])
-        doubts, thresholds = self._judge([*prompts, *confining], self.engine.of_gaussians(queries))
-        thresholds = self._asked(threshold, thresholds, len(prompts))
+    def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
+        """Matches of a question's prompts in one view; see `query`."""
         start = time.perf_counter()
-        carried = self.engine.carried(queries)
+        channels = question.channels
         seconds = time.perf_counter() - start
-        view = self._render(self.camera(place, size), carried)
-        if isinstance(place, str):
-            view.name, view.counts = self.file.photo(place).name, self._foreground_of(place, view.camera)
+        view = self._view(self.camera(place, size), self._name(place), channels)
         start = time.perf_counter()
-        assert view.carried is not None
-        maps = self.engine.maps(view.carried, queries)
-        keep = view.alpha >= self.config.min_alpha
-        if view.counts is not None:
-            keep = keep & view.counts
-        if confining:
-            maps, within = maps.tensor_split([len(prompts)])
-            keep = keep & matching(within, thresholds[len(prompts) :]).any(0)
-        maps = maps * keep
-        peaks = maps.flatten(1).max(dim=1)
-        scores, places = peaks.values.tolist(), peaks.indices.tolist()
+        foreground = None if view.name is None else self.file.photo(view.name).foreground()
+        maps = question.maps(view.rendering, foreground).cpu().float().numpy()
         seconds += time.perf_counter() - start
+        rows = zip(question.prompts, question.doubts, question.thresholds, maps, strict=True)
         return [
-            Match(
-                prompt,
-                self.synonyms(prompt),
-                doubt,
-                view,
-                relevancy,
-                relevancy > level,
-                (place % view.camera.width, place // view.camera.width),
-                score,
-                seconds,
-                level,
-            )
-            for prompt, doubt, level, relevancy, score, place in zip(
-                prompts, doubts, thresholds, maps, scores, places, strict=False
-            )
+            Match(prompt, self.synonyms(prompt), doubt, view, relevancy, level, seconds)
+            for prompt, doubt, level, relevancy in rows
         ]
 
-    def _judge(
-        self, prompts: Sequence[Prompt], relevancy: Float[Tensor, "q n"]
-    ) -> tuple[list[float], tuple[float, ...]]:
-        """Doubt about prompts and the thresholds of their matches, from the relevancy of all Gaussians."""
-        doubts = self.doubts.of(relevancy)
-        return doubts, match_thresholds(relevancy, doubts, [bool(prompt.negatives) for prompt in prompts])
+    def find(
+        self,
+        texts: Text | Sequence[Text],
+        *,
+        negatives: Sequence[str] = (),
+        threshold: float | None = None,
+        most: int = 10,
+    ) -> Any:
+        """Matches in the scene: a `Found` for one prompt, a list of them for several.
 
-    def thresholds(self, prompts: Sequence[Prompt]) -> tuple[float, ...]:
-        """Relevancy above which places match each prompt by the scene, whatever the settings are."""
-        return self._judge(prompts, self.engine.of_gaussians(self.queries(prompts)))[1]
+        Args:
+            texts, negatives, threshold: see `ask`.
+            most: views to return, at least 1.
 
-    def _asked(self, asked: float | None, own: tuple[float, ...], prompts: int) -> tuple[float, ...]:
-        """Thresholds, those of the first prompts replaced by what is asked for, here or in the settings."""
-        asked = self.config.threshold if asked is None else asked
-        if asked is None:
-            return own
-        if not 0 <= asked <= 1:
-            raise UserError(f"the threshold is {asked}: give a relevancy from 0 to 1")
-        return (asked,) * prompts + own[prompts:]
+        Raises:
+            UserError: see `ask`.
+        """
+        if most < 1:
+            raise UserError(f"{most} views are requested: give 1 or more")
+        found = self.places(self.ask(texts, negatives=negatives, threshold=threshold), most)
+        return found if _several(texts, found) else found[0]
+
+    def places(self, question: Question, most: int = 10) -> list[Found]:
+        """Matches of a question's prompts in the scene; see `find`."""
+        return [self._found(question, i, most) for i in range(len(question.prompts))]
+
+    def best_views(self, question: Question) -> list[str]:
+        """For each prompt the name of the training photo whose view shows it best, or comes closest."""
+        return [(found.views or found.closest)[0].name for found in self.places(question, most=1)]
+
+    def relevancy(self, text: Text) -> Float[Array, " n"]:
+        """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
+
+        Raises:
+            UserError: see `ask`; or the text holds several prompts.
+        """
+        return self._one(text).relevancy[0].cpu().float().numpy()
+
+    def export(
+        self,
+        path: str | Path,
+        text: Text | None = None,
+        *,
+        threshold: float | None = None,
+        everything: bool = False,
+        look: str | None = None,
+    ) -> int:
+        """Write the Gaussians as a .ply or .spz file for splat viewers.
+
+        Args:
+            path: the file.
+            text: write only the Gaussians that match it; None: all.
+            threshold: see `ask`.
+            everything: with a text, write all Gaussians; a PLY has their relevancy as a property.
+            look: training photo whose lighting is baked into the colors; default: of the overview photo.
+
+        Returns:
+            How many were written.
+
+        Raises:
+            UserError: nothing matches, or see `ask` and `write_splats`.
+        """
+        splats, relevancy = self.baked(look), None
+        if text is not None:
+            question = self._one(text, threshold)
+            relevancy, keep = question.relevancy[0], question.gaussians[0]
+            if not everything and not keep.any():
+                best, level = float(relevancy.max()), question.thresholds[0]
+                raise UserError(
+                    f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
+                    f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
+                )
+            if not everything:
+                splats, relevancy = splats.select(keep), relevancy[keep]
+        return write_splats(Path(path), splats, relevancy)
+
+    def baked(self, look: str | None = None) -> Splats:
+        """The Gaussians for viewers that know no looks: under that of a training photo.
+
+        Args:
+            look: the photo; default: the overview photo. Without looks the Gaussians are returned as they
+                are.
+        """
+        if self.looks is None:
+            if look is not None:
+                self._look(look)
+            return self.splats
+        camera = self.overview.camera
+        chosen = self._look(look) or self.looks.of_view(camera)
+        pose = camera.view_matrix
+        return chosen.apply(self.splats, -pose[:3, :3].T @ pose[:3, 3])
+
+    # ── features ────────────────────────────────────────────────────────────────────────────────────
+
+    def encode(self, texts: str | Sequence[str]) -> Float[Array, "n c"]:
+        """Unit vectors of texts in the space of the scene's CLIP: [c] for one text, [n, c] for a list."""
+        vectors = self.text.vectors([texts] if isinstance(texts, str) else list(texts)).cpu().numpy()
+        return vectors[0] if isinstance(texts, str) else vectors
+
+    @property
+    def features(self) -> Float[Array, "n c"]:
+        """Unit CLIP features of all Gaussians, half precision; 0 for those visible in no photo. They are
+        decoded in parts at each call: 1 GB for a million Gaussians of 512 channels."""
+        rows = range(0, len(self.splats), _ROWS)
+        parts = [self.engine.features(slice(row, row + _ROWS)).cpu().half().numpy() for row in rows]
+        return np.concatenate(parts) if parts else np.zeros((0, 0), np.float16)
+
+    def what_is(
+        self,
+        place: Place,
+        x: float,
+        y: float,
+        *,
+        words: Sequence[str] | None = None,
+        most: int = 5,
+        size: int | None = None,
+    ) -> list[tuple[str, float]]:
+        """The words that fit a pixel best, with their relevancy, best first; none where nothing is rendered.
+
+        Args:
+            place, size: the view, see `camera`.
+            x, y: column and row in pixels of that view.
+            words: the words to choose from; default: the shipped vocabulary of buildings.
+            most: words to return.
+
+        Raises:
+            UserError: the pixel lies outside the view.
+        """
+        camera = self.camera(place, size)
+        if not (0 <= x < camera.width and 0 <= y < camera.height):
+            raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
+        words = list(shipped_vocabulary() if words is None else words)
+        pixel = torch.zeros(camera.height, camera.width, device=self.device)
+        pixel[int(y), int(x)] = 1.0
+        share = self._fill(camera, pixel)
+        rows = share.nonzero().squeeze(1)
+        if not len(rows):
+            return []
+        feature = share[rows] @ self.engine.features(rows)
+        queries = self.text.plain_queries(words).to(self.device)
+        scores = queries.relevancy_of_cosines(queries.cosines(feature))
+        best = scores.topk(min(most, len(words)))
+        return [(words[int(i)], float(score)) for score, i in zip(best.values, best.indices, strict=True)]
+
+    # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
+
+    def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
+        """Parsed prompts. Raises UserError if there are none."""
+        prompts: list[Prompt] = []
+        for text in _listed(texts):
+            if isinstance(text, Prompt):
+                prompts.append(text)
+            elif isinstance(text, str):
+                prompts += parse_prompts(text)
+            else:
+                prompts.append(Prompt("vector", vector=self._vector(text)))
+        return prompts or parse_prompts("")
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
         """Vectors of prompts on the scene's device. A text that the scene doubts has its synonyms beside it:
@@ -232,7 +452,7 @@ class Scene:
 
     def synonyms(self, prompt: Prompt) -> list[str]:
         """Synonyms searched along with a prompt."""
-        synonyms = self.text.synonyms(prompt.text)
+        synonyms = [] if prompt.vector is not None else self.text.synonyms(prompt.text)
         if not synonyms or self.config.text.combine != "fallback":
             return synonyms
         if prompt.text not in self._doubt_alone:
@@ -240,100 +460,61 @@ class Scene:
             self._doubt_alone[prompt.text] = self.doubts.of(self.engine.of_gaussians(alone))[0]
         return synonyms if self._doubt_alone[prompt.text] > DOUBTFUL else []
 
-    def _confining(self) -> list[Prompt]:
-        """Prompts that matches must lie on."""
-        return self.prompts(self.config.foreground) if self.config.foreground else []
+    def _vector(self, values: Any) -> Float[Tensor, " c"]:
+        vector = values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, np.float32))
+        width = self._semantics()[0].clip_dim
+        if vector.shape != (width,) or not bool(vector.isfinite().all()) or not bool(vector.any()):
+            raise UserError(
+                f"a vector to search for has shape {list(vector.shape)}: this scene's CLIP has {width} "
+                "finite numbers, not all of them 0"
+            )
+        return vector.float()
 
-    def query_gaussians(self, text: str | Prompt) -> Float[Tensor, " n"]:
-        """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo."""
-        return self._of_gaussians([self._one_prompt(text)])[0][0]
+    def _one(self, text: Text, threshold: float | None = None) -> Question:
+        question = self.ask(text, threshold=threshold)
+        if len(question.prompts) > 1:
+            raise UserError(f"{text!r} are {len(question.prompts)} prompts: ask for one at a time")
+        return question
 
-    def _one_prompt(self, text: str | Prompt) -> Prompt:
-        first, *others = self.prompts([text])
-        if others:
-            raise UserError(f"{text!r} are {1 + len(others)} prompts: score Gaussians for one at a time")
-        return first
-
-    def find(
-        self, text: str | Sequence[str | Prompt], most: int = 10, threshold: float | None = None
-    ) -> list[Found]:
-        """Matches of each prompt in the scene: the training views that show it best, and a box."""
-        prompts = self.prompts(text)
-        scores, doubts, thresholds = self._of_gaussians(prompts, threshold)
-        return [self._found(*one, most) for one in zip(prompts, scores, doubts, thresholds, strict=True)]
-
-    def arrays(self, text: str | None = None, look: str | None = None) -> GaussianArrays:
-        """All Gaussians as NumPy arrays, with their relevancy to a prompt if one is given.
-
-        Colors that depend on the view, or on a photo's light, are those towards the overview photo, under the
-        look of the training photo `look` (default: of the overview photo).
-        """
-        camera = overview(self.photos, tuple(self.gaussians["means"].median(0).values.tolist())).camera
-        found = self._paint(camera, look)
-        if text is None:
-            return found
-        return replace(found, relevancy=self.query_gaussians(text).cpu().float().numpy())
-
-    def export(
-        self,
-        path: str | Path,
-        text: str | None = None,
-        threshold: float | None = None,
-        everything: bool = False,
-        look: str | None = None,
-    ) -> int:
-        """Write the Gaussians as a .ply or .spz file for splat viewers; returns how many.
-
-        With a text, only those that match it, or with `everything` all of them; the PLY has their relevancy
-        as a property. Colors as in `arrays`. Raises UserError if nothing matches.
-        """
-        found = self.arrays(text if everything else None, look)
-        if text is not None and not everything:
-            (scores,), _, (threshold,) = self._of_gaussians([self._one_prompt(text)], threshold)
-            relevancy = scores.cpu().float().numpy()
-            keep = relevancy > threshold
-            if not keep.any():
-                raise UserError(
-                    f"no Gaussian matches {text!r}: the best reaches {relevancy.max():.2f}; lower "
-                    f"--threshold, now {threshold:.2f}, or write all with their relevancy (--all)"
-                )
-            found = replace(found, relevancy=relevancy)[keep]
-        return write_gaussians(Path(path), found)
-
-    def _of_gaussians(
-        self, prompts: Sequence[Prompt], threshold: float | None = None
-    ) -> tuple[Float[Tensor, "q n"], list[float], tuple[float, ...]]:
-        """Relevancy of all Gaussians, 0 outside the foreground; doubts and thresholds."""
-        everything = [*prompts, *self._confining()]
-        scores = self.engine.of_gaussians(self.queries(everything))
-        doubts, thresholds = self._judge(everything, scores)
-        thresholds, count = self._asked(threshold, thresholds, len(prompts)), len(prompts)
-        scores, within = scores.tensor_split([count])
-        if len(within):
-            scores = scores * matching(within, thresholds[count:]).any(0)
-        return scores, doubts[:count], thresholds[:count]
-
-    def _found(
-        self, prompt: Prompt, scores: Float[Tensor, " n"], doubt: float, threshold: float, most: int
-    ) -> Found:
-        ranks = rank_views(self.visible, self.gaussians["means"], scores, threshold)
+    def _found(self, question: Question, row: int, most: int) -> Found:
+        scores, threshold = question.relevancy[row], question.thresholds[row]
+        means = self.splats.means
+        ranks = rank_views(self.visible, means, scores, threshold)
         closest = [
             Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
             for name, found in ranks.items()
         ]
         closest.sort(key=lambda v: v.rank, reverse=True)
-        viewpoints = [v for v in closest if v.area * self.visible[v.name].size >= _LEAST_PIXELS]
-        box = None
-        if viewpoints:
-            box = strongest_match(self.gaussians["means"], scores, self._mass, threshold, self._gap)
-        return Found(prompt, viewpoints[:most], box, doubt, threshold, closest[:most])
+        views = [v for v in closest if v.area * self.visible[v.name].size >= _LEAST_PIXELS]
+        box = strongest_match(means, scores, self._mass, threshold, self._gap) if views else None
+        return Found(
+            question.prompts[row],
+            views[:most],
+            box,
+            scores.cpu().float().numpy(),
+            question.gaussians[row].cpu().numpy(),
+            question.doubts[row],
+            threshold,
+            closest[:most],
+        )
 
-    # ── computed once per checkpoint ────────────────────────────────────────────────────────────────
+    # ── computed once ───────────────────────────────────────────────────────────────────────────────
+
+    def _semantics(self) -> tuple[SemanticEncoder, Float[Tensor, "n d"]]:
+        if self.decoder is None or self.codes is None:
+            raise UserError(NO_SEMANTICS)
+        return self.decoder, self.codes
 
     @cached_property
     def engine(self) -> QueryEngine:
-        """The query engine; decodes features of all Gaussians at first use."""
-        return self._make_engine()
+        """The query engine; decodes the features of all Gaussians at first use."""
+        return make_engine(*self._semantics(), self.config.temperature)
+
+    @cached_property
+    def text(self) -> TextEncoder:
+        """The encoder of prompts; loads the scene's CLIP at first use."""
+        self._semantics()
+        return TextEncoder(self._encode_texts or text_encoder(self.file, self.device), self.config.text)
 
     @cached_property
     def doubts(self) -> Doubts:
@@ -341,36 +522,31 @@ class Scene:
         return Doubts(self.engine.of_gaussians, lambda texts: self.text.plain_queries(texts).to(self.device))
 
     @cached_property
-    def visible(self) -> dict[str, VisibleGaussians]:
-        """Gaussians visible in the training views; computed once per checkpoint, with a progress bar."""
-        path, cameras = self._cache_file("visible"), self._small_cameras
-        views = load_visible(path, self._views_key, cameras, self.device) if path else None
+    def visible(self) -> Mapping[str, VisibleGaussians]:
+        """The Gaussians visible in the training views; measured once, with a progress bar."""
+        cameras = self._small_cameras
+        views = load_visible(self._cache, self._views_key, cameras, self.device) if self._cache else None
         if views is None:
-            what = "measuring which Gaussians the photos show, once per checkpoint"
+            what = "measuring which Gaussians the photos show, once"
             shown = watched(cameras.items(), what, self._watch)
             views = {name: self._visible(name, camera) for name, camera in shown}
-            if path:
-                save_visible(path, views, self._views_key)
+            if self._cache:
+                save_visible(self._cache, views, self._views_key)
         return views
 
     def _visible(self, name: str, camera: Camera) -> VisibleGaussians:
-        counts = self._foreground_of(name, camera)
-        weight = torch.ones(camera.height, camera.width) if counts is None else counts.float()
+        mask = self.file.photo(name).foreground((camera.height, camera.width))
+        weight = torch.ones(camera.height, camera.width) if mask is None else mask.float()
         return VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
 
-    def _foreground_of(self, name: str, camera: Camera) -> Bool[Tensor, "h w"] | None:
-        counts = self.file.photo(name).foreground()
-        if counts is None:
-            return None
-        size = camera.height, camera.width
-        return (
-            F.interpolate(counts[None, None].float(), size, mode="nearest-exact")[0, 0].bool().to(self.device)
-        )
+    def _fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
+        drawn = partial(composite, self.splats, camera, backend=self.backend)
+        return filled_pixels(drawn, weight, len(self.splats))
 
     @cached_property
     def _mass(self) -> Float[Tensor, " n"]:
         """Pixels that every Gaussian fills, over all views."""
-        mass = self.gaussians["means"].new_zeros(len(self.gaussians["means"]))
+        mass = self.splats.means.new_zeros(len(self.splats))
         for view in self.visible.values():
             mass[view.rows.long()] += view.pixels.float()
         return mass
@@ -379,21 +555,38 @@ class Scene:
     def _gap(self) -> float:
         """Matches closer than this are connected: 3 % of the median distance at which the scene is seen,
         about eight pixels of a small view."""
-        means = self.gaussians["means"]
-        distances = torch.tensor([view.distance(means) for view in self.visible.values()])
+        distances = torch.tensor([view.distance(self.splats.means) for view in self.visible.values()])
         return 0.03 * float(distances.nanmedian())
 
     @cached_property
     def _small_cameras(self) -> dict[str, Camera]:
-        photos = [photo for photo in self.file.photos if photo.split == "train"]
+        photos = [photo for photo in self.photos if photo.split == "train"]
         count = min(self.config.views, len(photos))
         chosen = [photos[i * len(photos) // count] for i in range(count)]
         return {photo.name: resized(photo.camera, self.config.view_side) for photo in chosen}
 
     @cached_property
     def _views_key(self) -> str:
-        c = self.config
-        return fingerprint(self._state, [asdict(self.file), c.views, c.view_side])
+        c, shapes = self.config, vars(self.splats.gaussians)
+        return fingerprint(shapes, [asdict(self.file), c.views, c.view_side])
 
-    def _cache_file(self, name: str) -> Path | None:
-        return None if self._cache_dir is None else self._cache_dir / f"lang3dxl_{name}.safetensors"
+
+def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
+    """The CLIP that a scene's features come from. Raises UserError if there is none, or it has changed."""
+    if file.clip is None:
+        raise UserError(NO_SEMANTICS)
+    encoder = load_image_text_encoder(file.clip, device)
+    if encoder.identity != file.clip_identity:
+        raise UserError(
+            f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
+        )
+    return encoder.encode_texts
+
+
+def _listed(texts: Any) -> list[Any]:
+    return list(texts) if isinstance(texts, list | tuple) else [texts]
+
+
+def _several(texts: Any, found: Sequence[Any]) -> bool:
+    """Whether the answer is a list: to a list, and to a text that holds several prompts."""
+    return isinstance(texts, list | tuple) or len(found) > 1

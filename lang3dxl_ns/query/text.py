@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -34,6 +35,8 @@ class Prompt:
     text: str
     negatives: tuple[str, ...] = ()
     """Phrases it competes with, besides the configured ones."""
+    vector: Float[Tensor, " c"] | None = field(default=None, compare=False, repr=False)
+    """What to search for, in the space of CLIP, in place of the text's own vector."""
 
 
 def parse_prompts(typed: str) -> list[Prompt]:
@@ -126,6 +129,7 @@ class TextEncoder:
         self._vectors: dict[str, Float[Tensor, " c"]] = {}
         self._synonyms: dict[str, list[str]] = {}
         self._table = SynonymTable()
+        self._lock = threading.Lock()
 
     @cached_property
     def _chat(self) -> ChatSynonyms:
@@ -146,7 +150,7 @@ class TextEncoder:
         known: texts that are taken without synonyms.
         """
         return Queries.of(
-            [self._positive(p.text, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
+            [self._positive(p, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
             self.vectors(self.config.negatives),
             [self.vectors(prompt.negatives) for prompt in prompts],
             [self._against(prompt.text) for prompt in prompts],
@@ -163,8 +167,10 @@ class TextEncoder:
     def _against(self, text: str) -> list[int]:
         return competitors(self.config.negatives, [text, *self.synonyms(text)])
 
-    def _positive(self, text: str, synonyms: list[str]) -> Float[Tensor, "s c"]:
-        words = [*synonyms, text]
+    def _positive(self, prompt: Prompt, synonyms: list[str]) -> Float[Tensor, "s c"]:
+        if prompt.vector is not None:
+            return prompt.vector.to(self.vectors(self.config.negatives))[None]
+        words = [*synonyms, prompt.text]
         if self.config.combine == "joined":
             return self.vectors([", ".join(words)])
         vectors = self.vectors(words)
@@ -172,9 +178,10 @@ class TextEncoder:
 
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:
         """Unit vectors of texts."""
-        new = [text for text in dict.fromkeys(texts) if text not in self._vectors]
-        if new:
-            self._vectors |= zip(new, F.normalize(self._encode(new), dim=-1), strict=True)
+        with self._lock:  # tokenizers can't be used by two threads at once
+            new = [text for text in dict.fromkeys(texts) if text not in self._vectors]
+            if new:
+                self._vectors |= zip(new, F.normalize(self._encode(new), dim=-1), strict=True)
         if texts:
             return torch.stack([self._vectors[text] for text in texts])
         return next(iter(self._vectors.values()))[None][:0]

@@ -1,4 +1,4 @@
-"""Inputs and outputs of rendering: Gaussians and rendered maps."""
+"""Inputs and outputs of `rasterize`: Gaussians and rendered maps."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Gaussians:
 
 
 @dataclass
-class Rendering:
-    """The maps of one rasterization."""
+class Raster:
+    """The maps of one rasterization, as training needs them."""
 
     image: Float[Tensor, "h w c"]
     """The channels over the background."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
-from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
+from lang3dxl_ns.rendering.gaussians import Gaussians, Raster
 from lang3dxl_ns.scene.camera import Camera
 
 _STRATEGY_KEYS = ("width", "height", "n_cameras", "radii", "gaussian_ids", "means2d")
@@ -28,7 +28,7 @@ def rasterize_with_gsplat(
     absgrad: bool,
     near: float,
     eps2d: float,
-) -> Rendering:
+) -> Raster:
     """See `rasterize`. Computes in float32; detached features cost a second pass, if there is a gradient."""
     detach_features &= torch.is_grad_enabled()
     settings = {
@@ -50,7 +50,7 @@ def rasterize_with_gsplat(
     elif features is not None:
         black = background.new_zeros(features.shape[1])
         feature_map, _, _ = _render(gaussians.detach(), camera.detach(), features, black, **settings)
-    return Rendering(
+    return Raster(
         image=image,
         features=feature_map,
         alpha=alpha,

@@ -14,7 +14,7 @@ import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
 from lang3dxl_ns.rendering.compositing import composite
-from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
+from lang3dxl_ns.rendering.gaussians import Gaussians, Raster
 from lang3dxl_ns.rendering.gsplat_backend import rasterize_with_gsplat
 from lang3dxl_ns.rendering.projection import Splats, project
 from lang3dxl_ns.rendering.tile_plan import ALPHA_MIN
@@ -38,7 +38,7 @@ def rasterize(
     near: float = 0.01,
     eps2d: float = 0.3,
     backend: Backend = "auto",
-) -> Rendering:
+) -> Raster:
     """Render Gaussians by alpha compositing (3D Gaussian Splatting, Kerbl et al. 2023; gsplat's rules).
 
     Differentiable in the Gaussians, channels, features, background and the camera's view matrix.
@@ -76,7 +76,7 @@ def rasterize(
     elif backend == "gsplat" and gaussians.means.is_cuda:
         gsplat_build.make_ready()
     # gsplat's kernels can't be launched on empty input.
-    render: Callable[..., Rendering] = functools.partial(_rasterize, backend)
+    render: Callable[..., Raster] = functools.partial(_rasterize, backend)
     if backend == "gsplat" and len(channels):
         render = rasterize_with_gsplat
     gaussians, channels, features = _without_broken(gaussians, channels, features)
@@ -156,7 +156,7 @@ def _rasterize(
     absgrad: bool,
     near: float,
     eps2d: float,
-) -> Rendering:
+) -> Raster:
     """One pass for everything: depth and features are extra channels of the image."""
     to_screen, to_pixels = _kernels(backend)
     splats = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
@@ -184,4 +184,4 @@ def _rasterize(
         "gaussian_ids": None,
         "means2d": splats.means2d,
     }
-    return Rendering(image, feature_map, alpha, depth, info)
+    return Raster(image, feature_map, alpha, depth, info)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from lang3dxl_ns.rendering.gaussians import Gaussians, Rendering
+from lang3dxl_ns.rendering.gaussians import Gaussians, Raster
 from lang3dxl_ns.scene.camera import Camera
 
 PIXELS_AT_A_TIME = 64
@@ -28,7 +28,7 @@ def rasterize_reference(
     antialiased: bool = False,
     near: float = 0.01,
     eps2d: float = 0.3,
-) -> Rendering:
+) -> Raster:
     """As `rasterize`, in time proportional to Gaussians × pixels; all values finite, `info` stays empty."""
     means2d, axes, depths = project_reference(gaussians, camera)
     whitening = whitening_reference(axes, eps2d)
@@ -49,7 +49,7 @@ def rasterize_reference(
     if background is not None:
         image = image + (1 - alpha) * background
     expected_depth = torch.where(alpha > 0, depth / alpha.clamp_min(1e-12), 0.0) if render_depth else None
-    return Rendering(image, None if features is None else detached_maps, alpha, expected_depth)
+    return Raster(image, None if features is None else detached_maps, alpha, expected_depth)
 
 
 def project_reference(

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from lang3dxl_ns.common.precision import in_full_precision
 
-_BAND_0 = math.sqrt(1 / (4 * math.pi))
+BAND_0 = math.sqrt(1 / (4 * math.pi))
+"""The constant harmonic: color = 0.5 + this × coefficient."""
 _BAND_1 = math.sqrt(3 / (4 * math.pi))
 _BAND_2 = math.sqrt(15 / (4 * math.pi))
 _BAND_2_ZONAL = math.sqrt(5 / (16 * math.pi))
@@ -24,7 +25,7 @@ _BAND_3_ZONAL = math.sqrt(7 / (16 * math.pi))
 def _basis(degree: int, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
     """The basis functions at unit directions, with the signs used in Gaussian splatting files."""
     x, y, z = directions.unbind(1)
-    columns = [torch.full_like(x, _BAND_0)]
+    columns = [torch.full_like(x, BAND_0)]
     if degree >= 1:
         columns += [-_BAND_1 * y, _BAND_1 * z, -_BAND_1 * x]
     if degree >= 2:
@@ -71,3 +72,24 @@ def spherical_harmonics(
         )
     basis = _basis(degree, F.normalize(directions, dim=1))
     return torch.einsum("nk,nkc->nc", basis, coefficients[:, :count])
+
+
+def rotated_harmonics(
+    coefficients: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n k 3"]:
+    """Coefficients of the same colors after the world has been turned by a rotation.
+
+    Harmonics of one degree mix only with each other, so the turned function is solved for from its values at
+    a few directions, degree by degree.
+    """
+    degree = math.isqrt(coefficients.shape[1]) - 1
+    generator = torch.Generator().manual_seed(0)
+    directions = F.normalize(torch.randn(32, 3, generator=generator, dtype=torch.float64), dim=1)
+    turn = rotation.double().cpu()
+    before, after = _basis(degree, directions @ turn), _basis(degree, directions)
+    parts = []
+    for band in range(degree + 1):
+        rows = slice(band**2, (band + 1) ** 2)
+        mixing = torch.linalg.lstsq(after[:, rows], before[:, rows]).solution.to(coefficients)
+        parts.append(torch.einsum("jk,nkc->njc", mixing, coefficients[:, rows]))
+    return torch.cat(parts, dim=1)

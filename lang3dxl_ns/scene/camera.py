@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -169,6 +170,20 @@ def with_longer_side(camera: Camera, pixels: int) -> Camera:
     width, height = max(round(camera.width * factor), 1), max(round(camera.height * factor), 1)
     zoom = camera.intrinsics.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
     return Camera(camera.view_matrix, camera.intrinsics * zoom, width, height)
+
+
+def with_field_of_view(camera: Camera, degrees: float) -> Camera:
+    """The same view through a lens with another vertical field of view, centered, with square pixels.
+
+    Raises UserError unless it lies between 1 and 170 degrees.
+    """
+    if not (isinstance(degrees, int | float) and 1 <= degrees <= 170):
+        raise UserError(f"the field of view is {degrees}: give 1 to 170 degrees")
+    focal = camera.height / 2 / math.tan(math.radians(degrees) / 2)
+    intrinsics = torch.tensor(
+        [[focal, 0.0, camera.width / 2], [0.0, focal, camera.height / 2], [0.0, 0.0, 1.0]]
+    )
+    return Camera(camera.view_matrix, intrinsics.to(camera.intrinsics), camera.width, camera.height)
 
 
 def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:

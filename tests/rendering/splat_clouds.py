@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.rendering import Gaussians, Rendering
+from lang3dxl_ns.rendering import Gaussians, Raster
 from lang3dxl_ns.scene.camera import Camera
 
 
@@ -29,9 +29,7 @@ class Cloud:
         view = leaves["view_matrix"]
         return Camera(view, self.intrinsics.to(view), self.width, self.height)
 
-    def render(
-        self, rasterizer: Callable[..., Rendering], leaves: dict[str, Tensor], **settings: Any
-    ) -> Rendering:
+    def render(self, rasterizer: Callable[..., Raster], leaves: dict[str, Tensor], **settings: Any) -> Raster:
         """Image over the background, features and depth."""
         return rasterizer(
             gaussians(leaves), self.camera(leaves), leaves["channels"], leaves["background"],
@@ -74,13 +72,13 @@ def make_cloud(count: int, width: int, height: int, *, seed: int = 0, size: floa
     return Cloud(tensors, intrinsics, width, height)
 
 
-def maps(rendering: Rendering) -> dict[str, Tensor]:
+def maps(rendering: Raster) -> dict[str, Tensor]:
     found = {name: getattr(rendering, name) for name in ("image", "features", "alpha", "depth")}
     return {name: value for name, value in found.items() if value is not None}
 
 
 def gradients(
-    rendering: Rendering, leaves: dict[str, Tensor], *, pixels: Tensor | None = None
+    rendering: Raster, leaves: dict[str, Tensor], *, pixels: Tensor | None = None
 ) -> dict[str, Tensor]:
     """Gradients for random upstream gradients of every map (in the given pixels [H, W] only)."""
     generator = torch.Generator().manual_seed(0)

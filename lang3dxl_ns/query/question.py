@@ -1,0 +1,85 @@
+"""A question: prompts put to one scene, and everything that their answers share.
+
+Whoever shows matches, in pixels or in Gaussians, goes through a question. So thresholds, doubt and the
+restriction to a foreground are decided here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lang3dxl_ns.query.engine import QueryEngine
+from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.threshold import matching
+from lang3dxl_ns.rendering.render import Rendering
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Question:
+    """Prompts, their vectors, and the levels from which places of the scene match them."""
+
+    engine: QueryEngine
+    prompts: tuple[Prompt, ...]
+    queries: Queries
+    """Vectors of the prompts, then those of the foreground prompts, if any."""
+    doubts: tuple[float, ...] = ()
+    """Per prompt, the share of unrelated words that fit the scene as well."""
+    thresholds: tuple[float, ...] = ()
+    """Relevancy above which places match, one per prompt."""
+    foreground_thresholds: tuple[float, ...] = ()
+    """The same for the foreground prompts."""
+    min_alpha: float = 0.3
+    """Coverage below which a pixel matches nothing."""
+
+    def __repr__(self) -> str:
+        return f"Question({', '.join(repr(prompt.text) for prompt in self.prompts)})"
+
+    @cached_property
+    def channels(self) -> Float[Tensor, "n d"]:
+        """Values that Gaussians carry in a rendering that answers the question."""
+        return self.engine.channels(self.queries)
+
+    @cached_property
+    def relevancy(self) -> Float[Tensor, "q n"]:
+        """Relevancy of every Gaussian to every prompt, 0…1; 0 outside the foreground."""
+        return self._confined(self.engine.of_gaussians(self.queries))
+
+    @cached_property
+    def gaussians(self) -> Bool[Tensor, "q n"]:
+        """Which Gaussians match each prompt: the selection that masks show in 2D."""
+        return matching(self.relevancy, self.thresholds)
+
+    @torch.no_grad()
+    def maps(
+        self, rendering: Rendering, foreground: Bool[Tensor, "h w"] | None = None
+    ) -> Float[Tensor, "q h w"]:
+        """Relevancy of every pixel to every prompt, 0…1.
+
+        Args:
+            rendering: a view rendered with `channels`.
+            foreground: pixels that may match, at any size; None for all.
+
+        Pixels outside the foreground, and those that the scene hardly covers, are 0.
+        """
+        assert rendering.channels is not None
+        keep = rendering.alpha >= self.min_alpha
+        if foreground is not None:
+            size = (rendering.camera.height, rendering.camera.width)
+            there = F.interpolate(foreground[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
+            keep = keep & there.to(keep.device)
+        return self._confined(self.engine.maps(rendering.channels, self.queries)) * keep
+
+    def _confined(self, relevancy: Float[Tensor, "all ..."]) -> Float[Tensor, "q ..."]:
+        """Relevancy to the prompts, 0 where no foreground prompt matches."""
+        count = len(self.prompts)
+        wanted, within = relevancy[:count], relevancy[count:]
+        if not len(within):
+            return wanted
+        return wanted * matching(within, self.foreground_thresholds).any(0)

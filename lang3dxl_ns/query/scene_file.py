@@ -1,0 +1,404 @@
+"""The scene file, NAME.scene: all that rendering and asking a scene need, in one file that can be shared.
+
+It is a safetensors file: no code in it, and every size is checked before a tensor is read. 40 bytes hold a
+Gaussian of one color and its code. The metadata entry `lang3dxl` is JSON: format version, photos and cameras,
+the CLIP, the decoder's settings, and how the scene was made.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Shaped, UInt16
+from numpy import ndarray as Array
+from PIL import Image
+from torch import Tensor
+
+from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
+from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.looks import Looks
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.splat_file import log_scales, logits
+from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
+
+Module = TypeVar("Module", bound=torch.nn.Module)
+SUFFIX = ".scene"
+VERSION = 1
+_KEY = "lang3dxl"
+_MASK_SIDE = 800
+"""Longer side of a stored foreground mask in pixels."""
+_LARGEST_HALF = 6e4
+_UNKNOWN_CODE = 0
+"""Stored code of a Gaussian that is visible in no photo; the others are 1 to 65,535."""
+_MOST_SETTING = 100_000
+"""No setting of a decoder is larger: sizes are refused before anything of that size is built."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a scene file tells about its origin."""
+
+    title: str = ""
+    """Heading of the page; by default the name of the photos' folder."""
+    credit: str = ""
+    """Who took the photos."""
+    license: str = ""
+    """Terms under which photos and scene may be used."""
+    made_by: str = ""
+    """Program and version that wrote the file."""
+    made_how: str = ""
+    """How the scene was made, in a line: the method, its decoder, its iterations."""
+
+
+# ── writing ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) -> int:
+    """Write a scene as one file, atomically.
+
+    Args:
+        path: the file; its name ends in .scene.
+        scene: the scene. Foreground masks are read from their files and stored with it.
+        provenance: what the file tells about its origin.
+
+    Returns:
+        The bytes written.
+
+    Raises:
+        UserError: the name doesn't end in .scene.
+    """
+    if path.suffix != SUFFIX:
+        raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}")
+    from safetensors.numpy import save
+
+    content = _splat_tensors(scene.splats)
+    described: dict[str, Any] = {
+        "version": VERSION,
+        "antialiased": scene.splats.antialiased,
+        "background": None if scene.background is None else scene.background.tolist(),
+        "provenance": asdict(provenance or Provenance()),
+    }
+    if scene.decoder is not None and scene.codes is not None:
+        described["decoder"] = _described(scene.decoder)
+        content["codes"] = _stored_codes(scene.codes, scene.decoder.bounded)
+        content |= _stored_state("decoder", scene.decoder)
+    if scene.looks is not None:
+        field = scene.looks.field
+        described["looks"] = {"config": asdict(field.config), "names": field.names}
+        content |= _stored_state("looks", field)
+    masks = {i: _mask_of(photo) for i, photo in enumerate(scene.photos) if photo.mask is not None}
+    content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
+    file = replace(scene.file, photos=[replace(photo, mask=None) for photo in scene.photos])
+    described["scene"] = asdict(replace(file, data=Path(file.data).name))
+    data = save(content, {_KEY: json.dumps(described)})
+    write_atomically(path, data)
+    return len(data)
+
+
+def _splat_tensors(splats: Splats) -> dict[str, Shaped[Array, "..."]]:
+    return {
+        "means": _array(splats.means, np.float32),
+        "quats": _array(F.normalize(splats.quats, dim=1), np.float16),
+        "log_scales": _array(log_scales(splats), np.float16),
+        "logits": _array(logits(splats), np.float16),
+        "harmonics": _array(splats.harmonics.clamp(-_LARGEST_HALF, _LARGEST_HALF), np.float16),
+    }
+
+
+def _stored_codes(codes: Float[Tensor, "n d"], bounded: bool) -> Shaped[Array, "n d"]:
+    """Bounded codes as 16-bit coordinates in (0, 1), which are what the hash grid reads; others as they
+    are."""
+    if not bounded:
+        return _array(codes, np.float32)
+    known = codes.isfinite().all(1, keepdim=True)
+    places = 1 + (codes.double().sigmoid() * 65534).round()
+    return torch.where(known, places, _UNKNOWN_CODE).cpu().numpy().astype(np.uint16)
+
+
+def _stored_state(name: str, module: torch.nn.Module) -> dict[str, Shaped[Array, "..."]]:
+    tensors = {key: value for key, value in module.state_dict().items() if isinstance(value, Tensor)}
+    return {f"{name}.{key}": _smallest(value) for key, value in tensors.items()}
+
+
+def _smallest(values: Tensor) -> Shaped[Array, "..."]:
+    """Weights in half precision, unless they are too large for it, or few."""
+    half = values.is_floating_point() and values.numel() > 256 and float(values.abs().max()) < _LARGEST_HALF
+    return _array(values, np.float16 if half else values.cpu().numpy().dtype.type)
+
+
+def _mask_of(photo: Any) -> bytes | None:
+    camera = resized(photo.camera, _MASK_SIDE)
+    mask = photo.foreground((camera.height, camera.width))
+    if mask is None:
+        return None
+    content = io.BytesIO()
+    Image.fromarray(mask.cpu().numpy()).save(content, "PNG", optimize=True)
+    return content.getvalue()
+
+
+def _described(decoder: SemanticEncoder) -> dict[str, Any]:
+    settings = getattr(getattr(decoder, "field", decoder), "settings", None)
+    return {
+        "name": decoder.name,
+        "clip_dim": decoder.clip_dim,
+        "dense_dim": decoder.dense_dim,
+        "settings": None if settings is None else asdict(settings),
+    }
+
+
+def _array(tensor: Tensor, kind: Any) -> Shaped[Array, "..."]:
+    return tensor.detach().cpu().numpy().astype(kind, order="C")
+
+
+# ── reading ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def read_scene(
+    path: str | Path,
+    device: torch.device | str | None = None,
+    config: QueryConfig | None = None,
+    encode_texts: EncodeTexts | None = None,
+) -> Scene:
+    """Read a scene file. Nothing in it is executed, and nothing is allocated that the file doesn't hold.
+
+    Args:
+        path: the file.
+        device: default: a GPU if there is one.
+        config: defaults of queries.
+        encode_texts: the scene's CLIP, if it is already loaded, or is elsewhere than the scene tells.
+
+    Raises:
+        UserError: the file is missing, damaged, cut short, or of a newer version.
+    """
+    path = Path(path).expanduser()
+    with _reported(path):
+        return _read(path, torch.device(device or best_device()), config, encode_texts)
+
+
+def describe_scene_file(path: str | Path) -> dict[str, Any]:
+    """What a scene file says of itself: `provenance`, `gaussians`, `photos`, `clip`, `decoder`, `bytes`.
+
+    Raises UserError as `read_scene` does; no tensor is read.
+    """
+    path = Path(path).expanduser()
+    with _reported(path), _opened(path) as file:
+        described, sizes = _description(file), _sizes(file)
+        return {
+            "provenance": described.provenance,
+            "gaussians": sizes["means"][0],
+            "photos": len(described.scene.photos),
+            "clip": described.scene.clip,
+            "decoder": described.decoder,
+            "looks": described.looks is not None,
+            "bytes": path.stat().st_size,
+        }
+
+
+@contextmanager
+def _reported(path: Path) -> Iterator[None]:
+    """Errors of reading as one sentence."""
+    if not path.is_file():
+        raise UserError(f"{path} is not a file: name a {SUFFIX} file")
+    try:
+        yield
+    except _NewerError as error:
+        raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
+    except (OSError, UserError, *_DAMAGE) as error:
+        raise UserError(f"{path} is not a readable scene ({_short(error)}): copy it again") from error
+
+
+class _NewerError(Exception):
+    """The file's format version is unknown."""
+
+
+_DAMAGE = (
+    *(ValueError, LookupError, TypeError, AttributeError),
+    *(ArithmeticError, RecursionError, RuntimeError, MemoryError),
+)
+"""Exceptions raised on reading values that a scene doesn't have."""
+
+
+@dataclass(frozen=True)
+class _Description:
+    """The file's metadata, checked."""
+
+    scene: SceneFile
+    provenance: Provenance
+    antialiased: bool
+    background: list[float] | None
+    decoder: dict[str, Any] | None
+    looks: dict[str, Any] | None
+
+
+def _read(
+    path: Path, device: torch.device, config: QueryConfig | None, encode_texts: EncodeTexts | None
+) -> Scene:
+    with _opened(path) as file:
+        about, sizes = _description(file), _sizes(file)
+        splats = _splats(file, sizes, about.antialiased).to(device)
+        decoder = codes = looks = None
+        if about.decoder is not None:
+            decoder = _decoder(file, sizes, about.decoder).to(device)
+            codes = _codes(file, sizes, decoder.bounded, len(splats)).to(device)
+        if about.looks is not None:
+            looks = Looks(_looks(file, sizes, about.looks).to(device))
+        photos = [
+            replace(photo, mask=_checked_mask(file.get_tensor(f"mask.{i}")) if f"mask.{i}" in sizes else None)
+            for i, photo in enumerate(about.scene.photos)
+        ]
+    background = None if about.background is None else torch.tensor(about.background, device=device)
+    return Scene(
+        splats, replace(about.scene, photos=photos), decoder, codes,
+        looks=looks, background=background, config=config, encode_texts=encode_texts,
+        cache=path.with_name(f".{path.stem}.visible"),
+    )  # fmt: skip
+
+
+def _opened(path: Path) -> Any:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        return safe_open(path, "np")
+    except SafetensorError as error:
+        raise ValueError(str(error)) from error
+
+
+def _description(file: Any) -> _Description:
+    content = json.loads((file.metadata() or {})[_KEY])
+    if content["version"] != VERSION:
+        raise _NewerError(content["version"])
+    provenance = Provenance(**content["provenance"])
+    _expect(
+        all(isinstance(text, str) for text in vars(provenance).values()), "its origin is not told in words"
+    )
+    background = content["background"]
+    if background is not None:
+        _expect(len(background) == 3 and all(0 <= float(x) <= 1 for x in background), "its background")
+    _expect(isinstance(content["antialiased"], bool), "antialiased")
+    return _Description(
+        scene_from_json(content["scene"]),
+        provenance,
+        content["antialiased"],
+        background,
+        content.get("decoder"),
+        content.get("looks"),
+    )
+
+
+def _sizes(file: Any) -> dict[str, list[int]]:
+    return {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
+
+
+def _splats(file: Any, sizes: Mapping[str, list[int]], antialiased: bool) -> Splats:
+    count, bands = sizes["means"][0], sizes["harmonics"][1]
+    _expect(bands in (1, 4, 9, 16), f"{bands} harmonics")
+    wanted = {"means": [count, 3], "quats": [count, 4], "log_scales": [count, 3]}
+    wanted |= {"logits": [count], "harmonics": [count, bands, 3]}
+    for name, size in wanted.items():
+        _expect(sizes[name] == size, f"{name} has the shape {sizes[name]}")
+    means, quats, scales, opacities, harmonics = (_tensor(file, name) for name in wanted)
+    return Splats(means, quats, scales.exp(), opacities.sigmoid(), harmonics, antialiased)
+
+
+def _codes(file: Any, sizes: Mapping[str, list[int]], bounded: bool, count: int) -> Float[Tensor, "n d"]:
+    _expect(len(sizes["codes"]) == 2 and sizes["codes"][0] == count, "its codes")
+    stored: UInt16[Array, "n d"] = file.get_tensor("codes")
+    if not bounded:
+        return torch.from_numpy(stored).float()
+    _expect(stored.dtype == np.uint16, "its codes")
+    places = torch.from_numpy(stored.astype(np.float64))
+    codes = ((places - 1) / 65534).clamp(1e-9, 1 - 1e-9).logit().float()
+    return torch.where(places == _UNKNOWN_CODE, torch.nan, codes)
+
+
+def _decoder(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> SemanticEncoder:
+    settings = told["settings"] or {}
+    numbers = [told["clip_dim"], told["dense_dim"], *settings.values()]
+    bad = [
+        x
+        for x in numbers
+        if not isinstance(x, int | float | str) or (not isinstance(x, str) and not 0 <= x <= _MOST_SETTING)
+    ]
+    _expect(not bad, f"a decoder has the setting {bad[:1]}")
+    layers = {name: settings.get(name, 0) for name in ("levels", "hidden_layers", "log2_table_size")}
+    _expect(max(layers.values()) <= 32, "its decoder has too many layers")
+
+    def build() -> SemanticEncoder:
+        return make_encoder(
+            EncoderConfig(name=told["name"]),
+            SemanticFieldConfig(preset="short", **settings),
+            told["clip_dim"],
+            told["dense_dim"],
+            torch.zeros(3),
+            1.0,
+        )
+
+    return _loaded(file, sizes, "decoder", build)
+
+
+def _looks(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> AppearanceField:
+    names = told["names"]
+    _expect(isinstance(names, list) and all(isinstance(name, str) for name in names), "its looks' photos")
+    config = AppearanceConfig(**told["config"])
+    _expect(isinstance(config.vector_dim, int) and 0 < config.vector_dim <= _MOST_SETTING, "its looks")
+    state = {"_extra_state": names}
+    return _loaded(file, sizes, "looks", lambda: AppearanceField(config, names, torch.zeros(3), 1.0), state)
+
+
+def _loaded(
+    file: Any,
+    sizes: Mapping[str, list[int]],
+    name: str,
+    build: Callable[[], Module],
+    state: Mapping[str, Any] | None = None,
+) -> Module:
+    """A module with its tensors from the file.
+
+    It is first built on the device `meta`, where nothing is allocated, to compare its shapes with the file's.
+    """
+    with torch.device("meta"):
+        expected = {key: value for key, value in build().state_dict().items() if isinstance(value, Tensor)}
+    for key, value in expected.items():
+        _expect(sizes.get(f"{name}.{key}") == list(value.shape), f"{name}.{key} has the wrong shape")
+    module = build()
+    tensors = {key: torch.from_numpy(file.get_tensor(f"{name}.{key}")) for key in expected}
+    module.load_state_dict({**tensors, **(state or {})})
+    return module.eval().requires_grad_(False)
+
+
+def _checked_mask(stored: Shaped[Array, " b"]) -> bytes:
+    content = stored.astype(np.uint8).tobytes()
+    with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+        _expect(image.width * image.height <= MOST_PIXELS, "a mask is too large")
+    return content
+
+
+def _tensor(file: Any, name: str) -> Float[Tensor, "n ..."]:
+    return torch.from_numpy(file.get_tensor(name)).float()
+
+
+def _expect(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise ValueError(otherwise)
+
+
+def _short(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -1,0 +1,75 @@
+"""`render`: a picture of a finished scene from a camera, as a pure function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lang3dxl_ns.rendering.rasterize import Backend, rasterize
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rendering:
+    """The maps of one view, without gradients."""
+
+    camera: Camera
+    rgb: Float[Tensor, "h w 3"]
+    """Colors over the background, 0…1."""
+    alpha: Float[Tensor, "h w"]
+    """Accumulated opacity, 0…1."""
+    depth: Float[Tensor, "h w"]
+    """Expected distance along the camera's axis, world units; 0 where nothing is rendered."""
+    channels: Float[Tensor, "h w d"] | None = None
+    """Further values of the Gaussians composited over black, not divided by alpha."""
+
+
+@torch.no_grad()
+def render(
+    splats: Splats,
+    camera: Camera,
+    channels: Float[Tensor, "n d"] | None = None,
+    *,
+    background: Float[Tensor, "3"] | None = None,
+    backend: Backend = "auto",
+) -> Rendering:
+    """Render Gaussians in their own colors; safe to call from any thread.
+
+    Args:
+        splats: the Gaussians, world frame.
+        camera: where to render them from.
+        channels: further values to composite, one row per Gaussian.
+        background: color behind the scene, 0…1; black by default.
+        backend: see `rasterize`.
+
+    Raises:
+        ValueError: as `rasterize` does.
+    """
+    pose = camera.view_matrix
+    raster = rasterize(
+        splats.gaussians,
+        camera,
+        splats.colors(-pose[:3, :3].T @ pose[:3, 3]),
+        None if background is None else background.to(splats.means),
+        features=channels,
+        render_depth=True,
+        antialiased=splats.antialiased,
+        backend=backend,
+    )
+    assert raster.depth is not None
+    return Rendering(
+        camera, raster.image.clamp(0.0, 1.0), raster.alpha[..., 0], raster.depth[..., 0], raster.features
+    )
+
+
+def composite(
+    splats: Splats, camera: Camera, channels: Float[Tensor, "n d"], backend: Backend = "auto"
+) -> Float[Tensor, "h w d"]:
+    """Values of the Gaussians composited over black, without their colors; differentiable in the values."""
+    return rasterize(
+        splats.gaussians, camera, channels, antialiased=splats.antialiased, backend=backend
+    ).image

@@ -1,0 +1,134 @@
+"""`Splats`: the Gaussians of a finished scene, as a value that never changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from math import isqrt
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lang3dxl_ns.rendering.gaussians import Gaussians
+from lang3dxl_ns.rendering.spherical_harmonics import BAND_0, rotated_harmonics, spherical_harmonics
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Splats:
+    """Gaussians with activated values (no logarithms, no logits) and colors, without gradients.
+
+    Tensors share a device. They must not be written to: renderings in other threads may be reading them.
+    """
+
+    means: Float[Tensor, "n 3"]
+    """Centers, world units."""
+    quats: Float[Tensor, "n 4"]
+    """Rotations as quaternions (w, x, y, z) of any length; zero length means no rotation."""
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the rotated axes, world units, positive."""
+    opacities: Float[Tensor, " n"]
+    """Peak opacity, 0…1."""
+    harmonics: Float[Tensor, "n k 3"]
+    """Spherical harmonics of the colors, degrees 0 to 3, the constant ones first (k = 1, 4, 9 or 16)."""
+    antialiased: bool = False
+    """Whether small Gaussians are dimmed by what the screen-space blur adds to their area, as in training."""
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __repr__(self) -> str:
+        return f"Splats({len(self):,} Gaussians, harmonics of degree {self.degree}, on {self.means.device})"
+
+    @property
+    def degree(self) -> int:
+        """Degree of the harmonics; 0 for colors that don't depend on the viewing direction."""
+        return isqrt(self.harmonics.shape[1]) - 1
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The shapes, as `rasterize` takes them."""
+        return Gaussians(self.means, self.quats, self.scales, self.opacities)
+
+    def colors(self, center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
+        """Red, green and blue, 0 and above, as seen from a point in the world frame."""
+        directions = self.means - center.to(self.means)
+        return (spherical_harmonics(self.degree, directions, self.harmonics) + 0.5).clamp_min(0.0)
+
+    def with_colors(self, colors: Float[Tensor, "n 3"]) -> Splats:
+        """The same Gaussians in colors (0 and above) that don't depend on the viewing direction."""
+        return replace(self, harmonics=harmonics_of(colors))
+
+    def to(self, device: torch.device | str) -> Splats:
+        """The same Gaussians on a device."""
+        return self._mapped(lambda tensor: tensor.to(device))
+
+    def select(self, which: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> Splats:
+        """Some of the Gaussians, by a mask or by their indices (tensors or NumPy arrays)."""
+        rows = torch.as_tensor(which, device=self.means.device)
+        return self._mapped(lambda tensor: tensor[rows])
+
+    def transformed(self, similarity: Float[Tensor, "4 4"]) -> Splats:
+        """The same Gaussians in another frame.
+
+        Args:
+            similarity: [[s·R, t], [0, 1]] from this frame to the other one, with a rotation R, a scale s > 0
+                and a translation t.
+
+        Raises:
+            ValueError: the matrix is not a similarity.
+        """
+        turned = similarity[:3, :3].double().cpu()
+        scale = float(turned.det().clamp_min(0) ** (1 / 3))
+        rotation = turned / max(scale, 1e-30)
+        if not torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=rotation.dtype), atol=1e-3):
+            raise ValueError("the matrix is not a rotation, a uniform scale and a translation")
+        like = self.means
+        means = scale * (like @ rotation.T.to(like)) + similarity[:3, 3].to(like)
+        identity = self.quats.new_tensor([1.0, 0, 0, 0])
+        quats = torch.where(self.quats.norm(dim=1, keepdim=True) > 0, self.quats, identity)
+        return replace(
+            self,
+            means=means,
+            quats=_product(_quaternion(rotation).to(quats), quats),
+            scales=scale * self.scales,
+            harmonics=rotated_harmonics(self.harmonics, rotation),
+        )
+
+    def sound(self) -> Bool[Tensor, " n"]:
+        """Which Gaussians have no NaN or infinite value."""
+        parts = (self.means, self.quats, self.scales, self.opacities, self.harmonics)
+        return torch.stack([part.reshape(len(self), -1).isfinite().all(1) for part in parts]).all(0)
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Splats:
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: change(v) for name, v in values.items() if isinstance(v, Tensor)})
+
+
+def harmonics_of(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
+    """Harmonics of degree 0 for colors that don't depend on the viewing direction."""
+    return (colors[:, None] - 0.5) / BAND_0
+
+
+def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
+    """A rotation matrix as a unit quaternion (w, x, y, z)."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat()
+    return torch.tensor([w, x, y, z], dtype=torch.float64)
+
+
+def _product(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
+    """Quaternion product: the rotation b, then a."""
+    aw, ax, ay, az = a.unbind()
+    w, x, y, z = F.normalize(b, dim=1).unbind(1)
+    return torch.stack(
+        [
+            aw * w - ax * x - ay * y - az * z,
+            aw * x + ax * w + ay * z - az * y,
+            aw * y - ax * z + ay * w + az * x,
+            aw * z + ax * y - ay * x + az * w,
+        ],
+        dim=1,
+    )

@@ -1,0 +1,244 @@
+"""Scene files: what is written is read, and nothing else is."""
+
+import json
+import struct
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from painted_scene import (
+    CHANNELS,
+    encode_texts,
+    painted_file,
+    painted_gaussians,
+    painted_scene,
+    painted_splats,
+)
+from PIL import Image
+
+from lang3dxl_ns.baselines.encoders import NAMES, EncoderConfig, make_encoder
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
+from lang3dxl_ns.components.looks import Looks
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.scene_file import Provenance, describe_scene_file, read_scene, write_scene
+
+
+def looks(seed: int = 0) -> Looks:
+    generator = torch.Generator().manual_seed(seed)
+    names = [photo.name for photo in painted_file().photos if photo.split == "train"]
+    field = AppearanceField(AppearanceConfig(), names, torch.zeros(3), 5.0, generator=generator)
+    with torch.no_grad():
+        field.output.weight.normal_(0, 0.2, generator=generator)
+        for photo in painted_file().photos[:3]:
+            pose = photo.camera.view_matrix
+            field.remember(photo.name, -pose[:3, :3].T @ pose[:3, 3], pose[2, :3])
+    return Looks(field.eval().requires_grad_(False))
+
+
+def decoded(name: str, seed: int = 0) -> dict:
+    """A decoder of this kind with random weights, and codes for the painted Gaussians."""
+    torch.manual_seed(seed)
+    decoder = make_encoder(
+        EncoderConfig(name=name), SemanticFieldConfig(preset="short"), CHANNELS, 0, torch.zeros(3), 5.0
+    )
+    decoder.requires_grad_(False)
+    count = len(painted_gaussians()["means"])
+    if name == "lifting":
+        codes = torch.randn(count, CHANNELS + 1).abs()
+    elif (codes := decoder.initial_codes(count)) is None and name != "fmgs":
+        codes = torch.randn(count, 3)
+    gaussians = {"means": painted_splats().means}
+    carried = decoder.carried(gaussians if codes is None else gaussians | {"codes": codes}).detach().clone()
+    if name == "lang3dxl":
+        carried[7] = torch.nan
+    return {"decoder": decoder, "codes": carried}
+
+
+@pytest.fixture
+def written(tmp_path):
+    scene = painted_scene(**decoded("lang3dxl"), looks=looks(), background=torch.tensor([0.2, 0.0, 1.0]))
+    path = tmp_path / "wall.scene"
+    write_scene(path, scene, Provenance(title="A wall", credit="Painters", license="CC BY 4.0"))
+    return scene, path
+
+
+def test_a_scene_survives_its_file(written):
+    scene, path = written
+    found = read_scene(path, "cpu", encode_texts=encode_texts)
+    for word in ("dome", "window not a word", "wall"):
+        np.testing.assert_allclose(found.relevancy(word), scene.relevancy(word), atol=1e-3)
+    for photo in ("0001", "0003"):
+        here, there = scene.query("dome", photo), found.query("dome", photo)
+        np.testing.assert_allclose(there.relevancy, here.relevancy, atol=2e-3)
+        error = (there.view.pixels.astype(float) - here.view.pixels) / 255
+        assert 10 * np.log10(1 / np.square(error).mean()) > 45
+    lit = found.render("0002", look="left/0001.jpg").pixels.astype(int)
+    assert np.abs(lit - scene.render("0002", look="left/0001.jpg").pixels).max() <= 3
+    assert [asdict_of(p) for p in found.photos] == [asdict_of(p) for p in scene.photos]
+    assert (found.file.clip, found.file.scale) == (scene.file.clip, scene.file.scale)
+
+
+def asdict_of(photo):
+    return photo.name, photo.split, photo.camera_to_world, photo.lens, photo.size
+
+
+def test_unknown_gaussians_stay_unknown(written):
+    scene, path = written
+    assert torch.equal(read_scene(path, "cpu").codes.isnan(), scene.codes.isnan())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_decoder_answers_from_its_file_as_before(name, tmp_path):
+    scene = painted_scene(**decoded(name))
+    write_scene(tmp_path / "a.scene", scene)
+    found = read_scene(tmp_path / "a.scene", "cpu", encode_texts=encode_texts)
+    np.testing.assert_allclose(found.relevancy("dome"), scene.relevancy("dome"), atol=2e-3)
+
+
+def test_colors_alone_make_a_scene(tmp_path):
+    write_scene(tmp_path / "a.scene", Scene(painted_splats(), painted_file()))
+    found = read_scene(tmp_path / "a.scene", "cpu")
+    assert found.decoder is None and found.render("0003").pixels.any()
+
+
+def test_a_gaussian_of_one_color_takes_at_most_48_bytes(tmp_path):
+    small, large = painted_scene(**decoded("lang3dxl")), painted_scene(**decoded("lang3dxl"))
+    rows = torch.arange(len(large.splats)).repeat(4)
+    large = Scene(large.splats.select(rows), large.file, large.decoder, large.codes[rows])
+    sizes = [write_scene(tmp_path / "a.scene", scene) for scene in (small, large)]
+    assert (sizes[1] - sizes[0]) / (3 * len(small.splats)) <= 48
+
+
+def test_the_file_tells_what_it_is_without_paths_of_its_machine(written, tmp_path):
+    scene, path = written
+    told = describe_scene_file(path)
+    assert told["provenance"].credit == "Painters" and told["gaussians"] == 5185 and told["photos"] == 4
+    scene.file.photos[0] = replace(scene.file.photos[0], mask=str(tmp_path / "somewhere" / "mask.png"))
+    scene = Scene(scene.splats, replace(scene.file, data="/home/somebody/wall"), scene.decoder, scene.codes)
+    write_scene(path, scene)
+    assert b"/home" not in path.read_bytes() and b"somewhere" not in path.read_bytes()
+
+
+def test_foregrounds_travel_with_the_scene(tmp_path):
+    mask = np.zeros((24, 24), np.uint8)
+    mask[:, 12:] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    scene = painted_scene()
+    scene = painted_scene(**decoded("lang3dxl"))
+    scene.file.photos[2] = replace(scene.file.photos[2], mask=str(tmp_path / "mask.png"))
+    expected = scene.query("dome", "0003").relevancy
+    write_scene(tmp_path / "a.scene", scene)
+    (tmp_path / "mask.png").unlink()
+    found = read_scene(tmp_path / "a.scene", "cpu", encode_texts=encode_texts).query("dome", "0003").relevancy
+    assert not found[:, :48].any() and found[:, 48:].any()
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+
+
+# ── hostile files ───────────────────────────────────────────────────────────────────────────────────────
+
+
+def rewritten(path, change, tensors=None):
+    """The file with another description, or other tensors."""
+    content = path.read_bytes()
+    (length,) = struct.unpack("<Q", content[:8])
+    header = json.loads(content[8 : 8 + length])
+    told = json.loads(header["__metadata__"]["lang3dxl"])
+    change(told, header)
+    header["__metadata__"]["lang3dxl"] = json.dumps(told)
+    data = json.dumps(header).encode()
+    data += b" " * (-len(data) % 8)
+    path.write_bytes(struct.pack("<Q", len(data)) + data + content[8 + length :])
+
+
+def set_at(told, value, *keys):
+    for key in keys[:-1]:
+        told = told[key]
+    told[keys[-1]] = value
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("version",), "no number"),
+        (("scene", "photos"), []),
+        (("scene", "photos", 0, "lens", "fx"), "wide"),
+        (("scene", "photos", 0, "camera_to_world"), [[1, 2], [3]]),
+        (("scene",), None),
+        (("provenance", "title"), 7),
+        (("provenance",), {"evil": 1}),
+        (("background",), [0, 0]),
+        (("antialiased",), "yes"),
+        (("decoder", "name"), "os.system"),
+        (("decoder", "clip_dim"), 10**9),
+        (("decoder", "clip_dim"), -4),
+        (("decoder", "settings", "levels"), 10**6),
+        (("decoder", "settings", "log2_table_size"), 62),
+        (("decoder", "settings", "hidden_width"), 99_999),
+        (("decoder", "settings", "levels"), [1, 2]),
+        (("decoder", "settings", "evil"), 1),
+        (("looks", "names"), ["a"]),
+        (("looks", "names"), "abc"),
+        (("looks", "config", "vector_dim"), 10**9),
+        (("looks", "config", "preset"), "nope"),
+    ],
+)
+def test_a_description_that_lies_is_one_sentence(written, keys, value):
+    _, path = written
+    rewritten(path, lambda told, _: set_at(told, value, *keys))
+    with pytest.raises(UserError, match=r"wall.scene"):
+        read_scene(path, "cpu")
+
+
+def test_a_newer_format_is_told(written):
+    _, path = written
+    rewritten(path, lambda told, _: told.update(version=2))
+    for read in (read_scene, describe_scene_file):
+        with pytest.raises(UserError, match=r"format 2.*update"):
+            read(path)
+
+
+@pytest.mark.parametrize("name", ["means", "codes", "logits", "decoder.output.weight", "looks.vectors"])
+def test_tensors_of_wrong_shapes_are_refused(written, name):
+    _, path = written
+
+    def change(_, header):
+        shape = header[name]["shape"]
+        header[name]["shape"] = (
+            [shape[0] * 2, *shape[1:]] if len(shape) == 1 else [shape[1], shape[0], *shape[2:]]
+        )
+
+    rewritten(path, change)
+    with pytest.raises(UserError, match=r"wall.scene"):
+        read_scene(path, "cpu")
+
+
+def test_cut_and_spoiled_files_are_refused_or_read_as_numbers(written):
+    """Every change of a byte gives a scene, or one sentence."""
+    _, path = written
+    content = path.read_bytes()
+    generator = np.random.default_rng(0)
+    for _ in range(40):
+        spoiled = bytearray(
+            content[: generator.integers(len(content))] if generator.random() < 0.3 else content
+        )
+        for place in generator.integers(0, max(min(len(spoiled), 4000), 1), 4):
+            if len(spoiled):
+                spoiled[place] = generator.integers(256)
+        path.write_bytes(bytes(spoiled))
+        with suppress(UserError):
+            read_scene(path, "cpu")
+    for content in (b"", b"\0" * 8, b"\xff" * 64, b"PK\x03\x04", b"no scene"):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=r"wall.scene"):
+            read_scene(path, "cpu")
+
+
+def test_other_names_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"end it in .scene"):
+        write_scene(tmp_path / "a.ply", painted_scene())
+    with pytest.raises(UserError, match="not a file"):
+        read_scene(tmp_path / "none.scene")
