@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
+from lang3dxl_ns.rendering.ellipses import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Ellipses
 from lang3dxl_ns.rendering.gaussians import Gaussians
-from lang3dxl_ns.rendering.projection import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Splats
 from lang3dxl_ns.rendering.simd import (
     LANES,
     ceil,
@@ -34,8 +34,10 @@ _LENGTH_MIN = 1e-12
 """A quaternion shorter than this is divided by this, as by `torch.nn.functional.normalize`."""
 
 
-def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool) -> Splats:
-    """See `projection.project`; no gradient for the intrinsics."""
+def project(
+    gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool
+) -> Ellipses:
+    """See `projection.project`; no gradient for the intrinsics, and none from the variances."""
     count = len(gaussians.means)
     parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
     if count < LANES:  # a vector's worth at least; the rest is out of sight
@@ -50,7 +52,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, 
     view = camera.view_matrix.to(gaussians.means)
     found = _Projection.apply(*parts, view, torch.cat([lens, limits]).detach())
     means2d, conics, variances, depths, opacities, radii = (part[:count] for part in found)
-    return Splats(means2d[None], conics, variances, depths, opacities, radii[None])
+    return Ellipses(means2d[None], conics, variances, depths, opacities, radii[None])
 
 
 class _Projection(torch.autograd.Function):
