@@ -29,12 +29,6 @@ BENCHMARKS = {
     "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
-    "queries": ("benchmarks.queries:QueryBenchmark", "From a new text to its picture."),
-    "best-views": (
-        "benchmarks.best_views:BestViews",
-        "Whether the views that queries choose show the words.",
-    ),
-    "viewer": ("benchmarks.viewer:ViewerBenchmark", "Viewers in a browser: frames, first picture."),
     "ablation": (
         "benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",
