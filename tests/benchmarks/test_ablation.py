@@ -236,7 +236,7 @@ def test_new_weights_of_the_same_name_make_runs_anew(tmp_path, monkeypatch):
     assert len(made) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 
