@@ -16,6 +16,8 @@ import torch
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.photo import Photo
 
 SETTINGS = {"encoder": "abc", "crop_sides": [32, 64]}
 
@@ -220,38 +222,26 @@ def test_reading_a_slice_does_not_load_the_entry(store):
     assert resident() > 60 * 2**20  # the measurement does see accessed pages
 
 
-def test_an_entry_with_a_flipped_bit_or_without_its_checksum_is_damaged(store, caplog):
-    from safetensors.torch import save_file
-
-    store.write("clip", "a.jpg", entry(), SETTINGS)
-    path = store.path("clip", "a.jpg")
-    content = bytearray(path.read_bytes())
-    content[-3] ^= 1
+def photo(path, content=b"1"):
     path.write_bytes(content)
-    assert not store.is_current("clip", "a.jpg", SETTINGS)
-    assert "its checksum differs" in caplog.text
-    save_file({"x": torch.ones(2)}, path, {"settings": '{"made": "before checksums"}'})
-    assert not store.is_current("clip", "a.jpg", {"made": "before checksums"})
+    return Photo(path.name, path, None, Lens(4, 3, 5.0, 5.0, 2.0, 1.5))
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_a_claim_excludes_other_processes_and_ends_with_its_own(store):
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        with store.claim("a.jpg") as ours:
-            os.write(writing, b"1" if ours else b"0")
-            time.sleep(60)
-        os._exit(0)
-    assert os.read(reading, 1) == b"1"
-    with store.claim("a.jpg") as ours:
-        assert not ours
-    with store.claim("b.jpg") as ours:
-        assert ours
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    with store.claim("a.jpg") as ours:
-        assert ours
+def test_photos_are_hashed_once_and_again_only_when_their_files_change(store, tmp_path, monkeypatch):
+    photos = [photo(tmp_path / name, name.encode()) for name in ("a.png", "b.png", "gone.png")]
+    photos[2].path.unlink()
+    read, content_hash = [], Photo.content_hash
+    monkeypatch.setattr(Photo, "content_hash", lambda self: read.append(self.name) or content_hash(self))
+    first = store.photo_hashes(photos)
+    assert (first["a.png"], first["b.png"]) == (content_hash(photos[0]), content_hash(photos[1]))
+    assert "gone.png" in str(first["gone.png"])
+    assert sorted(read) == ["a.png", "b.png"]
+    assert store.photo_hashes(photos).keys() == first.keys() and len(read) == 2
+    photo(tmp_path / "b.png", b"another")
+    assert store.photo_hashes(photos)["b.png"] == content_hash(photos[1]) != first["b.png"]
+    assert read[2:] == ["b.png"]
+    (store.root / "photo_hashes.json").write_text("[damaged")
+    assert store.photo_hashes(photos)["a.png"] == first["a.png"]
 
 
 def test_cleaning_keeps_what_is_named_and_reports_what_went(store):
