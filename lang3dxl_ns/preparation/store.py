@@ -7,6 +7,7 @@ import errno
 import hashlib
 import json
 import logging
+import os
 import re
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -28,6 +29,7 @@ _HALF_MAX = torch.finfo(torch.float16).max
 _ENTRIES = (".safetensors", ".png", ".jpg")
 """Targets, masks, and photos at working size."""
 _HASHES = "photo_hashes.json"
+_SECOND = 10**9  # nanoseconds
 _LEFTOVER_AGE_S = 3600.0
 """A write takes seconds: an older temporary file belongs to a process that was killed."""
 _READERS = 4
@@ -58,8 +60,10 @@ class FeatureStore:
         from safetensors.torch import save
 
         stored = {key: _compact(tensor, f"{key} of {name} ({kind})") for key, tensor in tensors.items()}
-        content = save(stored, metadata={"settings": _canonical(settings)})
-        self.write_bytes(self.path(kind, name), content, f"{name} ({kind})")
+        metadata = {"settings": _canonical(settings), "checksum": _checksum(stored)}
+        path = self.path(kind, name)
+        self.write_bytes(path, save(stored, metadata=metadata), f"{name} ({kind})")
+        _seal(path)
 
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
         """Write a file of the store, atomically. Raises UserError if the disk is full or read-only."""
@@ -113,13 +117,23 @@ class FeatureStore:
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
         """Whether the entry exists, is complete, and was made with these settings. Damaged counts as absent.
 
-        Reads the entry's header alone, which gives away a file that was cut.
+        Reads the entry's header alone, and all of it only if the file has changed since it was last whole.
         """
         path = self.path(kind, name)
         if not path.exists():
             return False
         try:
-            return _canonical(self.settings(kind, name)) == _canonical(settings)
+            with _opened(path, f"{kind} of {name}") as file:
+                metadata = file.metadata()
+                if _canonical(json.loads(metadata["settings"])) != _canonical(settings):
+                    return False
+                if _is_sealed(path):
+                    return True
+                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+                if metadata.get("checksum") != _checksum(tensors):
+                    raise UserError(f"{path} ({kind} of {name}) is damaged: its checksum differs")
+            _seal(path)
+            return True
         except (UserError, ValueError) as error:
             logger.warning("%s; it will be made again", error)
             return False
@@ -209,6 +223,26 @@ def _compact(tensor: Tensor, what: str) -> Tensor:
         )
     fits = tensor.numel() == 0 or float(tensor.abs().max()) <= _HALF_MAX
     return tensor.to(torch.float16 if fits else torch.float32)
+
+
+def _checksum(tensors: dict[str, Tensor]) -> str:
+    """Checksum of names, shapes and contents."""
+    digest = hashlib.blake2b(digest_size=16)
+    for key, tensor in sorted(tensors.items()):
+        digest.update(f"{key} {tensor.dtype} {list(tensor.shape)}".encode())
+        digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _seal(path: Path) -> None:
+    """Mark a file as whole by a time of change in full seconds, which a later change makes another."""
+    with contextlib.suppress(OSError):
+        seconds = path.stat().st_mtime_ns // _SECOND
+        os.utime(path, ns=(seconds * _SECOND, seconds * _SECOND))
+
+
+def _is_sealed(path: Path) -> bool:
+    return path.stat().st_mtime_ns % _SECOND == 0
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -29,9 +29,9 @@ def test_a_crowd_is_a_scene_of_mixed_sizes_with_tracks_and_depends_on_its_seed_a
 
 
 def test_the_report_holds_a_row_per_stage():
-    stages = [Stage("words", "20,000 Gaussians", 12.34, "0.5 s", 2_500_000_000)]
+    stages = [Stage("words", "20,000 Gaussians", 12.34, 9.87, "0.5 s", 2_500_000_000)]
     report = markdown(ScaleBenchmark(out=Path("x")), stages)
-    assert "| words | 20,000 Gaussians | 12.3 | 0.5 s | 2.50 |" in report
+    assert "| words | 20,000 Gaussians | 12.3 | 9.9 | 0.5 s | 2.50 |" in report
     assert "lang3dxl benchmark scale --out x" in report
 
 

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation import store as module
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.photo import Photo
@@ -220,6 +221,31 @@ def test_reading_a_slice_does_not_load_the_entry(store):
     assert resident() < 8 * 2**20
     assert features.sum() == 0
     assert resident() > 60 * 2**20  # the measurement does see accessed pages
+
+
+def test_an_entry_with_a_flipped_bit_or_without_its_checksum_is_damaged(store, caplog):
+    from safetensors.torch import save_file
+
+    store.write("clip", "a.jpg", entry(), SETTINGS)
+    path = store.path("clip", "a.jpg")
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 1
+    path.write_bytes(content)
+    assert not store.is_current("clip", "a.jpg", SETTINGS)
+    assert "its checksum differs" in caplog.text
+    save_file({"x": torch.ones(2)}, path, {"settings": '{"made": "before checksums"}'})
+    assert not store.is_current("clip", "a.jpg", {"made": "before checksums"})
+
+
+def test_entries_that_nobody_touched_are_not_read_to_know_that_they_are_whole(store, monkeypatch):
+    store.write("clip", "a.jpg", entry(), SETTINGS)
+    path, read = store.path("clip", "a.jpg"), []
+    checksum = module._checksum
+    monkeypatch.setattr(module, "_checksum", lambda tensors: read.append(1) or checksum(tensors))
+    assert store.is_current("clip", "a.jpg", SETTINGS) and not read
+    path.write_bytes(path.read_bytes())  # a copy, say
+    assert store.is_current("clip", "a.jpg", SETTINGS) and len(read) == 1
+    assert store.is_current("clip", "a.jpg", SETTINGS) and len(read) == 1
 
 
 def photo(path, content=b"1"):
