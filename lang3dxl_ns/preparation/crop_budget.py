@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lang3dxl_ns.preparation.physical_scale import SMALLEST_CROP, crop_sides, fine_crops
-from lang3dxl_ns.preparation.pyramid import HALF, THIRD, crop_centers
+from lang3dxl_ns.preparation.pyramid import HALF, THIRD, crop_count
 from lang3dxl_ns.preparation.settings import Quality
 
 MOST_CROPS: dict[Quality, float] = {"fast": 700, "normal": 2_500, "fine": math.inf}
@@ -90,4 +90,4 @@ def input_side(folder: Path) -> int:
 
 
 def _grid(height: int, width: int, side: int, steps: int) -> tuple[int, int]:
-    return len(crop_centers(height, side, steps)), len(crop_centers(width, side, steps))
+    return crop_count(height, side, steps), crop_count(width, side, steps)

@@ -85,15 +85,8 @@ def _made_with(photo: Photo, source: Path) -> str:
     """Everything that determines a copy. Raises UserError if the source is missing."""
     lens = photo.lens
     camera = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion, lens.fisheye] if lens.distorts else None
-    try:
-        status = source.stat()
-    except OSError as error:
-        raise UserError(
-            f"photo {photo.name}: there is no file {source}: put it there or leave the photo out"
-        ) from error
-    stamp = [status.st_size, status.st_mtime_ns, status.st_ino]
     size = [photo.width, photo.height, photo.quarter_turns]
-    return json.dumps({"file": stamp, "size": size, "undistorted": camera, "rule": _RULE})
+    return json.dumps({"file": photo.stamp(source), "size": size, "undistorted": camera, "rule": _RULE})
 
 
 def _is_slow(photo: Photo, source: Path) -> bool:
@@ -115,10 +108,14 @@ def _kept(path: Path, made_with: str, note: Callable[[Image.Image], Any], mode: 
         with open_picture(path) as copy:
             written = note(copy)
             written = written.decode(errors="replace") if isinstance(written, bytes) else written
-            return copy.convert(mode) if written == made_with else None
+            if written != made_with:
+                return None
+            copy.load()
+            return copy if copy.mode == mode else copy.convert(mode)
     except (OSError, NoPictureError):
         return None
 
 
 def _resized(image: Image.Image, photo: Photo, scale: float, method: Image.Resampling) -> Image.Image:
-    return image.resize(scaled_size(photo.width, photo.height, scale), method)
+    size = scaled_size(photo.width, photo.height, scale)
+    return image if image.size == size else image.resize(size, method)

@@ -130,11 +130,11 @@ class Photo:
             return labels
         return torch.from_numpy(self._undistort(labels.numpy().astype(np.int32), nearest=True, empty=-1))
 
-    def stamp(self) -> list[int]:
-        """Size, time of change and inode of the file: another when its content is. Raises UserError if it is
-        missing."""
-        with _readable(self.path, self.name):
-            status = self.path.stat()
+    def stamp(self, path: Path | None = None) -> list[int]:
+        """Size, time of change and inode of the photo's file (or its mask's, at `path`): another when its
+        content is. Raises UserError if it is missing."""
+        with _readable(path or self.path, self.name):
+            status = (path or self.path).stat()
             return [status.st_size, status.st_mtime_ns, status.st_ino]
 
     def content_hash(self) -> str:
