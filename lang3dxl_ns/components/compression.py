@@ -311,6 +311,7 @@ class CompressedField(SemanticField):
         """Become another field, of codes of any length."""
         self.settings, self.code_dim = other.settings, other.code_dim
         self.grid, self.layers, self.output = other.grid, other.layers, other.output
+        self.level_weights = other.level_weights
         self.set_output_statistics(other.output_mean, other.output_std)
 
     def fit_codes(self, codes: Float[Tensor, "n code"]) -> None:

@@ -79,26 +79,20 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             raise UserError(f"torch can't use a GPU here: {unused_gpu() or 'there is none'}")
         warn_of_unused_gpu()
         rasterizer = self.pipeline.model.rasterizer
-        if self.machine.device_type != "cuda" or rasterizer == "torch":
-            return
-        try:
+        if self.machine.device_type == "cuda" and rasterizer == "gsplat":
             gsplat_build.make_ready()
-        except UserError as error:
-            if rasterizer == "gsplat":
-                raise
-            self._refuse_hours_of_torch(error)
+        elif self.machine.device_type == "cuda" and rasterizer == "auto" and not gsplat_build.ready():
+            self._refuse_hours_of_torch()
 
-    def _refuse_hours_of_torch(self, reason: UserError) -> None:
+    def _refuse_hours_of_torch(self) -> None:
         """Raises UserError if this GPU would take hours without gsplat, judged by one rendering."""
         seconds = RENDERINGS_PER_STEP[False] * self.max_num_iterations * _torch_rendering_seconds()
-        if seconds < LONG_RUN_S:
-            say(f"Warning: {reason}. The torch rasterizer renders instead, {roughly(seconds)} in this run.")
-            return
-        raise UserError(
-            f"{reason}. Without them the torch rasterizer would take {roughly(seconds)} or more for "
-            f"{self.max_num_iterations:,} iterations on this GPU: pass --pipeline.model.rasterizer torch to "
-            "train with it all the same"
-        )
+        if seconds > LONG_RUN_S:
+            raise UserError(
+                f"without gsplat (the warning above says what is missing) {self.max_num_iterations:,} "
+                f"iterations would take {roughly(seconds)} or more on this GPU: install what is missing, or "
+                "pass --pipeline.model.rasterizer torch to train with the slow rasterizer all the same"
+            )
 
     def _claim_folder(self) -> None:
         """Create a unique folder, even if two runs start in the same second."""

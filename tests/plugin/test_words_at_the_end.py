@@ -52,6 +52,18 @@ def test_a_run_that_dies_while_it_learns_words_resumes_with_words_only(trained, 
         run(load_dir=folders[1])
 
 
+def test_words_of_a_run_that_is_prolonged_are_learned_anew(trained, train, scene, monkeypatch):
+    """Those of the checkpoint are out of date as soon as the Gaussians move."""
+    run, folders = trained
+    run()
+    assert saved(folders[0])["words"]
+    monkeypatch.setattr(Lang3DXLPipeline, "learn_words", lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        train(scene, iterations=STEPS + 1, load_dir=folders[0])
+    (path,) = folders[1].glob("*.ckpt")
+    assert not torch.load(path, weights_only=True)["words"]
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_while_words_are_learned_ends_the_run_at_once(trained, monkeypatch, number, code):
     run, folders = trained
