@@ -73,7 +73,7 @@ class Demo:
         out = self.out.expanduser().absolute()
         try:
             self._run(out)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):
             sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
@@ -86,10 +86,8 @@ class Demo:
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
         trainer.stages = stages
         trainer.setup()
-        if trainer.first_iteration < config.max_num_iterations:
+        if not trainer.is_finished:
             trainer.train()
-            if trainer.interrupted:
-                raise KeyboardInterrupt
         else:
             say("train: skipped, the run is finished")
         with stages.stage("evaluate"):

@@ -33,6 +33,21 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         raise
 
 
+def replace_durably(partial: Path, path: Path) -> None:
+    """Move a finished file over another one; a loss of power leaves one of the two, whole."""
+    _to_disk(partial)
+    os.replace(partial, path)
+    _to_disk(path.parent)
+
+
+def _to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def make_folder(folder: Path) -> None:
     """Make a folder and its parents. Raises OSError with its name."""
     try:

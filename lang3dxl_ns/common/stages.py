@@ -76,6 +76,11 @@ class Stages:
         if self._tenths < 10:
             say(f"{self._current}: {100 * done:.0f} % done; {roughly(left)} left in all")
 
+    def weigh(self, name: str, other: str, times: float) -> None:
+        """Expect a stage to take so many times as long as another one."""
+        if name in self._shares and other in self._shares:
+            self._shares[name] = times * self._shares[other]
+
     def figures(self) -> dict[str, dict[str, float]]:
         """Seconds and peak memory (MB) by stage."""
         return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import torch
@@ -14,16 +15,22 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import unused_gpu, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import synchronize
+from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.load_scene import check_checkpoint
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.saved_config import read_config
-from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
+from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
 from lang3dxl_ns.preparation.encoders import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
-from lang3dxl_ns.rendering import gsplat_build
+from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
+from lang3dxl_ns.scene.camera import Camera
+
+LONG_RUN_S = 3_600.0
+"""Seconds of training that are not begun on a warning."""
 
 
 @dataclass
@@ -72,10 +79,20 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             raise UserError(f"torch can't use a GPU here: {unused_gpu() or 'there is none'}")
         warn_of_unused_gpu()
         rasterizer = self.pipeline.model.rasterizer
-        if self.machine.device_type == "cuda" and rasterizer == "auto":
-            gsplat_build.ready()
-        elif self.machine.device_type == "cuda" and rasterizer == "gsplat":
+        if self.machine.device_type == "cuda" and rasterizer == "gsplat":
             gsplat_build.make_ready()
+        elif self.machine.device_type == "cuda" and rasterizer == "auto" and not gsplat_build.ready():
+            self._refuse_hours_of_torch()
+
+    def _refuse_hours_of_torch(self) -> None:
+        """Raises UserError if this GPU would take hours without gsplat, judged by one rendering."""
+        seconds = RENDERINGS_PER_STEP[False] * self.max_num_iterations * _torch_rendering_seconds()
+        if seconds > LONG_RUN_S:
+            raise UserError(
+                f"without gsplat (the warning above says what is missing) {self.max_num_iterations:,} "
+                f"iterations would take {roughly(seconds)} or more on this GPU: install what is missing, or "
+                "pass --pipeline.model.rasterizer torch to train with the slow rasterizer all the same"
+            )
 
     def _claim_folder(self) -> None:
         """Create a unique folder, even if two runs start in the same second."""
@@ -149,6 +166,23 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         settle(mine.appearance, earlier.appearance, "use", "appearance")
         settle(mine, earlier, "view_dependence", "view dependence")
         settle(mine, earlier, "camera_optimization", "camera optimizer")
+
+
+def _torch_rendering_seconds(count: int = 50_000, size: tuple[int, int] = (1000, 700)) -> float:
+    """Seconds of a rendering of random Gaussians by torch on the GPU; the second one, warm."""
+    draw = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=draw) * 4 - torch.tensor([2.0, 2.0, -3.0])
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    parts = means, quats, torch.full((count, 3), 0.02), torch.full((count,), 0.5)
+    gaussians = Gaussians(*(part.to("cuda") for part in parts))
+    lens = torch.tensor([[900.0, 0.0, size[0] / 2], [0.0, 900.0, size[1] / 2], [0.0, 0.0, 1.0]])
+    camera, seconds = Camera(torch.eye(4), lens, *size), 0.0
+    for _ in range(2):
+        start = perf_counter()
+        rasterize(gaussians, camera, torch.ones(count, 3, device="cuda"), backend="torch")
+        synchronize()
+        seconds = perf_counter() - start
+    return seconds
 
 
 def _absolute(path: Path | None) -> Path | None:
