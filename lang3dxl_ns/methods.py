@@ -13,14 +13,12 @@ from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from lang3dxl_ns.common.console import silence_libraries
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.saved_config import check_command_line
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 
 check_command_line(sys.argv[1:])
-silence_libraries()
 
 DEVICE: Literal["cuda", "cpu"] = "cuda" if torch.cuda.is_available() else "cpu"
 

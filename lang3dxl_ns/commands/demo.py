@@ -15,6 +15,7 @@ from rich.markdown import Markdown
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
@@ -70,7 +71,7 @@ class Demo:
     """Extra flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.dense-weight 0.5"."""
 
     def main(self) -> None:
-        out = self.out.expanduser().absolute()
+        out = expanded(self.out).absolute()
         try:
             self._run(out)
         except KeyboardInterrupt:

@@ -52,7 +52,7 @@ def silence_libraries() -> None:
 
 _KNOWN_WARNINGS = (
     r"`torch\.jit\.\w+` is deprecated",  # torchmetrics
-    r"`torch\.cuda\.amp\.GradScaler",  # nerfstudio's trainer
+    r"`torch\.cuda\.amp\.",  # nerfstudio's trainer and activations
     r"Detected call of `lr_scheduler\.step\(\)` before",  # nerfstudio's optimizers
     r"Converting a tensor with requires_grad=True to a scalar",  # nerfstudio's writer
 )

@@ -30,7 +30,7 @@ from lang3dxl_ns.plugin.data_folder import parser_for
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.handover import Batch, SceneFacts
-from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
+from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
@@ -81,8 +81,9 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if hasattr(config.dataparser, "load_3D_points"):
             config.dataparser.load_3D_points = True  # off by default in nerfstudio-data
         try:
+            check_transforms(config.dataparser)
             super().__init__(config, *args, **kwargs)
-        except (UserError, OSError) as reason:
+        except (UserError, FileNotFoundError) as reason:
             recorded = recorded_scene(config.run)
             if recorded is None or kwargs.get("test_mode", "val") == "val":
                 raise

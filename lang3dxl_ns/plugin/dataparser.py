@@ -14,9 +14,9 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.console import silence_libraries, some
 from lang3dxl_ns.common.errors import UserError, printable
-from lang3dxl_ns.common.files import read_names
+from lang3dxl_ns.common.files import expanded, read_names
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
@@ -63,7 +63,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         self._left_out: dict[str, UserError] = {}
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        data = self.config.data = Path(self.config.data).expanduser().absolute()
+        data = self.config.data = expanded(self.config.data).absolute()
         if self.config.downscale_factor != 1:  # nerfstudio would hand the photos' names to a shell
             raise UserError(
                 f"--downscale-factor is {self.config.downscale_factor}: leave it at 1, resize photos with "
@@ -267,6 +267,8 @@ def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Pa
     """The first of the folders (relative to `data`) that exists and holds files; otherwise the first."""
     return next((c for c in candidates if any(p.is_file() for p in (data / c).glob(contents))), candidates[0])
 
+
+silence_libraries()  # nerfstudio imports this module before those that warn
 
 photo_collection = DataParserSpecification(
     config=PhotoCollectionDataParserConfig(),

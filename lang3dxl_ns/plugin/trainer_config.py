@@ -14,6 +14,7 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import unused_gpu, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.load_scene import check_checkpoint
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
@@ -126,7 +127,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)
         if isinstance(datamanager.dataparser, PhotoCollectionDataParserConfig):
             datamanager.dataparser.held_out = _absolute(datamanager.dataparser.held_out)
-        self.output_dir = Path(self.output_dir).expanduser().absolute()
+        self.output_dir = expanded(self.output_dir).absolute()
 
     def _follow(self, run: Path) -> None:
         """A resumed run keeps what `auto` resolved to when it began."""
@@ -152,4 +153,4 @@ class Lang3DXLTrainerConfig(TrainerConfig):
 
 
 def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else Path(path).expanduser().absolute()
+    return None if path is None else expanded(path).absolute()

@@ -19,6 +19,9 @@ MOST_PIXELS = 180_000_000
 LONGEST_SIDE = 1 << 16
 """Most pixels of a picture's side."""
 
+FARTHEST = 1e12
+"""Largest coordinate, world units; map coordinates are below 1e8."""
+
 
 def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
     """Width and height of a photo at `scale`, at least one pixel each."""
@@ -53,7 +56,7 @@ class Lens:
     def check(self) -> None:
         """Raises ValueError for a lens that cannot be rendered with."""
         values = (self.width, self.height, self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(type(x) in (int, float) and abs(x) < 1e30 for x in values):
+        if not all(map(is_coordinate, values)):
             raise ValueError("a lens has a value that is not a number")
         if type(self.width) is not int or type(self.height) is not int or min(self.width, self.height) < 1:
             raise ValueError(f"a picture has {self.width} × {self.height} pixels")
@@ -78,6 +81,23 @@ class Lens:
     def camera(self, view_matrix: Float[Tensor, "4 4"]) -> Camera:
         """This lens, undistorted, at a pose (world → camera, OpenCV axes)."""
         return Camera(view_matrix, self.matrix.float(), self.width, self.height)
+
+
+def is_coordinate(value: object) -> bool:
+    """Whether this is a finite number of a sensible size: no NaN, truth value or text."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < FARTHEST
+
+
+def check_pose(rows: object) -> None:
+    """The check of every pose that a file gives, whatever wrote it: [3, 4] or [4, 4] nested lists of finite
+    numbers, in which a rotation keeps volumes within a factor of eight. Raises ValueError otherwise."""
+    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+        raise ValueError("a pose is not three rows of four numbers")
+    if len(rows) not in (3, 4) or not all(is_coordinate(value) for row in rows for value in row):
+        raise ValueError("a pose is not three rows of four numbers")
+    turn = float(np.linalg.det(np.array([row[:3] for row in rows[:3]], dtype=np.float64)))
+    if not 1 / 8 < turn < 8:
+        raise ValueError("a pose is not a rotation and a position")
 
 
 @dataclass
@@ -175,4 +195,8 @@ def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:
     """A camera at a pose (camera → world, nerfstudio's axes) with the lens and size of `like`."""
     if pose.shape not in ((3, 4), (4, 4)):
         raise UserError(f"a pose has shape [3, 4] or [4, 4], not {list(pose.shape)}")
+    try:
+        check_pose(pose.double().tolist())
+    except ValueError as error:
+        raise UserError(f"{error}: give camera → world, such as the `pose` of a photo") from error
     return Camera(view_matrix(pose[:3].float()), like.intrinsics, like.width, like.height)

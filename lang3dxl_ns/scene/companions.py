@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from lang3dxl_ns.common.errors import UserError, is_plain
+from lang3dxl_ns.common.files import expanded
 
 
 def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
@@ -50,7 +51,7 @@ def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bo
 
 def named_folder(choice: str, data: Path, option: str) -> Path:
     """The folder given to an option, relative to `data`. Raises UserError if it does not exist."""
-    folder = data / Path(choice).expanduser()
+    folder = data / expanded(choice)
     if not folder.is_dir():
         raise UserError(
             f"--pipeline.datamanager.{option} {choice}: there is no folder {folder}; give an existing one "

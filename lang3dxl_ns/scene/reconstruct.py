@@ -22,7 +22,7 @@ import numpy as np
 
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import expanded, open_file, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
@@ -92,11 +92,11 @@ def reconstruct_scene(
     The model goes to sparse/0 in the scene's folder or, if sparse is taken or the folder is read-only,
     to the cache. Raises UserError like `reconstruct` and `extract_frames`.
     """
-    data = data.expanduser().absolute()
+    data = expanded(data).absolute()
     if is_video(data):
         data = extract_frames(data)
     photos = find_photos(data)
-    work = (cache_dir or data / "lang3dxl_cache").expanduser().absolute() / "reconstruction"
+    work = expanded(cache_dir or data / "lang3dxl_cache").absolute() / "reconstruction"
     model = data / "sparse"
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
         model = work / "sparse"
@@ -135,7 +135,7 @@ def _without_twins(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     first: dict[str, str] = {}
     twins = {}
     for name in photos.names:
-        with (photos.folder / name).open("rb") as file:
+        with open_file(photos.folder / name) as file:
             content = (
                 hashlib.file_digest(file, "blake2b").hexdigest()
                 if hasattr(hashlib, "file_digest")

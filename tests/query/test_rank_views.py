@@ -34,7 +34,7 @@ def ranks(pictures: dict[str, torch.Tensor], threshold: float = 0.5) -> list[str
     means = torch.cat([part[0] for part in parts.values()])
     scores = torch.cat([part[2] for part in parts.values()])
     views = {
-        name: VisibleGaussians(seen.camera, seen.rows + i * SIDE * SIDE, seen.pixels)
+        name: VisibleGaussians(seen.camera, seen.rows + i * SIDE * SIDE, seen.shares)
         for i, (name, (_, seen, _)) in enumerate(parts.items())
     }
     found = rank_views(views, means, scores, threshold)
@@ -65,7 +65,7 @@ def test_a_stray_pixel_is_no_peak():
 def test_what_is_hidden_does_not_count():
     means, seen, scores = view(spot(16))
     shown = scores < 0.5
-    hidden = VisibleGaussians(seen.camera, seen.rows[shown], seen.pixels[shown])
+    hidden = VisibleGaussians(seen.camera, seen.rows[shown], seen.shares[shown])
     found = rank_views({"seen": seen, "hidden": hidden}, means, scores, 0.5)
     assert found["hidden"].area == 0 and found["seen"].rank > found["hidden"].rank
 
