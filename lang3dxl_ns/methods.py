@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -98,6 +98,7 @@ lang3dxl = MethodSpecification(
         steps_per_eval_all_images=0,
         pipeline=Lang3DXLPipelineConfig(),
         optimizers=_optimizers(),
+        logging=LoggingConfig(profiler="none"),  # its table would end every command
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
     ),

@@ -169,7 +169,6 @@ def _configuration(scene: _Measured) -> Lang3DXLTrainerConfig:
     config.pipeline.datamanager.scale_range = (0.4, 0.4)
     config.pipeline.datamanager.dense_tokens = 16
     config.pipeline.model.sky_gaussians = 0
-    config.pipeline.model.stop_split_at = 0  # as many Gaussians as there are points
     config.set_timestamp()
     return config
 

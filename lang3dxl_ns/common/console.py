@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -15,16 +17,18 @@ QUIET_S = 5.0
 
 
 @contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A function to call after each of `total` items; after five seconds, shows a bar with time left."""
+def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
+    """A function to call after each of `total` items, or with their number after several; after five seconds,
+    shows a bar with the time left."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     start = time.monotonic()
-    bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    bar = Progress(*columns, speed_estimate_period=600)  # items come in lots: a short window would jump
     shown = bar.add_task(what, total=total)
 
-    def advance() -> None:
-        bar.advance(shown)
+    def advance(count: int = 1) -> None:
+        bar.advance(shown, count)
         if time.monotonic() - start > QUIET_S:
             bar.start()  # repeated calls have no effect
 
@@ -41,6 +45,13 @@ def say(*lines: str) -> None:
 
     for line in lines:
         get_console().print(printable(line), markup=False, highlight=False, soft_wrap=True)
+
+
+def accept_any_console() -> None:
+    """Make characters that the terminal's encoding lacks appear escaped, instead of as an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def silence_libraries() -> None:

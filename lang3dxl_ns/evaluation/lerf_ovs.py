@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
+from lang3dxl_ns.common.checks import is_coordinate
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth, check_shape
-from lang3dxl_ns.scene.camera import is_coordinate
 
 _MOST_PIXELS = 200_000_000
 _SLACK = 0.02

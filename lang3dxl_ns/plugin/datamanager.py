@@ -55,6 +55,8 @@ class PhotosGoneError(UserError):
     """Too many photos have vanished during training to continue."""
 
 
+_WORTH_TELLING = 1e8
+"""Bytes of photos and targets from which their memory is announced."""
 MOST_GONE = 0.1
 """Share of the training photos that may vanish."""
 
@@ -129,7 +131,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
             facts.clip_targets = partial(self.targets.clip_features, names)
             if self.targets.dense_dim:
                 facts.dense_targets = partial(self.targets.dense_features, names)
-        _log(self._memory_budget())
+        if budget := self._memory_budget():
+            _log(budget)
 
     @cached_property
     def targets(self) -> TargetReader | None:
@@ -253,12 +256,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return machine_memory() / 4 if gigabytes is None else gigabytes * 1e9
 
     def _memory_budget(self) -> str:
-        """Memory that training uses for photos, estimated from the first one's targets."""
+        """Memory for photos in training, estimated from the first one's targets; "" if it is little."""
         photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
         total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
         if self.targets is not None and self.config.targets_in_steps:
             total += len(photos) * self.targets.bytes_of(self.targets.names[0])
         held = min(total, self.cache_bytes)
+        if total < _WORTH_TELLING:
+            return ""
         return (
             f"memory: at most {held / 1e9:.2f} GB of photos and targets at a time (of "
             f"{total / 1e9:.2f} GB in {len(photos)} photos), {self.config.read_ahead} photos read ahead "
@@ -278,23 +283,24 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
         A photo found to be damaged is left out from then on, and logged.
         """
-        index = self.train_unseen_cameras.pop(0)
-        if not self.train_unseen_cameras:
-            self.train_unseen_cameras = self.sample_train_cameras()
-        try:
-            with part("data"):
-                data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
-                camera, batch = self._batch(self.train_dataset, index, data)
-        except UserError as reason:
-            _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
-            self._leave_out(index, reason)
-            # The round continues without it: a resumed run, which meets it later, has the same order.
-            rest = [i for i in self.train_unseen_cameras if i != index]
-            self.train_unseen_cameras = rest or self.sample_train_cameras()
-            return self.next_train(step)
-        camera.metadata = {"cam_idx": index}
-        self.photo_in_hand = batch["name"]
-        return camera, batch
+        while True:
+            index = self.train_unseen_cameras.pop(0)
+            if not self.train_unseen_cameras:
+                self.train_unseen_cameras = self.sample_train_cameras()
+            try:
+                with part("data"):
+                    data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
+                    camera, batch = self._batch(self.train_dataset, index, data)
+            except UserError as reason:
+                _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
+                self._leave_out(index, reason)
+                # The round continues without it: a resumed run, which meets it later, has the same order.
+                rest = [i for i in self.train_unseen_cameras if i != index]
+                self.train_unseen_cameras = rest or self.sample_train_cameras()
+                continue
+            camera.metadata = {"cam_idx": index}
+            self.photo_in_hand = batch["name"]
+            return camera, batch
 
     def _leave_out(self, index: int, reason: UserError) -> None:
         """Raises PhotosGoneError if too many have vanished."""

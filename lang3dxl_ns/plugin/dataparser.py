@@ -17,6 +17,7 @@ from rich.markup import escape
 from lang3dxl_ns.common.console import silence_libraries, some
 from lang3dxl_ns.common.errors import UserError, printable
 from lang3dxl_ns.common.files import expanded, read_names
+from lang3dxl_ns.plugin.inert_settings import OF_COLMAP, without
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
@@ -28,6 +29,7 @@ OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
 """Folder for a model of ours if sparse is taken."""
 
 
+@without(*OF_COLMAP)
 @dataclass
 class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
     """A folder with images/, a COLMAP model, and optionally masks/."""
@@ -88,6 +90,11 @@ class PhotoCollectionDataParser(ColmapDataParser):
         finally:
             self.config.masks_path, self.config.auto_scale_poses = masks, scaled
         outputs.metadata["photos"] = [self.photos[path] for path in outputs.image_filenames]
+        if split == "train" and (held_out := len(self.photos) - len(outputs.image_filenames)):
+            CONSOLE.log(
+                f"{held_out} of {len(self.photos)} photos are held out of training, for evaluation "
+                "(`lang3dxl-colmap --eval-mode all` after all other options trains on all)"
+            )
         # From here on the transform again applies to the model's own coordinates.
         transform = outputs.dataparser_transform.double()
         transform[:, 3] -= transform[:, :3] @ torch.from_numpy(self._origin)

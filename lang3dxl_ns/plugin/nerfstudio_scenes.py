@@ -12,12 +12,13 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from lang3dxl_ns.common.checks import is_coordinate
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import check_regular, expanded, read_json
 from lang3dxl_ns.plugin.cameras import lens_of
 from lang3dxl_ns.preparation.physical_scale import points_in_view
-from lang3dxl_ns.scene.camera import Lens, check_pose, is_coordinate
+from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo import Photo

@@ -207,7 +207,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         metrics, images = self.model.get_image_metrics_and_images(outputs, batch)
         metrics |= self.model.feature_metrics(camera, batch)
         metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
-        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, "mask" in batch)
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, photo.mask_path is not None)
         if score is not None:
             score(camera, evaluated, batch, photo)
         return evaluated

@@ -153,14 +153,15 @@ def check_command_line(arguments: Sequence[str]) -> None:
     the earliest moment a plugin can check. The YAML nodes are inspected, not constructed. Files that do not
     name this package are left to nerfstudio.
     """
-    for path in _load_configs(arguments):
+    for path in load_configs(arguments):
         if os.environ.get(TRUST_VARIABLE) != "1" and (why := _file_asks_for(path)):
             sys.exit(
                 f"Error: {path} {why}: nothing in it was run. If you trust its author, set {TRUST_VARIABLE}=1"
             )
 
 
-def _load_configs(arguments: Sequence[str]) -> Iterator[Path]:
+def load_configs(arguments: Sequence[str]) -> Iterator[Path]:
+    """Files that the arguments of a command name with --load-config."""
     for i, argument in enumerate(arguments):
         option, equals, value = argument.partition("=")
         if option.replace("_", "-") == "--load-config":

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,11 +18,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch.cuda.amp.grad_scaler import GradScaler
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
@@ -49,6 +53,29 @@ RENDERINGS_PER_STEP = {False: 3.0, True: 6.0}
 2.1 to 2.7 on a landmark and `castle`, and 3.5 to 8.4 for `feature3dgs` and `paper`, on a busy CPU."""
 
 
+@contextmanager
+def _disk_kept_out_of_training() -> Iterator[None]:
+    """Let training continue where its log (tensorboard's events) can't be written, as on a full disk.
+
+    tensorboard's own thread keeps such an error, and raises it in the step that adds to the log.
+    """
+    write = writer.write_out_storage
+
+    def guarded() -> None:
+        try:
+            write()
+        except OSError as error:
+            writer.EVENT_WRITERS[:] = [w for w in writer.EVENT_WRITERS if isinstance(w, writer.LocalWriter)]
+            CONSOLE.log(escape(f"The log can't be written ({error}). Training continues without it."))
+            write()
+
+    writer.write_out_storage = guarded
+    try:
+        yield
+    finally:
+        writer.write_out_storage = write
+
+
 class Lang3DXLTrainer(Trainer):
     """nerfstudio's trainer with atomic checkpoints, a resumed run that ends at the requested iteration, and a
     guard against steps that are not finite."""
@@ -60,6 +87,8 @@ class Lang3DXLTrainer(Trainer):
     """Announced while they run: `prepare`, `train`, `words`. A longer command puts a list of its own here."""
     interrupted = False
     """Whether training was interrupted."""
+    stopped_by: int | None = None
+    """The signal that interrupted it."""
     _last_iteration = -1
     _is_ending = False
     _run_state: dict[str, Any] | None = None
@@ -81,8 +110,12 @@ class Lang3DXLTrainer(Trainer):
         of the scene into the run's folder, so that it can be queried without the photos."""
         # nerfstudio turns this on, and photos of many sizes would then be tuned for in nearly every step.
         torch.backends.cudnn.benchmark = False
-        with self.stages.stage("prepare"):
-            self._set_up(test_mode)
+        try:
+            with self.stages.stage("prepare"):
+                self._set_up(test_mode)
+        except UserError:
+            self._forget_folder()
+            raise
 
     def _set_up(self, test_mode: Literal["test", "val", "inference"]) -> None:
         data, self.config.data = self.config.data, None  # otherwise the viewer would write camera paths there
@@ -100,6 +133,15 @@ class Lang3DXLTrainer(Trainer):
         torch.manual_seed(self.config.machine.seed)
         if self._run_state is not None:
             restore_run_state(self.pipeline, self._run_state)
+
+    def _forget_folder(self) -> None:
+        """Remove the folder of a run that could not begin, if it holds nothing but its settings, and the
+        folders above that this leaves empty."""
+        with suppress(OSError):
+            if {path.name for path in self.base_dir.iterdir()} <= {"config.yml"}:
+                (self.base_dir / "config.yml").unlink(missing_ok=True)
+                for folder in (self.base_dir, *self.base_dir.parents[:3]):
+                    folder.rmdir()  # an error ends this at the first that holds something
 
     def _limit_gaussians(self) -> None:
         """Set the cap of densification from the device's memory, and log what training will take."""
@@ -184,7 +226,7 @@ class Lang3DXLTrainer(Trainer):
         try:
             self._announce_time()
             self.stages.begin("train")
-            with self._stoppable():
+            with self._stoppable(), _disk_kept_out_of_training():
                 super().train()
         except PhotosGoneError as error:
             raise UserError(f"{error}. {self._stop_early()}") from error
@@ -197,6 +239,8 @@ class Lang3DXLTrainer(Trainer):
             self.config.max_num_iterations = total
             if summary := self.guard.summary():
                 CONSOLE.log(escape(summary))
+        if self.stopped_by == signal.SIGTERM:  # as every program that ends by it
+            sys.exit(128 + signal.SIGTERM)
 
     @torch.no_grad()
     def _announce_time(self) -> None:
@@ -229,6 +273,7 @@ class Lang3DXLTrainer(Trainer):
 
         def stop(number: int, _frame: FrameType | None) -> None:
             self.interrupted = self.stop_training = True
+            self.stopped_by = number
             signal.signal(number, previous[signal.Signals(number)])
 
         if threading.current_thread() is not threading.main_thread():  # only it may handle signals
@@ -241,7 +286,8 @@ class Lang3DXLTrainer(Trainer):
             yield
         finally:
             for number, handler in previous.items():
-                signal.signal(number, handler)
+                if handler is not None:  # one installed by C code can't be restored
+                    signal.signal(number, handler)
 
     def _stop_early(self) -> str:
         """Save a checkpoint when training can't continue; returns a message about it."""
@@ -285,7 +331,15 @@ class Lang3DXLTrainer(Trainer):
                 f"--load-dir {self.checkpoint_dir}",
                 soft_wrap=True,
             )
+        else:
+            say(*self._next_steps())
         super()._after_train()
+
+    def _next_steps(self) -> Iterator[str]:
+        run = shlex.quote(os.path.relpath(self.base_dir))
+        yield f"Walk through it: lang3dxl view {run}"
+        if self.pipeline.model.semantic_field is not None:
+            yield f"Ask it:          lang3dxl query {run} --text windows --out found"
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:

@@ -18,9 +18,10 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.common.checks import is_coordinate
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json, write_atomically
-from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, is_coordinate, view_matrix
+from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.photo import Photo
 

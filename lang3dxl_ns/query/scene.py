@@ -262,7 +262,7 @@ class Scene:
         scores, doubts, thresholds = self._of_gaussians(prompts, threshold)
         return [self._found(*one, most) for one in zip(prompts, scores, doubts, thresholds, strict=True)]
 
-    def arrays(self, text: str | None = None, look: str | None = None) -> GaussianArrays:
+    def arrays(self, text: str | Prompt | None = None, look: str | None = None) -> GaussianArrays:
         """All Gaussians as NumPy arrays, with their relevancy to a prompt if one is given.
 
         Colors that depend on the view, or on a photo's light, are those towards the overview photo, under the
@@ -277,7 +277,7 @@ class Scene:
     def export(
         self,
         path: str | Path,
-        text: str | None = None,
+        text: str | Prompt | None = None,
         threshold: float | None = None,
         everything: bool = False,
         look: str | None = None,
@@ -294,7 +294,8 @@ class Scene:
             keep = relevancy > threshold
             if not keep.any():
                 raise UserError(
-                    f"no Gaussian matches {text!r}: the best reaches {relevancy.max():.2f}; lower "
+                    f"no Gaussian matches {self._one_prompt(text).text!r}: the best reaches "
+                    f"{relevancy.max():.2f}; lower "
                     f"--threshold, now {threshold:.2f}, or write all with their relevancy (--all)"
                 )
             found = replace(found, relevancy=relevancy)[keep]

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
+from lang3dxl_ns.common.checks import FARTHEST
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError, is_plain
-from lang3dxl_ns.scene.camera import FARTHEST, Lens, check_pose
+from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap_check import check_binary_model
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 

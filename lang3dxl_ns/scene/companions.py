@@ -9,6 +9,9 @@ from pathlib import Path, PurePosixPath
 from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded
 
+_LONGEST_NAME = 255
+"""Bytes that file systems allow."""
+
 
 def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
     """The path in `folder` of a file that a model or a list names; sub-folders are allowed.
@@ -19,6 +22,8 @@ def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
     path = folder / name
     if not name or "\0" in name or os.path.isabs(name) or ".." in Path(name).parts:
         raise UserError(f"{name!r} leads out of {folder}: names are relative to that folder, without ..")
+    if any(len(os.fsencode(part)) > _LONGEST_NAME for part in Path(name).parts):
+        raise UserError(f"{name:.40}… is too long for a file's name: {_LONGEST_NAME} bytes at most")
     target = Path(os.path.realpath(path))  # unlike resolve(), accepts links in a circle
     if not follow_links and not target.is_relative_to(os.path.realpath(folder)):
         raise UserError(

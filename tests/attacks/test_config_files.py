@@ -270,3 +270,16 @@ def test_a_run_made_on_windows_opens(tmp_path):
     text = yaml.dump(lang3dxl.config)
     (tmp_path / "config.yml").write_text(text.replace("pathlib.PosixPath", "pathlib.WindowsPath"))
     assert read_config(tmp_path / "config.yml").relative_model_dir == lang3dxl.config.relative_model_dir
+
+
+def test_a_copy_of_a_run_loads_its_own_checkpoint_in_nerfstudios_commands(copy, two_steps, monkeypatch):
+    """As `ns-eval` reads it."""
+    original = two_steps.base_dir
+    config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
+    assert config.get_checkpoint_dir().parent == original
+    monkeypatch.setattr("sys.argv", ["/bin/ns-eval", "--load-config", str(copy / "config.yml")])
+    assert config.get_checkpoint_dir().parent == copy
+    config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
+    assert config.pipeline.datamanager.run == copy
+    monkeypatch.setattr("sys.argv", ["/bin/ns-train", "lang3dxl", "--load-config", str(copy / "config.yml")])
+    assert config.get_base_dir() == original
