@@ -46,7 +46,7 @@ def without(*names: str) -> Callable[[Class], Class]:
     def hide(kind: Class) -> Class:
         hints = get_type_hints(kind, include_extras=True)
         for name in names:
-            kind.__annotations__[name] = tyro.conf.Fixed[hints[name]]
+            kind.__annotations__[name] = tyro.conf.Fixed[hints[name]]  # type: ignore[valid-type, misc]
         return kind
 
     return hide

@@ -100,7 +100,7 @@ def _no_config(path: Path) -> UserError:
 def _differences(settings: Any, place: str = "") -> Iterator[str]:
     """Settings that a file lacks or should not have, by their dotted names."""
     known = {field.name for field in fields(settings)}
-    hints = _hints(type(settings))
+    hints = _hints(type(settings))  # type: ignore[arg-type]
     yield from (f"lacks the setting {place}{name}" for name in sorted(known - set(vars(settings))))
     yield from (f"has the unknown setting {place}{name}" for name in sorted(set(vars(settings)) - known))
     for name in sorted(known):
