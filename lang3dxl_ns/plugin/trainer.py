@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 import shutil
 import signal
 import sys
@@ -16,12 +18,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns import __version__
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
@@ -59,6 +63,29 @@ class _Stopped(BaseException):
     """A signal arrived while words were learned."""
 
 
+@contextmanager
+def _disk_kept_out_of_training() -> Iterator[None]:
+    """Let training continue where its log (tensorboard's events) can't be written, as on a full disk.
+
+    tensorboard's own thread keeps such an error, and raises it in the step that adds to the log.
+    """
+    write = writer.write_out_storage
+
+    def guarded() -> None:
+        try:
+            write()
+        except OSError as error:
+            writer.EVENT_WRITERS[:] = [w for w in writer.EVENT_WRITERS if isinstance(w, writer.LocalWriter)]
+            CONSOLE.log(escape(f"The log can't be written ({error}). Training continues without it."))
+            write()
+
+    writer.write_out_storage = guarded
+    try:
+        yield
+    finally:
+        writer.write_out_storage = write
+
+
 class Lang3DXLTrainer(Trainer):
     """nerfstudio's trainer with atomic checkpoints, a resumed run that ends at the requested iteration, and a
     guard against steps that are not finite."""
@@ -94,8 +121,12 @@ class Lang3DXLTrainer(Trainer):
         of the scene into the run's folder, so that it can be queried without the photos."""
         # nerfstudio turns this on, and photos of many sizes would then be tuned for in nearly every step.
         torch.backends.cudnn.benchmark = False
-        with self.stages.stage("prepare"):
-            self._set_up(test_mode)
+        try:
+            with self.stages.stage("prepare"):
+                self._set_up(test_mode)
+        except UserError:
+            self._forget_folder()
+            raise
 
     def _set_up(self, test_mode: Literal["test", "val", "inference"]) -> None:
         data, self.config.data = self.config.data, None  # otherwise the viewer would write camera paths there
@@ -113,6 +144,15 @@ class Lang3DXLTrainer(Trainer):
         torch.manual_seed(self.config.machine.seed)
         if self._run_state is not None:
             restore_run_state(self.pipeline, self._run_state)
+
+    def _forget_folder(self) -> None:
+        """Remove the folder of a run that could not begin, if it holds nothing but its settings, and the
+        folders above that this leaves empty."""
+        with suppress(OSError):
+            if {path.name for path in self.base_dir.iterdir()} <= {"config.yml"}:
+                (self.base_dir / "config.yml").unlink(missing_ok=True)
+                for folder in (self.base_dir, *self.base_dir.parents[:3]):
+                    folder.rmdir()  # an error ends this at the first that holds something
 
     def _limit_gaussians(self) -> None:
         """Set the cap of densification from the device's memory, and log what training will take."""
@@ -210,7 +250,7 @@ class Lang3DXLTrainer(Trainer):
         try:
             self._announce_time()
             self.stages.begin("train")
-            with self._stoppable():
+            with self._stoppable(), _disk_kept_out_of_training():
                 super().train()
         except PhotosGoneError as error:
             raise UserError(f"{error}. {self._stop_early()}") from error
@@ -330,15 +370,15 @@ class Lang3DXLTrainer(Trainer):
             )
         super()._after_train()  # saves first
 
-    def write_scene(self) -> Path:
+    def write_scene(self) -> None:
         """Write the trained scene as one file into the run's folder, to ask and to share."""
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
         how = f"{self.config.method_name}, {config.encoder.name}, {self.config.max_num_iterations} iterations"
         scene = self.pipeline.model.scene(self.pipeline.scene_file)
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
-        write_scene(path, scene, told)
-        return path
+        size = write_scene(path, scene, told)
+        say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)", *self._next_steps())
 
     def _learn_words(self) -> None:
         # Locked, since the viewer may be learning words too, for a question of a moment ago.
@@ -350,6 +390,12 @@ class Lang3DXLTrainer(Trainer):
                     self.words_are_learned = True
             finally:
                 self._is_learning_words = False
+
+    def _next_steps(self) -> Iterator[str]:
+        run = shlex.quote(os.path.relpath(self.base_dir))
+        yield f"Walk through it: lang3dxl view {run}"
+        if self.pipeline.model.semantic_field is not None:
+            yield f"Ask it:          lang3dxl query {run} --text windows --out found"
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -379,7 +425,8 @@ class Lang3DXLTrainer(Trainer):
             for other in self.checkpoint_dir.glob("*.ckpt"):
                 if other != path:
                     other.unlink()
-        if self._is_ending and self.is_finished:
+        done = self.words_are_learned or not self.pipeline.has_words_to_learn
+        if self._is_ending and not self.interrupted and done:
             self.write_scene()
 
     def _write_checkpoint(self, step: int, path: Path) -> None:
