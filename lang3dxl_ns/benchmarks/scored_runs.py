@@ -90,7 +90,7 @@ class ScoredRuns:
     @cached_property
     def _clip_weights(self) -> str:
         """Fingerprint of the CLIP's weights, so that another version under the same name is noticed."""
-        from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
+        from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 
         clip = self.settings.clip
         return clip if clip == "none" else find_model(clip, CLIP_OPTION).identity

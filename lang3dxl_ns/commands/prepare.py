@@ -29,7 +29,7 @@ class Prepare(PreparationConfig):
     removed photos, or dense features with --dense none)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.encoders import check_encoders, option_prefix
+        from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
         from lang3dxl_ns.preparation.store import FeatureStore
 
         option_prefix.set("--")
@@ -50,7 +50,7 @@ def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | 
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
     from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-    from lang3dxl_ns.preparation.encoders import option_prefix
+    from lang3dxl_ns.preparation.model_files import option_prefix
 
     option_prefix.set("--")
     config = Lang3DXLDataManagerConfig(

@@ -21,7 +21,7 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.saved_config import read_config
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
-from lang3dxl_ns.preparation.encoders import check_encoders
+from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.rendering import gsplat_build
 

@@ -20,14 +20,17 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import (
     CLIP_OPTION,
     DENSE_OPTION,
     DenseEncoder,
     ImageTextEncoder,
+    PatchReading,
     find_model,
     load_dense_encoder,
     load_image_text_encoder,
+    patch_reading,
 )
 from lang3dxl_ns.preparation.physical_scale import crop_sides, fine_crops
 from lang3dxl_ns.preparation.pyramid import HALF, THIRD, build_clip_target, crop_centers
@@ -42,6 +45,8 @@ _CROP_RULE = 4
 """Increased when crops, their encoding or their average change, so that older entries are made again."""
 _CHECKERS = 4
 """Threads that check photos."""
+_PATCHES_PER_CROP = 32
+"""Windows of patch features are encoded this many times fewer at once than crops: they hold more."""
 _PATIENCE_S = 1.0
 """Seconds between checks for photos that another process is making."""
 _BUSY = "another process is making it"
@@ -73,6 +78,8 @@ class _Task:
     has_regions: bool
     is_fine: bool = False
     """Whether the crops are small ones alone, on a finer grid."""
+    grids: tuple[Grid, Grid] | None = None
+    """Of a map of patch features, which then takes the place of crops."""
 
     @property
     def clip_kind(self) -> str:
@@ -144,6 +151,7 @@ def _plan(
 ) -> list[_Task]:
     """A task per photo; unreadable photos go to `left_out`."""
     clip_model = find_model(config.clip, CLIP_OPTION).identity
+    patches = patch_reading(config.clip, config.clip_features)
     dense_model = None if not config.makes_dense else find_model(config.dense, DENSE_OPTION).identity
 
     def plan_one(photo: Photo) -> _Task | UserError:
@@ -155,12 +163,23 @@ def _plan(
         sides, sizes = crop_sides(scales, pixel_size, photo.width)
         if is_fine := photo.name in fine:
             sides, sizes = fine_crops(sides[0], sizes[0])
-        clip = {**source, "encoder": clip_model, "crop_sides": sides, "rule": _CROP_RULE}
+        grids = (
+            None
+            if patches is None
+            else map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
+        )
+        if patches is not None and grids is not None:
+            sides = sorted(math.ceil(photo.width / columns) for _, columns in grids)
+            clip = {**source, "encoder": clip_model, "crop_sides": sides, **_dense_settings(patches, grids)}
+        else:
+            clip = {**source, "encoder": clip_model, "crop_sides": sides, "rule": _CROP_RULE}
         has_dense = dense_model is not None and (is_fine or not fine)
         dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if has_dense else None
         labels = None if regions is None else regions.settings(photo)
         settings = None if labels is None else {**source, **labels}
-        task = _Task(photo, sides, sizes, clip, dense, settings, has_dense, labels is not None, is_fine)
+        task = _Task(
+            photo, sides, sizes, clip, dense, settings, has_dense, labels is not None, is_fine, grids
+        )
         task.drop_current(store)
         return task
 
@@ -177,6 +196,10 @@ def _plan(
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
     return tasks
+
+
+def _dense_settings(patches: PatchReading, grids: tuple[Grid, Grid]) -> dict[str, Any]:
+    return {"patches": patches.recipe, "grids": grids, "rule": RULE}
 
 
 def _source(photo: Photo) -> dict[str, Any]:
@@ -273,7 +296,13 @@ def _encode(
     crop_batch: int,
     store: FeatureStore,
 ) -> None:
-    if task.clip and clip:
+    if task.clip and clip and task.grids:
+        tokens, windows = clip.crop_size // clip.patch_size, max(crop_batch // _PATCHES_PER_CROP, 1)
+        lit = clip.in_known_light(image)
+        features = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
+        tensors = {"features": features, "valid": torch.ones_like(features[..., 0])}
+        store.write(task.clip_kind, task.photo.name, tensors, task.clip)
+    elif task.clip and clip:
         target = build_clip_target(
             clip.in_known_light(image),
             task.sides,
@@ -298,8 +327,12 @@ def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: 
     for task in tasks:
         if task.clip and clip:
             rows, columns = (
-                len(crop_centers(n, min(task.sides), task.steps))
-                for n in (task.photo.height, task.photo.width)
+                task.grids[-1]
+                if task.grids
+                else [
+                    len(crop_centers(n, min(task.sides), task.steps))
+                    for n in (task.photo.height, task.photo.width)
+                ]
             )
             total += 2 * rows * columns * (clip.dim + 1)
         if task.dense and dense:

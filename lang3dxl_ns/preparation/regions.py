@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
-from lang3dxl_ns.preparation.encoders import ModelFiles
+from lang3dxl_ns.preparation.model_files import ModelFiles
 from lang3dxl_ns.preparation.segmentation import AutomaticSam, find_sam
 from lang3dxl_ns.preparation.settings import RegionLevel
 from lang3dxl_ns.scene.companions import companion, named_folder

@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.encoders import ModelFiles, find_model, load_weights, model_type
+from lang3dxl_ns.preparation.model_files import ModelFiles, find_model, load_weights, model_type
 
 TEXT_OPTION = "--pipeline.datamanager.foreground-model"
 SAM_OPTION = "--pipeline.datamanager.sam"

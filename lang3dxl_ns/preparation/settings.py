@@ -12,6 +12,7 @@ from typing import Literal
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.errors import UserError
 
+ClipFeatures = Literal["auto", "crops", "dense"]
 DistanceRule = Literal["median", "mean", "mean-inner"]
 AngleRule = Literal["half", "paper", "exact"]
 RegionLevel = Literal["small", "medium", "large"]
@@ -27,8 +28,12 @@ class PreparationConfig:
     """Settings of the targets."""
 
     clip: str = "openai/clip-vit-base-patch32"
-    """CLIP in Hugging Face format: a name, a folder, or "builtin". Queries need the same one. The paper uses
-    this architecture fine-tuned on landmarks."""
+    """CLIP, SigLIP or another image-text encoder (docs/encoders.md) in Hugging Face format: a name, a folder,
+    or "builtin". Queries need the same one. The paper uses this architecture fine-tuned on landmarks."""
+    clip_features: ClipFeatures = "auto"
+    """What it reads photos as. crops: one vector for each of thousands of crops. dense: a map of patch
+    features in about ten passes. auto: dense if its patches were trained to fit texts (TIPSv2), otherwise
+    crops."""
     dense: str = "auto"
     """Vision transformer whose patch tokens sharpen what crops blur: a name, a folder, or "none" to do
     without. auto: facebook/dinov2-small, or the built-in one with the built-in CLIP."""
@@ -56,7 +61,8 @@ class PreparationConfig:
     ranges), the paper's text ("paper"), or the pinhole's d / f ("exact")."""
     dense_tokens: int = 64
     """Dense tokens per side of a photo, which is squashed to a square. The authors use 128: four times the
-    disk and over four times the time."""
+    disk and over four times the time. Also the fewest patches along a photo's longer side in dense
+    `clip_features`."""
     crop_batch: int = 256
     """Crops encoded at once: more are faster on a GPU, but need more memory."""
     workers: int = 1

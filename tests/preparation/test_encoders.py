@@ -12,13 +12,8 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
 from lang3dxl_ns.preparation import encoders
-from lang3dxl_ns.preparation.encoders import (
-    check_encoders,
-    find_model,
-    load_dense_encoder,
-    load_image_text_encoder,
-    option_prefix,
-)
+from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
+from lang3dxl_ns.preparation.model_files import check_encoders, find_model, option_prefix
 
 TEXTS = ["a rose window", "minaret", "the dome of a mosque, seen from far away in the evening light"]
 
