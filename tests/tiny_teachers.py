@@ -1,4 +1,4 @@
-"""Small random image-text encoders and SAM 3, written as their published checkpoints are: same files, same keys.
+"""Small random image-text encoders and SAM 3, written as their published checkpoints are.
 
 from tiny_teachers import make_tiny_siglip
 """

@@ -41,7 +41,7 @@ from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.viewer.panel import AskPanel
 from lang3dxl_ns.query.answer import Asked
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
-from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
+from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.scene.photo import Photo
@@ -231,7 +231,8 @@ class Lang3DXLPipeline(VanillaPipeline):
         if not scorer.smooths:
             queries = scorer.published_queries.to(self.device)
             published = scorer.named(self.relevancy(camera, queries), size)
-        variants = scorer.variants(raw, keep, TEMPERATURE, published)
+        assert self._engine is not None
+        variants = scorer.variants(raw, keep, self._engine.temperature, published)
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
         evaluated.maps = inside(raw, keep)
         truths = _truths(scorer.truth, photo, map_size(raw))
@@ -245,7 +246,9 @@ class Lang3DXLPipeline(VanillaPipeline):
             encoder, carried = self.model.semantic_field, self.model.carried
             if encoder is None or carried is None:
                 raise UserError(NOT_FINISHED)
-            self._engine = make_engine(encoder, carried.detach())
+            engine = make_engine(encoder, carried.detach())
+            scorer = self.scorer or self._test_scorer
+            self._engine = engine if scorer is None else engine.calibrated(scorer.yardstick.to(self.device))
         _, rendered = self.model.render(camera, self._engine.carried(queries))
         assert rendered is not None
         return self._engine.maps(rendered, queries)

@@ -6,7 +6,7 @@ colors, and let the engine compute maps from the result.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -15,11 +15,25 @@ from torch import Tensor
 
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
-from lang3dxl_ns.query.relevancy import TEMPERATURE, Decode, Queries, relevancy_of_codes
+from lang3dxl_ns.query.relevancy import (
+    TEMPERATURE,
+    Decode,
+    Queries,
+    calibrated,
+    cosines_of_codes,
+    relevancy_of_codes,
+)
+
+_SAMPLE = 4096
+"""Gaussians that a calibration is read from."""
 
 
 class QueryEngine(Protocol):
     """Answers prompts about a scene."""
+
+    @property
+    def temperature(self) -> float:
+        """Of its relevancies, for cosines as they are."""
 
     def carried(self, queries: Queries) -> Float[Tensor, "n d"]:
         """Values that Gaussians must carry in a rendering that answers these prompts."""
@@ -29,6 +43,12 @@ class QueryEngine(Protocol):
 
     def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
         """Relevancy of every Gaussian by itself, 0…1."""
+
+    def calibrated(self, words: Queries) -> QueryEngine:
+        """The same with a temperature that suits the encoder: `relevancy.calibrated`.
+
+        words: a fixed set for all scenes and encoders, `TextEncoder.yardstick`.
+        """
 
 
 @dataclass(frozen=True)
@@ -48,6 +68,10 @@ class PerGaussian:
     def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
         return self.features.relevancy(queries, self.temperature)
 
+    def calibrated(self, words: Queries) -> PerGaussian:
+        cosines = self.features.some(_SAMPLE).cosines(words)
+        return replace(self, temperature=calibrated(self.temperature, cosines))
+
 
 @dataclass(frozen=True)
 class PerPixel:
@@ -65,6 +89,10 @@ class PerPixel:
 
     def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
         return relevancy_of_codes(self.decode, self.codes, queries, temperature=self.temperature)
+
+    def calibrated(self, words: Queries) -> PerPixel:
+        cosines = cosines_of_codes(self.decode, self.codes[:: max(len(self.codes) // _SAMPLE, 1)], words)
+        return replace(self, temperature=calibrated(self.temperature, cosines))
 
 
 @torch.no_grad()

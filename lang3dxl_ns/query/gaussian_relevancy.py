@@ -53,6 +53,12 @@ class GaussianFeatures:
         rows = _in_chunks(decode, carried, encoder.clip_dim)
         return cls(rows, head, (rows != 0).any(1))
 
+    def some(self, count: int) -> GaussianFeatures:
+        """About `count` of the known Gaussians, evenly chosen."""
+        rows = self.rows[self.known]
+        rows = rows[:: max(len(rows) // count, 1)]
+        return GaussianFeatures(rows, self.head, torch.ones_like(rows[:, 0], dtype=torch.bool))
+
     @torch.no_grad()
     def cosines(self, queries: Queries) -> Float[Tensor, "n v"]:
         """Cosine of every Gaussian with every vector; 0 where unknown."""

@@ -333,7 +333,7 @@ class Scene:
     @cached_property
     def engine(self) -> QueryEngine:
         """The query engine; decodes features of all Gaussians at first use."""
-        return self._make_engine()
+        return self._make_engine().calibrated(self.text.yardstick.to(self.device))
 
     @cached_property
     def doubts(self) -> Doubts:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -52,7 +54,7 @@ def test_a_mirrored_photo_has_a_mirrored_map():
 def test_windows_cover_everything_and_overlap(length):
     starts = window_starts(length, TOKENS).tolist()
     assert starts[0] == 0 and starts[-1] + TOKENS == length
-    assert all(0 < after - before < TOKENS for before, after in zip(starts, starts[1:], strict=False))
+    assert all(0 < after - before < TOKENS for before, after in itertools.pairwise(starts))
 
 
 @pytest.mark.parametrize(("height", "width"), [(1000, 1500), (1500, 1000), (480, 480), (100, 3000)])

@@ -1,4 +1,4 @@
-"""Image-text encoders of every family, on models of their real layouts, against transformers' own pipelines."""
+"""Image-text encoders of every family, on models of their real layouts, against transformers itself."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def test_a_siglip_that_sees_one_patch_pools_that_patch(load, name):
 @pytest.mark.parametrize("name", ["clip", "metaclip2", "altclip"])
 @torch.no_grad()
 def test_a_clips_last_block_attends_from_values_to_values(load, folders, name):
-    """Against loops over heads and tokens, on the input that transformers' own forward gives the last block."""
+    """Against loops over heads and tokens, on what transformers' own forward gives the last block."""
     encoder, model = load(name)
     picture = random_picture(1, 3, encoder.crop_size, encoder.crop_size)
     last, seen = model.vision_model.encoder.layers[-1], []

@@ -21,7 +21,7 @@ from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.heat_maps import strongest
 from lang3dxl_ns.query.match import Found
-from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.text import EncodeTexts, Prompt
@@ -99,6 +99,7 @@ class Conversation:
         self._scene_was_learned = False
         self._encode_texts: EncodeTexts | None = None
         self._engine: QueryEngine | None = None
+        self._temperature = TEMPERATURE
         self._engine_codes: Tensor | None = None
         self._asked: Asked | None = None
         self._learned_at: int | None = None
@@ -119,6 +120,7 @@ class Conversation:
         # In the order of `find`: who asks the scene first has to wait for nobody who holds the model.
         with self._making, self._model_to_ourselves() if self._learning() else nullcontext():
             queries, thresholds = scene.queries(everything), scene.thresholds(everything)
+            self._temperature = scene.engine.temperature
         self.seconds.text = time.perf_counter() - start
         self.found = None
         self.question = Question(prompts, foreground, queries, thresholds)
@@ -209,7 +211,8 @@ class Conversation:
         if self._engine is None or codes is not self._engine_codes:
             encoder = self._model.semantic_field
             assert encoder is not None
-            self._engine, self._engine_codes, self._asked = make_engine(encoder, codes.detach()), codes, None
+            self._engine = make_engine(encoder, codes.detach(), self._temperature)
+            self._engine_codes, self._asked = codes, None
         if self._asked is None or self._asked.queries is not question.queries:
             return Asked(self._engine, question.queries, question.confining, thresholds=question.thresholds)
         return self._asked
