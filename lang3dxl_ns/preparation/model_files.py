@@ -120,6 +120,17 @@ def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str
     return model.to(device).eval().requires_grad_(False)
 
 
+def load_processor(processor_class: Any, files: ModelFiles) -> Any:
+    """Preprocessor of a network's images and texts. Raises UserError if its files are missing."""
+    try:
+        return processor_class.from_pretrained(files.folder, local_files_only=True)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise UserError(
+            f"{files.folder} lacks files that preprocess the input of {files.name} ({error}): copy its "
+            "preprocessor_config.json and tokenizer files there, or download the model again"
+        ) from error
+
+
 def model_type(files: ModelFiles) -> str:
     """The model type in its configuration ("clip"). Raises UserError if there is none."""
     return read_config(files).model_type

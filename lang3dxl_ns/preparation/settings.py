@@ -80,8 +80,8 @@ class PreparationConfig:
     foreground_prompts: tuple[str, ...] = ("building",)
     """With "text": the foreground is everything that any of these prompts names."""
     foreground_model: str = "IDEA-Research/grounding-dino-tiny"
-    """Model that finds the prompts: a GroundingDINO, with `sam` for the masks, or a CLIPSeg, lighter and
-    coarser (CIDAS/clipseg-rd64-refined). A name or a folder."""
+    """Model that finds the prompts: a GroundingDINO, with `sam` for the masks; a CLIPSeg, lighter and coarser
+    (CIDAS/clipseg-rd64-refined); or SAM 3, the best (facebook/sam3, gated). A name or a folder."""
 
     @property
     def makes_dense(self) -> bool:
@@ -90,8 +90,11 @@ class PreparationConfig:
 
     regions: str = "auto"
     """Segments inside which features should agree: "auto" (regions/ in the data folder, if there is one),
-    "none", "sam", "felzenszwalb" (needs no weights), or a folder of label maps named like the photos: 16-bit
+    "none", "sam", "felzenszwalb" (needs no weights), "text" (instances of `region_prompts`, found by a SAM 3
+    as `foreground_model`), or a folder of label maps named like the photos: 16-bit
     PNG, 0 = no region, or .npy, negative = no region."""
+    region_prompts: tuple[str, ...] = ("window", "door", "tower", "roof", "column", "statue")
+    """With "text": what regions are instances of."""
     region_level: RegionLevel = "small"
     """Which of SAM's masks a pixel gets where they overlap. Small, as in the paper."""
     sam: str = "facebook/sam-vit-base"

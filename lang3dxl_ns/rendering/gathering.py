@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 Composite = Callable[[nn.Parameter], Float[Tensor, "h w c"]]
@@ -52,6 +52,25 @@ def gather(
     features, mass = sums[:, :-1], sums[:, -1]
     seen = mass > 0
     return torch.where(seen[:, None], features / torch.where(seen, mass, 1.0)[:, None], 0.0), mass
+
+
+def lift_masks(
+    count: int, views: Iterable[tuple[Composite, Bool[Tensor, "h w"]]], like: Tensor
+) -> Float[Tensor, " n"]:
+    """Votes of masks in photos about Gaussians: the share of each Gaussian's visible pixels that lie in the
+    masks, 0…1; 0 for Gaussians never visible. Above 0.5 the majority says that it belongs to what was
+    segmented.
+
+    Args:
+        count: number of Gaussians, n.
+        views: for each, a function that composites values of the Gaussians, and the mask.
+        like: gives number type and device.
+    """
+    pixels = (
+        (composite, torch.stack([mask.to(like), torch.ones_like(mask).to(like)], -1))
+        for composite, mask in views
+    )
+    return gather(count, pixels, 1, like)[0][:, 0]
 
 
 def filled_pixels(composite: Composite, weight: Float[Tensor, "h w"], count: int) -> Float[Tensor, " n"]:
