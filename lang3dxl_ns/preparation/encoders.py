@@ -31,6 +31,8 @@ from lang3dxl_ns.preparation.model_files import (
 )
 
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+_NORMALIZE_THEMSELVES = ("radio",)
+"""Vision transformers that take pictures in 0…1."""
 _VOCABULARIES = (
     ("tokenizer.json",),
     ("vocab.json", "merges.txt"),
@@ -155,10 +157,9 @@ class DenseEncoder:
         self._model = model
         self._side = tokens * model.config.patch_size
         self._device = next(model.parameters()).device
-        self._mean, self._std = (
-            _channels(_IMAGENET_MEAN, self._device),
-            _channels(_IMAGENET_STD, self._device),
-        )
+        own = model.config.model_type in _NORMALIZE_THEMSELVES
+        self._mean = _channels((0.0, 0.0, 0.0) if own else _IMAGENET_MEAN, self._device)
+        self._std = _channels((1.0, 1.0, 1.0) if own else _IMAGENET_STD, self._device)
         # a plain ViT rejects other image sizes by default; DINOv2 always interpolates, without the argument
         interpolates = "interpolate_pos_encoding" in inspect.signature(model.forward).parameters
         self._arguments = {"interpolate_pos_encoding": True} if interpolates else {}
