@@ -295,7 +295,7 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
-        pipeline.relevancy(camera, scorer.queries.to(pipeline.device))
+        pipeline.relevancy(camera, scorer.queries.to(pipeline.device), scorer.yardstick)
         times["render_ms"].append(1000 * (rendered - start))
         times["answer_ms"].append(1000 * (_now() - rendered))
     return {name: median(values) for name, values in times.items()}

@@ -224,13 +224,14 @@ class Lang3DXLPipeline(VanillaPipeline):
         size = scorer.truth.scoring_size(photo.height, photo.width)
         keep = batch["mask"][..., 0] if "mask" in batch else None
         start = perf_counter()
-        raw = scorer.named(self.relevancy(camera, scorer.queries.to(self.device)), size)
+        asked = scorer.queries.to(self.device)
+        raw = scorer.named(self.relevancy(camera, asked, scorer.yardstick), size)
         synchronize()
         evaluated.metrics["query_seconds"] = perf_counter() - start
         published = None
         if not scorer.smooths:
             queries = scorer.published_queries.to(self.device)
-            published = scorer.named(self.relevancy(camera, queries), size)
+            published = scorer.named(self.relevancy(camera, queries, scorer.yardstick), size)
         assert self._engine is not None
         variants = scorer.variants(raw, keep, self._engine.temperature, published)
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
@@ -240,15 +241,14 @@ class Lang3DXLPipeline(VanillaPipeline):
         evaluated.metrics |= bounds(inside(resized(limit(camera), size), keep), truths)
 
     @torch.no_grad()
-    def relevancy(self, camera, queries: Queries) -> Tensor:
-        """Relevancy of every pixel to every prompt [q, h, w]."""
+    def relevancy(self, camera, queries: Queries, yardstick: Queries) -> Tensor:
+        """Relevancy of every pixel to every prompt [q, h, w], calibrated by the words of a yardstick."""
         if self._engine is None:
             encoder, carried = self.model.semantic_field, self.model.carried
             if encoder is None or carried is None:
                 raise UserError(NOT_FINISHED)
-            engine = make_engine(encoder, carried.detach())
-            scorer = self.scorer or self._test_scorer
-            self._engine = engine if scorer is None else engine.calibrated(scorer.yardstick.to(self.device))
+            words = yardstick.to(self.device)
+            self._engine = make_engine(encoder, carried.detach()).calibrated(words)
         _, rendered = self.model.render(camera, self._engine.carried(queries))
         assert rendered is not None
         return self._engine.maps(rendered, queries)
