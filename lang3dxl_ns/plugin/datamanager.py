@@ -212,8 +212,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
-        c = self.config
-        return region_source(c.regions, c.region_level, c.sam, self.data_folder, self.device)
+        return region_source(self.config, self.data_folder, self.device)
 
     @cached_property
     def needs(self) -> list[Need]:

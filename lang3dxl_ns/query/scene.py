@@ -521,7 +521,8 @@ class Scene:
     @cached_property
     def engine(self) -> QueryEngine:
         """The query engine; decodes the features of all Gaussians at first use."""
-        return make_engine(*self._semantics(), self.config.temperature)
+        engine = make_engine(*self._semantics(), self.config.temperature)
+        return engine.calibrated(self.text.yardstick.to(self.device))
 
     @cached_property
     def text(self) -> TextEncoder:

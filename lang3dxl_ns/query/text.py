@@ -17,6 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
+from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 
@@ -164,6 +165,12 @@ class TextEncoder:
             self.vectors(self.config.negatives),
             against=[self._against(text) for text in texts],
         )
+
+    @cached_property
+    def yardstick(self) -> Queries:
+        """The words by which an encoder's cosines are measured, whatever the settings are."""
+        words = self.vectors((*NEGATIVES, *UNRELATED))
+        return Queries(words, (), ())
 
     def _against(self, text: str) -> list[int]:
         return competitors(self.config.negatives, [text, *self.synonyms(text)])
