@@ -25,11 +25,11 @@ def shipped_vocabulary() -> tuple[str, ...]:
 
 
 def common_words() -> tuple[str, ...]:
-    """What a scene file knows without its CLIP: single words of the shipped vocabulary, in the singular and
-    the plural, and the phrases that every query needs."""
-    words = [word for word in shipped_vocabulary() if " " not in word]
-    fixed = (*NEGATIVES, *CANONICAL, *UNRELATED)
-    return tuple(dict.fromkeys([*fixed, *words, *(_plural(word) for word in words)]))
+    """What a scene file knows without its CLIP: the shipped vocabulary, its single words in the plural too,
+    and the phrases that every query needs."""
+    words = shipped_vocabulary()
+    plurals = [_plural(word) for word in words if " " not in word]
+    return tuple(dict.fromkeys([*NEGATIVES, *CANONICAL, *UNRELATED, *words, *plurals]))
 
 
 def _plural(word: str) -> str:
