@@ -34,6 +34,10 @@ BENCHMARKS = {
         "benchmarks.best_views:BestViews",
         "Whether the views that queries choose show the words.",
     ),
+    "teaching": (
+        "benchmarks.teaching:TeachingBenchmark",
+        "Words taught by example, beside the text alone.",
+    ),
     "viewer": ("benchmarks.viewer:ViewerBenchmark", "Viewers in a browser: frames, first picture."),
     "ablation": (
         "benchmarks.ablation:Ablation",
@@ -57,6 +61,8 @@ COMMANDS = {
         "commands.query:Export",
         "Write a scene, or what matches a text, as a splat file or a web page.",
     ),
+    "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
+    "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (
         "demo.landmark.demo_scene:DemoScene",

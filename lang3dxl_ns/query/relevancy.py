@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -23,6 +23,20 @@ _CPU_CHUNK = 8192
 
 
 @dataclass(frozen=True)
+class Probe:
+    """A linear score of features, learned from examples, that joins a prompt's own margin."""
+
+    row: int
+    """Of its direction among the vectors."""
+    length: float
+    """Margin per unit of the cosine with that direction."""
+    bias: float
+    """Margin where the cosine is 0."""
+    text: float
+    """Share of the text's own margin, from 0."""
+
+
+@dataclass(frozen=True)
 class Queries:
     """Several prompts as vectors: each has synonyms, any of which may fit, and phrases to compete with.
 
@@ -35,6 +49,8 @@ class Queries:
     """For every prompt, the rows of its synonyms."""
     negative: tuple[tuple[int, ...], ...]
     """For every prompt, the rows it competes with: canonical phrases and its own negatives."""
+    probes: tuple[Probe | None, ...] = ()
+    """For every prompt, what was learned from examples; empty: nothing for any."""
 
     @classmethod
     def of(
@@ -63,12 +79,32 @@ class Queries:
             rows += len(extra)
         return cls(F.normalize(torch.cat(blocks), dim=-1), tuple(positive), tuple(negative))
 
+    def taught(self, learned: Sequence[tuple[Float[Tensor, " c"], float, float] | None]) -> Queries:
+        """The same prompts, where a learned one has the margin v · feature + bias + text · (its own margin).
+
+        Args:
+            learned: for every prompt v (of any length), bias and text; None for the others.
+        """
+        if not any(learned):
+            return self
+        probes: list[Probe | None] = []
+        rows = [self.vectors]
+        for one in learned:
+            if one is None:
+                probes.append(None)
+                continue
+            vector = one[0].to(self.vectors)
+            length = float(vector.norm())
+            probes.append(Probe(len(self.vectors) + len(rows) - 1, length, one[1], one[2]))
+            rows.append(vector[None] / max(length, 1e-30))
+        return replace(self, vectors=torch.cat(rows), probes=tuple(probes))
+
     def __len__(self) -> int:
         return len(self.positive)
 
     def to(self, device: torch.device | str) -> Queries:
         """The same on another device."""
-        return Queries(self.vectors.to(device), self.positive, self.negative)
+        return replace(self, vectors=self.vectors.to(device))
 
     def cosines(self, features: Float[Tensor, "... c"]) -> Float[Tensor, "... v"]:
         """Cosine of every feature with every vector; 0 for a zero feature."""
@@ -78,11 +114,16 @@ class Queries:
         self, cosines: Float[Tensor, "... v"], temperature: float = TEMPERATURE
     ) -> Float[Tensor, "q ..."]:
         """sigmoid(τ (max over synonyms − max over competitors)), the smallest softmax of the best synonym
-        against each competitor (LERF, Kerr et al. 2023): 0…1, above 0.5 where it wins."""
+        against each competitor (LERF, Kerr et al. 2023): 0…1, above 0.5 where it wins. Prompts learned from
+        examples have the margin of their `Probe`."""
         margins = [
             _largest(cosines, mine) - _largest(cosines, theirs)
             for mine, theirs in zip(self.positive, self.negative, strict=True)
         ]
+        for i, probe in enumerate(self.probes):
+            if probe is not None:
+                learned = probe.length * cosines[..., probe.row] + probe.bias
+                margins[i] = learned + probe.text * margins[i]
         return torch.sigmoid(temperature * torch.stack(margins))
 
 

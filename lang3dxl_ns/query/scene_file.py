@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -35,6 +35,7 @@ from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
+from lang3dxl_ns.query.teach import TaughtWord, words_from_json
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
@@ -106,11 +107,36 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         content |= _stored_state("looks", field)
     masks = {i: _mask_of(photo) for i, photo in enumerate(scene.photos) if photo.mask is not None}
     content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
+    described["words"] = [word.to_json() for word in scene.words.values()]
     file = replace(scene.file, photos=[replace(photo, mask=None) for photo in scene.photos])
     described["scene"] = asdict(replace(file, data=Path(file.data).name))
     data = save(content, {_KEY: json.dumps(described)})
     write_atomically(path, data)
     return len(data)
+
+
+def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
+    """Replace the taught words in a scene file, atomically; nothing else in it changes.
+
+    Args:
+        path: the scene file.
+        words: those that it holds from now on.
+
+    Raises:
+        UserError: as `read_scene`.
+    """
+    with _reported(path):
+        with _opened(path) as file:
+            _description(file)
+        content = path.read_bytes()
+        begin = 8 + int.from_bytes(content[:8], "little")
+        header = json.loads(content[8:begin])
+        described = json.loads(header["__metadata__"][_KEY])
+        described["words"] = [word.to_json() for word in words]
+        header["__metadata__"][_KEY] = json.dumps(described)
+        start = json.dumps(header).encode()
+        start += b" " * (-len(start) % 8)  # tensors stay aligned
+    write_atomically(path, len(start).to_bytes(8, "little") + start + content[begin:])
 
 
 def _splat_tensors(splats: Splats) -> dict[str, Shaped[Array, "..."]]:
@@ -246,6 +272,7 @@ class _Description:
     background: list[float] | None
     decoder: dict[str, Any] | None
     looks: dict[str, Any] | None
+    words: list[TaughtWord]
 
 
 def _read(
@@ -268,7 +295,7 @@ def _read(
     return Scene(
         splats, replace(about.scene, photos=photos), decoder, codes,
         looks=looks, background=background, config=config, encode_texts=encode_texts,
-        cache=path.with_name(f".{path.stem}.visible"),
+        cache=path.with_name(f".{path.stem}.visible"), words=about.words,
     )  # fmt: skip
 
 
@@ -300,6 +327,7 @@ def _description(file: Any) -> _Description:
         background,
         content.get("decoder"),
         content.get("looks"),
+        words_from_json(content.get("words", [])),
     )
 
 
