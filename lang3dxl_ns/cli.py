@@ -29,16 +29,10 @@ BENCHMARKS = {
     "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
-    "queries": ("benchmarks.queries:QueryBenchmark", "From a new text to its picture."),
-    "best-views": (
-        "benchmarks.best_views:BestViews",
-        "Whether the views that queries choose show the words.",
-    ),
     "teaching": (
         "benchmarks.teaching:TeachingBenchmark",
         "Words taught by example, beside the text alone.",
     ),
-    "viewer": ("benchmarks.viewer:ViewerBenchmark", "Viewers in a browser: frames, first picture."),
     "ablation": (
         "benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",
@@ -63,6 +57,7 @@ COMMANDS = {
     ),
     "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
     "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
+    "info": ("commands.info:Info", "Tell what a scene file holds, and where it comes from."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (
         "demo.landmark.demo_scene:DemoScene",
