@@ -43,8 +43,8 @@ class TeachingBenchmark:
     """Teach every labeled word by clicks, boxes and outlines drawn from its labels, and score its maps in the
     labeled photos that are not marked, beside the text alone."""
 
-    run: tyro.conf.Positional[Path | None] = None
-    """A .scene file, or the folder of a run (default: the newest under outputs/)."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
     ground_truth: Path
     """Folder of the scene's labels, in any layout of docs/evaluation.md."""
     out: Path
@@ -60,9 +60,9 @@ class TeachingBenchmark:
 
     def main(self) -> None:
         """Measure and write the report."""
-        from lang3dxl_ns.commands.teach import open_taught
+        from lang3dxl_ns.open_scene import load_scene
 
-        scene = open_taught(self.run)[0].with_words(())
+        scene = load_scene(self.scene).with_words(())
         truth = GroundTruth(self.ground_truth)
         figures: dict[str, dict[str, dict[str, float]]] = {}
         with progress_bar() as bar:
@@ -218,8 +218,8 @@ def report(
 
     {command}
 
-{machine}. Average precision / IoU at 0.5 in the labeled photos that are not marked; clicks are means of random
-draws inside the label. A click takes {1e3 * seconds:.0f} ms.
+{machine}. Average precision / IoU at 0.5 in the labeled photos that are not marked; clicks are means of
+random draws inside the label. A click takes {1e3 * seconds:.0f} ms.
 
 {markdown_table(("marked", "mean", *words), lines)}
 """

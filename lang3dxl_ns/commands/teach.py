@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,9 +16,6 @@ if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene
     from lang3dxl_ns.query.teach import Example, TaughtWord
 
-WORDS_FILE = "lang3dxl_words.json"
-"""Taught words in a run's folder, beside config.yml."""
-
 
 @dataclass(kw_only=True)
 class Teach:
@@ -29,8 +25,8 @@ class Teach:
     lists them and takes them back. `query`, `export` and the viewer then find the word everywhere.
     """
 
-    run: tyro.conf.Positional[Path | None] = None
-    """A .scene file, or the folder of a run, or its config.yml (default: the newest under outputs/)."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
     word: str
     """The word to teach."""
     photo: str
@@ -45,15 +41,16 @@ class Teach:
     """A point on something else: X,Y; repeat the flag."""
 
     def main(self) -> None:
+        from lang3dxl_ns.query.scene_file import keep_words
         from lang3dxl_ns.query.teach import known_word
 
-        scene, place = open_taught(self.run)
+        scene, file = opened(self.scene)
         example = self._example()
         before = scene.words.get(known_word(self.word))
         examples = [*(before.examples if before else ()), example]
         taught = scene.teach(self.word, examples)
         word = taught.words[known_word(self.word)]
-        keep(place, list(taught.words.values()))
+        keep_words(file, taught.words.values())
         say(*described(word))
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
 
@@ -73,8 +70,8 @@ class Teach:
 class Words:
     """List the words that a scene was taught; take them back; carry them to other scenes of the same CLIP."""
 
-    run: tyro.conf.Positional[Path | None] = None
-    """A .scene file, or the folder of a run, or its config.yml (default: the newest under outputs/)."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
     forget: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """A word to forget, or one of its examples: doors, or doors/2 for its second example."""
     save: Path | None = None
@@ -83,9 +80,10 @@ class Words:
     """Add the words from this file. What was learned in one scene often fails in another: check them."""
 
     def main(self) -> None:
+        from lang3dxl_ns.query.scene_file import keep_words
         from lang3dxl_ns.query.teach import load_words, save_words
 
-        scene, place = open_taught(self.run)
+        scene, file = opened(self.scene)
         for name in self.forget:
             scene = forgotten(scene, name)
         if self.load is not None:
@@ -93,7 +91,7 @@ class Words:
                 scene = carried(scene, word)
         words = list(scene.words.values())
         if self.forget or self.load is not None:
-            keep(place, words)
+            keep_words(file, words)
         if self.save is not None:
             if not words:
                 raise UserError("there is no word to save: teach one with lang3dxl teach")
@@ -118,27 +116,21 @@ def carried(scene: Scene, word: TaughtWord) -> Scene:
     return scene.with_words([*scene.words.values(), replace(word, examples=(), precision={})])
 
 
-def open_taught(run: Path | None) -> tuple[Scene, Path]:
-    """A scene with its taught words, and the file that keeps them: the scene's own, or one beside a run."""
-    if run is not None and run.suffix == ".scene":
-        from lang3dxl_ns.query.scene_file import read_scene
+def opened(path: Path | None) -> tuple[Scene, Path]:
+    """A scene, and the file that keeps its words.
 
-        return read_scene(run), run
-    from lang3dxl_ns.plugin.load_scene import load_scene
-    from lang3dxl_ns.query.find_run import find_config
-    from lang3dxl_ns.query.teach import load_words
+    Raises:
+        UserError: there is no scene file.
+    """
+    from lang3dxl_ns.open_scene import find_scene_file
+    from lang3dxl_ns.query.scene_file import read_scene
 
-    place = find_config(run).parent / WORDS_FILE
-    scene = load_scene(run)
-    return (scene.with_words(load_words(place)) if place.is_file() else scene), place
-
-
-def keep(place: Path, words: Sequence[TaughtWord]) -> None:
-    """Write the words of a scene to where `open_taught` finds them."""
-    from lang3dxl_ns.query.scene_file import keep_words
-    from lang3dxl_ns.query.teach import save_words
-
-    (keep_words if place.suffix == ".scene" else save_words)(place, words)
+    file = find_scene_file(path)
+    if file is None:
+        raise UserError(
+            "this run has no file to keep words in: write one with lang3dxl export --scene-file NAME.scene"
+        )
+    return read_scene(file), file
 
 
 def forgotten(scene: Scene, which: str) -> Scene:

@@ -1,4 +1,4 @@
-"""Labels in COCO's format: run lengths of masks, and a file of all matches in all photos."""
+"""Labels in COCO's format, and run lengths of masks."""
 
 from __future__ import annotations
 
@@ -31,30 +31,42 @@ def mask_of(lengths: Sequence[int], size: tuple[int, int]) -> Bool[Array, "h w"]
     return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(size, order="F")
 
 
-def coco_labels(
-    photos: Iterable[tuple[str, Sequence[Bool[Array, "h w"]]]], categories: Sequence[str]
-) -> dict[str, Any]:
-    """A COCO data set with an annotation for each connected part of each mask.
+class CocoLabels:
+    """A data set in COCO's format, with an annotation for each connected part of each mask.
 
     Args:
-        photos: names, and a mask per category at the size of the photo's file.
-        categories: names of the categories.
+        categories: their names.
     """
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
-    for name, masks in photos:
+
+    def __init__(self, categories: Sequence[str]) -> None:
+        self._images: list[dict[str, Any]] = []
+        self._annotations: list[dict[str, Any]] = []
+        self._categories = [{"id": i, "name": name} for i, name in enumerate(categories, start=1)]
+
+    def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
+        """Add a photo.
+
+        Args:
+            photo: its name.
+            masks: one per category, at the size of the photo's file.
+        """
         height, width = masks[0].shape
-        images.append({"id": len(images) + 1, "file_name": name, "width": width, "height": height})
+        image = {"id": len(self._images) + 1, "file_name": photo, "width": width, "height": height}
+        self._images.append(image)
         for category, mask in enumerate(masks, start=1):
             for part in _parts(mask):
-                number = {"id": len(annotations) + 1, "image_id": len(images), "category_id": category}
-                annotations.append(number | _annotation(part))
-    return {
-        "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
-        "images": images,
-        "annotations": annotations,
-        "categories": [{"id": i, "name": name} for i, name in enumerate(categories, start=1)],
-    }
+                number = {"id": len(self._annotations) + 1, "image_id": image["id"], "category_id": category}
+                self._annotations.append(number | _annotation(part))
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The file's content."""
+        return {
+            "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
+            "images": self._images,
+            "annotations": self._annotations,
+            "categories": self._categories,
+        }
 
 
 def _parts(mask: Bool[Array, "h w"]) -> Iterable[Bool[Array, "h w"]]:

@@ -34,6 +34,10 @@ class QueryEngine(Protocol):
     def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
         """Unit CLIP features of some Gaussians; 0 for those visible in no photo."""
 
+    @property
+    def head(self) -> Float[Tensor, "r c"] | None:
+        """Vectors that all features are combinations of, if they are fewer than CLIP's channels."""
+
 
 @dataclass(frozen=True)
 class PerGaussian:
@@ -55,6 +59,10 @@ class PerGaussian:
     def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
         return self.decoded.features(rows)
 
+    @property
+    def head(self) -> Float[Tensor, "r c"] | None:
+        return self.decoded.head
+
 
 @dataclass(frozen=True)
 class PerPixel:
@@ -63,6 +71,7 @@ class PerPixel:
     decode: Decode
     codes: Float[Tensor, "n d"]
     temperature: float = TEMPERATURE
+    head = None
 
     def channels(self, queries: Queries) -> Float[Tensor, "n d"]:
         return self.codes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 import torch.nn.functional as F
@@ -20,6 +21,22 @@ Decode = Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]]
 """Codes to raw CLIP features: `SemanticField.decode_clip`."""
 _CPU_CHUNK = 8192
 """Codes decoded at a time on a CPU."""
+
+
+class Learned(Protocol):
+    """A word learned from examples: a linear score of unit features, and a share of its text."""
+
+    @property
+    def vector(self) -> Float[Tensor, " c"]:
+        """Of any length."""
+
+    @property
+    def bias(self) -> float:
+        """Margin of a feature that is orthogonal to the vector."""
+
+    @property
+    def text(self) -> float:
+        """Weight of the text's own margin, from 0."""
 
 
 @dataclass(frozen=True)
@@ -79,24 +96,21 @@ class Queries:
             rows += len(extra)
         return cls(F.normalize(torch.cat(blocks), dim=-1), tuple(positive), tuple(negative))
 
-    def taught(self, learned: Sequence[tuple[Float[Tensor, " c"], float, float] | None]) -> Queries:
-        """The same prompts, where a learned one has the margin v · feature + bias + text · (its own margin).
+    def taught(self, words: Sequence[Learned | None]) -> Queries:
+        """The same prompts; those with a learned word have the margin vector · feature + bias + text · (their
+        own margin).
 
         Args:
-            learned: for every prompt v (of any length), bias and text; None for the others.
+            words: one per prompt; None for prompts of texts alone.
         """
-        if not any(learned):
-            return self
-        probes: list[Probe | None] = []
-        rows = [self.vectors]
-        for one in learned:
-            if one is None:
-                probes.append(None)
-                continue
-            vector = one[0].to(self.vectors)
-            length = float(vector.norm())
-            probes.append(Probe(len(self.vectors) + len(rows) - 1, length, one[1], one[2]))
-            rows.append(vector[None] / max(length, 1e-30))
+        rows, probes = [self.vectors], list[Probe | None]()
+        for word in words:
+            probe = None
+            if word is not None:
+                vector = word.vector.to(self.vectors)
+                probe = Probe(len(self.vectors) + len(rows) - 1, float(vector.norm()), word.bias, word.text)
+                rows.append(F.normalize(vector, dim=0)[None])
+            probes.append(probe)
         return replace(self, vectors=torch.cat(rows), probes=tuple(probes))
 
     def __len__(self) -> int:

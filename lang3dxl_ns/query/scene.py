@@ -466,7 +466,7 @@ class Scene:
             return queries.relevancy_of_cosines(queries.cosines(features), 1.0)[0].logit()
 
         weights = [self._marked(example) for example in listed]
-        learned = learn(prompt.text, listed, weights, self.engine.features, margin)
+        learned = learn(prompt.text, listed, weights, self.engine.features, margin, self.engine.head)
         learned = replace(learned, clip=self.file.clip_identity, scene=Path(self.file.data).name)
         return self.with_words([*self.words.values(), learned])
 
@@ -503,7 +503,7 @@ class Scene:
         drawn = partial(composite, self.splats, camera, backend=self.backend)
         views = [(drawn, pixels.to(self.device))]
         shares, mass = gather(len(self.splats), views, 2, self.splats.means)
-        return Weights(shares[:, 0] * mass, shares[:, 1] * mass, mass, example.complete)
+        return Weights(shares[:, 0] * mass, shares[:, 1] * mass, mass)
 
     def _with_taught(self, prompt: Prompt) -> Prompt:
         taught = self.words.get(known_word(prompt.text))

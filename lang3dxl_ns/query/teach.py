@@ -39,10 +39,12 @@ _ROWS = 20_000
 """Gaussians that a word is fitted to, at most; more are sampled by their weight."""
 _AXES = 64
 """Principal components of the scene's features that a word is fitted in."""
-_RIDGE = 0.01
-"""Penalty of the squared coefficients, per standardized component."""
-_FLOOR = 1e-3
-_WHITENING = 0.25
+_OUTLINE, _BOX = 100, 30
+"""Clicks that an outline and a box are worth."""
+_TRUST = 3
+"""Clicks that the belief in a word's text is worth before anything is marked."""
+_LEAST_SPREAD = 1e-3
+"""Spread of a coordinate that takes part, relative to the largest."""
 _TYPICAL = 4096
 """Gaussians, evenly spaced, that the components are taken from."""
 _STEPS = 20
@@ -81,6 +83,12 @@ class Example:
             raise UserError(f"{self.photo} has a mask and a box: give one of them")
         if self.mask is not None and (np.ndim(self.mask) != 2 or not np.any(self.mask)):
             raise UserError(f"the mask of {self.photo} is empty: mark the word in white")
+
+    @property
+    def evidence(self) -> int:
+        """How many clicks the marks are worth."""
+        points = len(self.points) + len(self.not_points)
+        return points + (_OUTLINE if self.mask is not None else _BOX if self.box is not None else 0)
 
     @property
     def complete(self) -> bool:
@@ -202,8 +210,6 @@ class Weights:
     """Of those marked as something else."""
     seen: Float[Tensor, " n"]
     """Of all."""
-    complete: bool
-    """Whether everything that is the word in the photo is marked."""
 
     def check(self, photo: str, word: str) -> None:
         """Raises UserError where the marks show nothing, or everything."""
@@ -312,6 +318,7 @@ class _Photo:
     """Of what is not; sums to about 1."""
     share: float
     """Of the photo that is marked as the word."""
+    evidence: int
     complete: bool
 
 
@@ -321,6 +328,7 @@ def learn(
     weights: Sequence[Weights],
     features: Callable[[Int[Tensor, " m"]], Float[Tensor, "m c"]],
     margin: Callable[[Float[Tensor, "m c"]], Float[Tensor, " m"]],
+    head: Float[Tensor, "k c"] | None = None,
 ) -> TaughtWord:
     """The word that examples teach; their order doesn't matter.
 
@@ -330,6 +338,7 @@ def learn(
         weights: what they show, one per example.
         features: unit CLIP features of some Gaussians, by their indices; 0 where unknown.
         margin: of the word's text, for unit features: cosine minus that of the best competitor.
+        head: vectors that all features are combinations of, if they are few.
 
     Raises:
         UserError: there is no example, or the marks show nothing, or everything.
@@ -338,11 +347,11 @@ def learn(
         raise UserError(f"there is no example of {name!r}: mark it in a photo")
     for example, one in zip(examples, weights, strict=True):
         one.check(example.photo, name)
-    rows, photos = _sampled([example.photo for example in examples], weights)
+    rows, photos = _sampled(examples, weights)
     sample = features(rows).double()
     text = margin(sample.float()).double()
     everywhere = features(torch.linspace(0, len(weights[0].seen) - 1, _TYPICAL).long().to(rows.device))
-    axes = _Axes.of(everywhere.double())
+    axes = _Axes.of(everywhere.double(), head)
     word = _fitted(name, sample, text, axes, photos)
     if len(photos) > 1:  # each photo judged by what the others teach
         others = [_fitted(name, sample, text, axes, photos[:i] + photos[i + 1 :]) for i in range(len(photos))]
@@ -356,18 +365,21 @@ def learn(
     return replace(word, doubt=doubt, precision=precision, examples=tuple(examples))
 
 
-def _sampled(names: Sequence[str], weights: Sequence[Weights]) -> tuple[Int[Tensor, " m"], list[_Photo]]:
+def _sampled(
+    examples: Sequence[Example], weights: Sequence[Weights]
+) -> tuple[Int[Tensor, " m"], list[_Photo]]:
     """Gaussians to fit, and their weights in every photo: evenly spaced ones of those that are the word, then
     of those that are not (a Gaussian at an edge may be both)."""
     words = [one.word.double() / one.word.double().sum() for one in weights]
     rests = [_rest(one) for one in weights]
     first, second = (_spaced(sum(parts, torch.zeros_like(parts[0]))) for parts in (words, rests))
     photos = []
-    for name, one, word, rest in zip(names, weights, words, rests, strict=True):
+    for example, one, word, rest in zip(examples, weights, words, rests, strict=True):
         share = float(one.word.sum() / one.seen.sum())
         word = torch.cat([word[first], torch.zeros_like(word[second])])
         rest = torch.cat([torch.zeros_like(rest[first]), rest[second]])
-        photos.append(_Photo(name, word / word.sum(), rest / rest.sum(), share, one.complete))
+        kind = (share, example.evidence, example.complete)
+        photos.append(_Photo(example.photo, word / word.sum(), rest / rest.sum(), *kind))
     return torch.cat([first, second]), photos
 
 
@@ -385,21 +397,22 @@ def _spaced(weight: Float[Tensor, " n"]) -> Int[Tensor, " m"]:
 
 @dataclass(frozen=True)
 class _Axes:
-    """Principal components of a scene's features, scaled."""
+    """Standardized coordinates of features."""
 
     middle: Float[Tensor, " c"]
     matrix: Float[Tensor, "c k"]
 
     @classmethod
-    def of(cls, features: Float[Tensor, "n c"]) -> _Axes:
-        """Components of the known features."""
+    def of(cls, features: Float[Tensor, "n c"], head: Float[Tensor, "k c"] | None) -> _Axes:
+        """From features of a scene, and the rows that all of them are made of; None: principal components."""
         known = features[features.abs().sum(1) > 0]
         middle = known.mean(0)
-        values, axes = torch.linalg.eigh((known - middle).T @ (known - middle) / len(known))
-        values, axes = values.flip(0)[:_AXES].clamp_min(0), axes.flip(1)[:, :_AXES]
-        scale = (values + _FLOOR * values[0]).clamp_min(1e-12) ** -_WHITENING
-        spread = (values * scale.square()).mean().sqrt()
-        return cls(middle, axes * scale / spread)
+        if head is None:
+            axes = torch.linalg.eigh((known - middle).T @ (known - middle)).eigenvectors[:, -_AXES:]
+        else:
+            axes = torch.linalg.pinv(head.to(known))
+        spread = ((known - middle) @ axes).square().mean(0).sqrt()
+        return cls(middle, axes * torch.where(spread > _LEAST_SPREAD * spread.max(), 1 / spread, 0.0))
 
     def places(self, features: Float[Tensor, "m c"]) -> Float[Tensor, "m k"]:
         """Coordinates of features."""
@@ -415,36 +428,38 @@ def _fitted(
 ) -> TaughtWord:
     word = sum((photo.word for photo in photos), torch.zeros_like(text)) / len(photos)
     rest = sum((photo.rest for photo in photos), torch.zeros_like(text)) / len(photos)
-    slope, bias = _logistic(axes.places(sample), word, rest)
+    evidence = sum(photo.evidence for photo in photos)
+    slope, bias = _logistic(axes.places(sample), word, rest, 1 / evidence)
     vector = axes.matrix @ slope / TEMPERATURE
     bias = bias / TEMPERATURE - float(axes.middle @ vector)
-    known = max(2 * _separation(text, word, rest) - 1, 0.0) ** 2
+    separated = max(2 * _separation(text, word, rest) - 1, 0.0)
+    known = (evidence * separated + _TRUST) / (evidence + _TRUST)
     taught = TaughtWord(name, vector.float(), bias, known, 0.5)
     return replace(taught, bias=bias - _level(taught.margins(sample, text), photos))
 
 
 def _logistic(
-    places: Float[Tensor, "m k"], word: Float[Tensor, " m"], rest: Float[Tensor, " m"]
+    places: Float[Tensor, "m k"], word: Float[Tensor, " m"], rest: Float[Tensor, " m"], ridge: float
 ) -> tuple[Float[Tensor, " k"], float]:
     """Slope and bias of a logistic regression with both classes weighing the same, by Newton's method:
-    minimizes ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ `_RIDGE` |slope|²."""
+    minimizes ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
     inputs = F.pad(places, (0, 1), value=1.0)
     word, rest = word / 2, rest / 2
-    ridge = torch.full_like(inputs[0], _RIDGE)
-    ridge[-1] = 1e-9
-    solution = torch.zeros_like(ridge)
+    penalty = torch.full_like(inputs[0], ridge)
+    penalty[-1] = 1e-9
+    solution = torch.zeros_like(penalty)
 
     def loss(solution: Float[Tensor, " k"]) -> float:
         score = inputs @ solution
         fit = word @ F.softplus(-score) + rest @ F.softplus(score)
-        return float(fit + 0.5 * ridge @ solution.square())
+        return float(fit + 0.5 * penalty @ solution.square())
 
     least = loss(solution)
     for _ in range(_STEPS):
         chance = (inputs @ solution).sigmoid()
-        slope = inputs.T @ ((word + rest) * chance - word) + ridge * solution
+        slope = inputs.T @ ((word + rest) * chance - word) + penalty * solution
         curvature = (inputs * ((word + rest) * chance * (1 - chance))[:, None]).T @ inputs
-        step = torch.linalg.solve(curvature + ridge.diag(), slope)
+        step = torch.linalg.solve(curvature + penalty.diag(), slope)
         size = 1.0
         while size > 1e-3 and loss(solution - size * step) > least:
             size /= 2

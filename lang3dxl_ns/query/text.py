@@ -157,7 +157,7 @@ class TextEncoder:
             self.vectors(self.config.negatives),
             [self.vectors(prompt.negatives) for prompt in prompts],
             [self._against(prompt.text) for prompt in prompts],
-        ).taught([p.taught and (p.taught.vector, p.taught.bias, p.taught.text) for p in prompts])
+        ).taught([prompt.taught for prompt in prompts])
 
     def plain_queries(self, texts: Sequence[str]) -> Queries:
         """Vectors of texts without synonyms, against the negatives."""

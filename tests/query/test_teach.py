@@ -198,7 +198,7 @@ def test_the_fit_is_where_its_loss_has_no_slope():
     word, rest = (torch.rand(200, generator=generator, dtype=torch.float64) for _ in range(2))
     word, rest = word * (places[:, 0] > 0) / 60, rest / 100
     word, rest = word / word.sum(), rest / rest.sum()
-    slope, bias = _logistic(places, word, rest)
+    slope, bias = _logistic(places, word, rest, 0.01)
     slope.requires_grad_()
     shift = torch.tensor(bias, dtype=torch.float64, requires_grad=True)
     score = places @ slope + shift
