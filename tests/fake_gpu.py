@@ -24,7 +24,7 @@ import transformers
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
-from lang3dxl_ns.rendering.compositing import Compositing
+from lang3dxl_ns.rendering.torch_rasterizer import Compositing
 
 aten = torch.ops.aten
 CUDA = torch.device("cuda", 0)

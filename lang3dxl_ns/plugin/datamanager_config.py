@@ -26,9 +26,9 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     cache_dir: Path | None = None
     """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
     cache_gb: float | None = None
-    """Memory for decoded photos and their targets, in gigabytes; least recently used ones are evicted.
-    Default: a quarter of the machine's memory."""
-    read_ahead: int = 4
+    """Memory for decoded photos and their targets, in gigabytes: the first that fit are kept, the others read
+    ahead of their use. Default: a quarter of the machine's memory."""
+    read_ahead: int = 16
     """Photos read ahead of the training step, in addition to that memory."""
     targets_in_steps: tyro.conf.Suppress[bool] = True
     """Whether training steps learn from the targets; settled with the encoder."""

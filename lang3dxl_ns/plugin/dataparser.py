@@ -20,7 +20,7 @@ from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
-from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.photo import Photo, upright_in_model
 from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
@@ -194,12 +194,14 @@ class PhotoCollectionDataParser(ColmapDataParser):
         """The model's usable photos; logs which are left out, and why."""
         reconstruction = read_reconstruction(self.config.data / self.config.colmap_path)
         left_out: dict[str, UserError] = {}
+        kept: dict[str, TrackedPhoto] = {}
         for name, tracked in reconstruction.photos.items():
             path = self._image_path(name)
             try:
                 if not inside(self._images_folder, name, self.config.follow_links).is_file():
                     raise UserError(f"there is no {path}")
-                self.photos[path] = Photo.from_model(tracked, path, self._mask_path(name))
+                kept[name] = upright_in_model(tracked, path)
+                self.photos[path] = Photo.from_model(kept[name], path, self._mask_path(name))
             except UserError as reason:
                 left_out[name] = reason
         self._left_out = left_out
@@ -218,7 +220,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
             CONSOLE.log(f"[yellow]{len(left_out)} photos of the model are left out:[/yellow]")
             for name, why in left_out.items():
                 CONSOLE.log(f"  {escape(printable(f'{name}: {why}'))}")
-        kept = {name: g for name, g in reconstruction.photos.items() if name not in left_out}
+        kept = {name: tracked for name, tracked in kept.items() if name not in left_out}
         self.reconstruction = replace(reconstruction, photos=kept)
 
     def _mask_path(self, name: str) -> Path | None:

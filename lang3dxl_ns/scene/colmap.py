@@ -38,6 +38,8 @@ class TrackedPhoto:
     """World units."""
     pixels: Float[Array, "n 2"]
     """Positions of the points in the (distorted) photo."""
+    quarter_turns: int = 0
+    """Clockwise, from the file's pixels as stored to this photo's."""
 
     @property
     def width(self) -> int:

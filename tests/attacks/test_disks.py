@@ -72,7 +72,7 @@ def test_a_run_that_can_not_be_written_to_answers(run, monkeypatch, number):
     monkeypatch.setattr(files.os, "replace", refuse(number))
     scene = load_scene(run / "config.yml")
     assert np.isfinite(scene.query("dome", "photo_000").relevancy).all()
-    assert len(scene.find("dome")) == 1
+    assert scene.find("dome").relevancy.any()
     assert not list(run.glob("*.tmp"))
 
 

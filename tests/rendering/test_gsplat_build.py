@@ -55,7 +55,7 @@ def fake_compiler(monkeypatch):
     return install
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(TOOLKIT is None, reason="needs pip install 'lang3dxl-ns[cuda]'")
 def test_cub_is_compiled_linked_and_loaded(tiny, tmp_path):
     """About 20 seconds of processor time."""
