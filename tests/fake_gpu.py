@@ -359,6 +359,18 @@ def fake_gpu(memory: int = MEMORY, capability: tuple[int, int] = (8, 9)) -> Iter
         yield Gpu()
 
 
+class RealGpu(Gpu):
+    """This machine's own, which does not tell what the host waits for."""
+
+    syncs = property(lambda self: {})  # type: ignore[assignment]
+
+
+@contextlib.contextmanager
+def real_gpu(**_: Any) -> Iterator[Gpu]:
+    """This machine's GPU."""
+    yield RealGpu()
+
+
 def _cuda(memory: int, capability: tuple[int, int]) -> dict[str, Any]:
     """Names of torch.cuda, and what they are on this GPU."""
     major, minor = capability

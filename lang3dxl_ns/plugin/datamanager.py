@@ -30,7 +30,7 @@ from lang3dxl_ns.plugin.data_folder import parser_for
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.handover import Batch, SceneFacts
-from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
+from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
@@ -56,6 +56,8 @@ class PhotosGoneError(UserError):
     """Too many photos have vanished during training to continue."""
 
 
+_WORTH_TELLING = 1e8
+"""Bytes of photos and targets from which their memory is announced."""
 MOST_GONE = 0.1
 """Share of the training photos that may vanish."""
 
@@ -82,8 +84,9 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if hasattr(config.dataparser, "load_3D_points"):
             config.dataparser.load_3D_points = True  # off by default in nerfstudio-data
         try:
+            check_transforms(config.dataparser)
             super().__init__(config, *args, **kwargs)
-        except (UserError, OSError) as reason:
+        except (UserError, FileNotFoundError) as reason:
             recorded = recorded_scene(config.run)
             if recorded is None or kwargs.get("test_mode", "val") == "val":
                 raise
@@ -141,7 +144,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
             facts.clip_targets = partial(self.targets.clip_features, names)
             if self.targets.dense_dim:
                 facts.dense_targets = partial(self.targets.dense_features, names)
-        _log(self._memory_budget())
+        if budget := self._memory_budget():
+            _log(budget)
 
     @cached_property
     def targets(self) -> TargetReader | None:
@@ -208,8 +212,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
-        c = self.config
-        return region_source(c.regions, c.region_level, c.sam, self.data_folder, self.device)
+        return region_source(self.config, self.data_folder, self.device)
 
     @cached_property
     def needs(self) -> list[Need]:
@@ -271,12 +274,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return machine_memory() / 4 if gigabytes is None else gigabytes * 1e9
 
     def _memory_budget(self) -> str:
-        """Memory that training uses for photos, estimated from the first one's targets."""
+        """Memory for photos in training, estimated from the first one's targets; "" if it is little."""
         photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
         total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
         if self.targets is not None and self.config.targets_in_steps:
             total += len(photos) * self.targets.bytes_of(self.targets.names[0])
         held = min(total, self.cache_bytes)
+        if total < _WORTH_TELLING:
+            return ""
         return (
             f"memory: at most {held / 1e9:.2f} GB of photos and targets at a time (of "
             f"{total / 1e9:.2f} GB in {len(photos)} photos), {self.config.read_ahead} photos read ahead "

@@ -467,7 +467,10 @@ class Scene:
             return queries.relevancy_of_cosines(queries.cosines(features), 1.0)[0].logit()
 
         weights = [self._marked(example) for example in listed]
-        learned = learn(prompt.text, listed, weights, self.engine.features, margin, self.engine.head)
+        engine = self.engine
+        learned = learn(
+            prompt.text, listed, weights, engine.features, margin, engine.head, engine.temperature
+        )
         learned = replace(learned, clip=self.file.clip_identity, scene=Path(self.file.data).name)
         return self.with_words([*self.words.values(), learned])
 
@@ -596,7 +599,8 @@ class Scene:
     @cached_property
     def engine(self) -> QueryEngine:
         """The query engine; decodes the features of all Gaussians at first use."""
-        return make_engine(*self._semantics(), self.config.temperature)
+        engine = make_engine(*self._semantics(), self.config.temperature)
+        return engine.calibrated(self.text.yardstick.to(self.device))
 
     @cached_property
     def text(self) -> TextEncoder:

@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -228,7 +229,7 @@ class TaughtWord:
     """A word learned from examples, in the space of a CLIP.
 
     A unit feature f has the margin `vector` · f + `bias` + `text` · (margin of the word's text). The
-    relevancy is sigmoid(10 · margin), above 0.5 where the word is.
+    relevancy is sigmoid(temperature · margin), above 0.5 where the word is.
     """
 
     name: str
@@ -329,6 +330,7 @@ def learn(
     features: Callable[[Int[Tensor, " m"]], Float[Tensor, "m c"]],
     margin: Callable[[Float[Tensor, "m c"]], Float[Tensor, " m"]],
     head: Float[Tensor, "k c"] | None = None,
+    temperature: float = TEMPERATURE,
 ) -> TaughtWord:
     """The word that examples teach; their order doesn't matter.
 
@@ -339,6 +341,7 @@ def learn(
         features: unit CLIP features of some Gaussians, by their indices; 0 where unknown.
         margin: of the word's text, for unit features: cosine minus that of the best competitor.
         head: vectors that all features are combinations of, if they are few.
+        temperature: of the scene's relevancies.
 
     Raises:
         UserError: there is no example, or the marks show nothing, or everything.
@@ -352,9 +355,10 @@ def learn(
     text = margin(sample.float()).double()
     everywhere = features(torch.linspace(0, len(weights[0].seen) - 1, _TYPICAL).long().to(rows.device))
     axes = _Axes.of(everywhere.double(), head)
-    word = _fitted(name, sample, text, axes, photos)
+    fit = partial(_fitted, name, sample, text, axes, temperature)
+    word = fit(photos)
     if len(photos) > 1:  # each photo judged by what the others teach
-        others = [_fitted(name, sample, text, axes, photos[:i] + photos[i + 1 :]) for i in range(len(photos))]
+        others = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))]
     else:
         others = [word]
     precision: dict[str, float] = {}
@@ -424,14 +428,15 @@ def _fitted(
     sample: Float[Tensor, "m c"],
     text: Float[Tensor, " m"],
     axes: _Axes,
+    temperature: float,
     photos: Sequence[_Photo],
 ) -> TaughtWord:
     word = sum((photo.word for photo in photos), torch.zeros_like(text)) / len(photos)
     rest = sum((photo.rest for photo in photos), torch.zeros_like(text)) / len(photos)
     evidence = sum(photo.evidence for photo in photos)
     slope, bias = _logistic(axes.places(sample), word, rest, 1 / evidence)
-    vector = axes.matrix @ slope / TEMPERATURE
-    bias = bias / TEMPERATURE - float(axes.middle @ vector)
+    vector = axes.matrix @ slope / temperature
+    bias = bias / temperature - float(axes.middle @ vector)
     separated = max(2 * _separation(text, word, rest) - 1, 0.0)
     known = (evidence * separated + _TRUST) / (evidence + _TRUST)
     taught = TaughtWord(name, vector.float(), bias, known, 0.5)

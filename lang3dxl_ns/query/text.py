@@ -14,8 +14,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
+from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.teach import TaughtWord
@@ -25,6 +27,7 @@ EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 
 _QUOTED = r'"[^"]*"'
 _NEGATIVES = re.compile(rf"\s*\bnot\s+({_QUOTED}(?:\s*,\s*{_QUOTED})*)", re.IGNORECASE)
+_SINGLE_QUOTES = re.compile(r"‘([^‘’]*)’")
 _CURLY_QUOTES = str.maketrans("“”„«»", '"""""')
 
 
@@ -48,7 +51,10 @@ def parse_prompts(typed: str) -> list[Prompt]:
     word; a `;` in quotes doesn't separate. Raises UserError if there is no prompt.
     """
     # An unpaired UTF-16 surrogate, as from a broken paste, is invalid text: tokenizers reject it.
+    if not isinstance(typed, str):
+        raise TypeError(f"a prompt is a text, not {type(typed).__name__}: {typed!r:.40}")
     clean = typed.encode("utf-8", "ignore").decode().translate(_CURLY_QUOTES)
+    clean = _SINGLE_QUOTES.sub(r'"\1"', clean)
     parts = re.findall(rf"(?:{_QUOTED}|[^;])+", clean)
     prompts = [_parse_prompt(part) for part in parts if part.strip(' "\t\r\n\0')]
     if not prompts:
@@ -59,6 +65,11 @@ def parse_prompts(typed: str) -> list[Prompt]:
 def _parse_prompt(part: str) -> Prompt:
     negatives = [_tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
     text = _tidy(_NEGATIVES.sub(" ", part))
+    if found := re.fullmatch(r"(.+) not (.+)", text, re.IGNORECASE):
+        say(
+            f"{text} is searched for as it stands. To tell one thing from another: "
+            f'"{found[1]}" not "{found[2]}"'
+        )
     if not text:
         raise UserError(f"{part.strip()!r} has only negatives: put what to find first")
     return Prompt(text, tuple(negative for negative in negatives if negative))
@@ -157,6 +168,12 @@ class TextEncoder:
             self.vectors(self.config.negatives),
             against=[self._against(text) for text in texts],
         )
+
+    @cached_property
+    def yardstick(self) -> Queries:
+        """The words by which an encoder's cosines are measured, whatever the settings are."""
+        words = self.vectors((*NEGATIVES, *UNRELATED))
+        return Queries(words, (), ())
 
     def _against(self, text: str) -> list[int]:
         return competitors(self.config.negatives, [text, *self.synonyms(text)])

@@ -142,3 +142,28 @@ def test_sky_surrounds_the_scene_evenly():
     assert float(radii.std() / radii.mean()) < 1e-5
     assert float(radii.min()) > 5 * float((points - 5).norm(dim=1).quantile(0.9))
     assert float((sky.mean(dim=0) - points.median(dim=0).values).norm() / radii.mean()) < 1e-2
+
+
+def test_thousands_of_unusable_photos_in_a_row_are_passed_over():
+    """More than Python's stack holds calls."""
+    count = 3_000
+
+    def read(index, _ahead):
+        if index != count - 1:
+            raise UserError("it is damaged")
+        return {}
+
+    manager = object.__new__(Lang3DXLDataManager)
+    photos = [SimpleNamespace(name=str(i)) for i in range(count)]
+    vars(manager).update(
+        train_unseen_cameras=list(range(count)),
+        train_dataset=SimpleNamespace(photos=photos, __len__=lambda: count),
+        config=SimpleNamespace(read_ahead=0),
+        _train_cache=SimpleNamespace(get=read),
+        _left_out=set(),
+        _gone=0,
+        _batch=lambda _dataset, index, _data: (SimpleNamespace(), {"name": str(index)}),
+        _leave_out=lambda *_: None,
+        sample_train_cameras=lambda: [count - 1],
+    )
+    assert manager.next_train(0)[1]["name"] == str(count - 1)

@@ -124,7 +124,7 @@ def test_a_query_is_what_evaluation_scores(scene, trainer, tiny_clip):
     scorer = open_scorer(SimpleNamespace(categories=["dome", "door"]), str(tiny_clip), "cpu")
     pipeline, camera = trainer.pipeline, scene.camera("photo_003.jpg")
     pipeline.eval()
-    maps = pipeline.evaluation.relevancy(view_of(camera), scorer.queries)
+    maps = pipeline.evaluation.relevancy(view_of(camera), scorer.queries, scorer.yardstick)
     for match, expected in zip(scene.query("dome; door", camera), maps, strict=True):
         seen = match.view.alpha >= scene.config.min_alpha
         np.testing.assert_allclose(match.relevancy[seen], expected.numpy()[seen], rtol=1e-5, atol=1e-6)
