@@ -357,12 +357,10 @@ def learn(
     axes = _Axes.of(everywhere.double(), head)
     fit = partial(_fitted, name, sample, text, axes, temperature)
     word = fit(photos)
-    if len(photos) > 1:  # each photo judged by what the others teach
-        others = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))]
-    else:
-        others = [word]
+    # Each photo is judged by what the others teach.
+    judges = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))] if len(photos) > 1 else [word]
     precision: dict[str, float] = {}
-    for photo, taught in zip(photos, others, strict=True):
+    for photo, taught in zip(photos, judges, strict=True):
         precision[photo.name] = _precision(taught.margins(sample, text), photo)
     missed = [1 - _separation(word.margins(sample, text), photo.word, photo.rest) for photo in photos]
     doubt = sum(missed) / len(missed)
