@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 import tyro
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
@@ -125,7 +125,7 @@ class TeachingBenchmark:
         for photo, mask in masks.items():
             drawn = scene.draw(scene.camera(photo, self.size), channels).channels
             assert drawn is not None
-            foreground = scene.file.photo(photo).foreground(mask.shape)
+            foreground = scene.file.photo(photo).foreground((mask.shape[0], mask.shape[1]))
             for row, one in zip(rows, drawn.permute(2, 0, 1).cpu().numpy(), strict=True):
                 if photo not in marked[row]:
                     shown = one if foreground is None else one * foreground.numpy()
@@ -161,7 +161,8 @@ def _clicks(count: int, draw: int) -> Draw:
 def _edge_click(photo: str, mask: Bool[Array, "h w"], size: tuple[int, int]) -> Example:
     """The worst place for a click: as close to the edge as can be."""
     depth = np.where(mask, distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1], np.inf)
-    return Example(photo, points=(_point(np.unravel_index(depth.argmin(), mask.shape), mask, size),))
+    place = np.argwhere(depth == depth.min())[0]
+    return Example(photo, points=(_point(place, mask, size),))
 
 
 def _box(photo: str, mask: Bool[Array, "h w"], size: tuple[int, int]) -> Example:
@@ -178,7 +179,7 @@ def _outline(photo: str, mask: Bool[Array, "h w"], size: tuple[int, int]) -> Exa
     return Example(photo, mask)
 
 
-def _point(place: Sequence[int], mask: Bool[Array, "h w"], size: tuple[int, int]) -> Point:
+def _point(place: Int[Array, "2"], mask: Bool[Array, "h w"], size: tuple[int, int]) -> Point:
     row, column = (int(x) for x in place)
     return (column + 0.5) * size[0] / mask.shape[1] - 0.5, (row + 0.5) * size[1] / mask.shape[0] - 0.5
 

@@ -38,7 +38,7 @@ from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_promp
 from lang3dxl_ns.query.threshold import match_thresholds
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
-from lang3dxl_ns.rendering.gathering import filled_pixels, gather
+from lang3dxl_ns.rendering.gathering import filled_parts, filled_pixels
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import Rendering, composite
 from lang3dxl_ns.rendering.splats import Splats
@@ -502,12 +502,11 @@ class Scene:
         camera = resized(photo.full_camera, MARK_SIDE)
         size = (camera.height, camera.width)
         foreground = photo.foreground(size)
-        seen = torch.ones(size) if foreground is None else foreground.float()
-        pixels = torch.cat([marks(example, photo, size) * seen, seen[None]]).permute(1, 2, 0)
+        shown = torch.ones(size) if foreground is None else foreground.float()
+        pixels = torch.cat([marks(example, photo, size) * shown, shown[None]]).permute(1, 2, 0)
         drawn = partial(composite, self.splats, camera, backend=self.backend)
-        views = [(drawn, pixels.to(self.device))]
-        shares, mass = gather(len(self.splats), views, 2, self.splats.means)
-        return Weights(shares[:, 0] * mass, shares[:, 1] * mass, mass)
+        word, other, seen = filled_parts(drawn, pixels.to(self.device), len(self.splats)).unbind(1)
+        return Weights(word, other, seen)
 
     def _with_taught(self, prompt: Prompt) -> Prompt:
         taught = self.words.get(known_word(prompt.text))

@@ -42,6 +42,13 @@ _AXES = 64
 """Principal components of the scene's features that a word is fitted in."""
 _OUTLINE, _BOX = 100, 30
 """Clicks that an outline and a box are worth."""
+_RIDGE = 0.3
+"""Penalty of the squared coefficients, per standardized coordinate, after one click."""
+_LEAST_RIDGE = 0.01
+_UP = 0.6
+"""Part of the way from the mean score of a clicked photo to that of the clicks where the word begins."""
+_GAIN = 1.5
+"""Weight of a text whose average precision is 1."""
 _TRUST = 3
 """Clicks that the belief in a word's text is worth before anything is marked."""
 _LEAST_SPREAD = 1e-3
@@ -266,7 +273,7 @@ class TaughtWord:
     @classmethod
     def from_json(cls, told: Mapping[str, Any]) -> TaughtWord:
         """The word; raises ValueError, LookupError, TypeError or UserError for anything else."""
-        numbers = [float(told[name]) for name in ("bias", "text", "doubt")]
+        bias, text, doubt = numbers = [float(told[name]) for name in ("bias", "text", "doubt")]
         vector = torch.tensor([float(x) for x in told["vector"]])
         if not np.isfinite(numbers).all() or not vector.isfinite().all() or not len(vector):
             raise ValueError("a word has a value that is not a number")
@@ -275,7 +282,7 @@ class TaughtWord:
             raise ValueError("a word has no name")
         precision = {str(photo): float(value) for photo, value in told["precision"].items()}
         examples = tuple(map(Example.from_json, told["examples"]))
-        return cls(name, vector, *numbers, precision, examples, clip, scene)
+        return cls(name, vector, bias, text, doubt, precision, examples, clip, scene)
 
 
 def known_word(text: str) -> str:
@@ -393,7 +400,7 @@ def _rest(example: Weights) -> Float[Tensor, " n"]:
 
 
 def _spaced(weight: Float[Tensor, " n"]) -> Int[Tensor, " m"]:
-    rows = (weight > 1e-4 * weight.max()).nonzero().squeeze(1)
+    rows = (weight > 1e-5 * weight.max()).nonzero().squeeze(1)
     return rows[:: math.ceil(len(rows) / _ROWS)]
 
 
@@ -432,13 +439,22 @@ def _fitted(
     word = sum((photo.word for photo in photos), torch.zeros_like(text)) / len(photos)
     rest = sum((photo.rest for photo in photos), torch.zeros_like(text)) / len(photos)
     evidence = sum(photo.evidence for photo in photos)
-    slope, bias = _logistic(axes.places(sample), word, rest, 1 / evidence)
+    slope, bias = _logistic(axes.places(sample), word, rest, max(_RIDGE / evidence, _LEAST_RIDGE))
     vector = axes.matrix @ slope / temperature
     bias = bias / temperature - float(axes.middle @ vector)
-    separated = max(2 * _separation(text, word, rest) - 1, 0.0)
-    known = (evidence * separated + _TRUST) / (evidence + _TRUST)
+    known = (evidence * _trust(text, photos) + _TRUST) / (evidence + _TRUST)
     taught = TaughtWord(name, vector.float(), bias, known, 0.5)
     return replace(taught, bias=bias - _level(taught.margins(sample, text), photos))
+
+
+def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
+    """Weight of a text, by how well it tells the word from the rest: its average precision in photos where
+    all of the word is marked, or how far it ranks clicks above the rest."""
+    complete = [_precision(text, photo) for photo in photos if photo.complete]
+    if complete:
+        return _GAIN * sum(complete) / len(complete)
+    separated = [2 * _separation(text, photo.word, photo.rest) - 1 for photo in photos]
+    return max(sum(separated) / len(separated), 0.0)
 
 
 def _logistic(
@@ -493,10 +509,13 @@ def _precision(score: Float[Tensor, " m"], photo: _Photo) -> float:
 
 def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     """The score above which the word is: where intersection over union is best in photos whose marks are
-    complete; 0 without any."""
+    complete; without any, part of the way from what is not clicked to what is."""
     complete = [photo for photo in photos if photo.complete]
     if not complete:
-        return 0.0
+        on, off = (
+            torch.stack([getattr(photo, side) for photo in photos]).mean(0) for side in ("word", "rest")
+        )
+        return float(_UP * on @ score + (1 - _UP) * off @ score)
     order = score.argsort(descending=True, stable=True)
     overlap = torch.zeros_like(score)
     for photo in complete:
