@@ -15,7 +15,7 @@ from scenes import write_scene
 
 from lang3dxl_ns.baselines.encoders import EncoderConfig
 from lang3dxl_ns.components.compression import CompressedField
-from lang3dxl_ns.plugin.load_scene import load_scene
+from lang3dxl_ns.open_scene import load_scene
 
 EVERYTHING = {
     "pipeline__model__encoder__name": "paper",
@@ -259,11 +259,10 @@ def test_no_photo_of_a_query_is_waited_for(default, fake):
     with fake_gpu() as gpu:
         scene = load_scene(default.base_dir / "config.yml")
         assert scene.device == CUDA
-        queries = scene.queries(scene.prompts("tower; window"))
-        camera, carried = scene.camera(scene.file.photos[0].name), scene.engine.carried(queries)
+        question = scene.ask("tower; window")
+        camera, channels = scene.camera(scene.file.photos[0].name), question.channels
         with gpu.counting() as waits:
-            view = scene._render(camera, carried)
-            maps = scene.engine.maps(view.carried, queries)
+            maps = question.maps(scene.draw(camera, channels))
         assert waits == {"gsplat": 1}
         assert maps.device == CUDA
         counts = []
@@ -274,7 +273,7 @@ def test_no_photo_of_a_query_is_waited_for(default, fake):
                 scene.find("tower")
             counts.append(waits)
         assert counts[0] == counts[1]
-        assert scene.match(scene.prompts("tower"), camera)[0].relevancy.device == CUDA
+        assert question.relevancy.device == CUDA
 
 
 def test_words_on_the_gpu_are_those_on_the_cpu(default, gpu):
@@ -332,15 +331,11 @@ def test_a_million_gaussians_are_trained_gathered_and_asked(tmp_path):
 def test_export(default, tmp_path, gpu):
     with gpu():
         scene = load_scene(default.base_dir / "config.yml")
-        count = len(scene.gaussians["means"])
-        assert scene.export(tmp_path / "tower.ply", "tower", everything=True) == count
+        assert scene.export(tmp_path / "tower.ply", "tower", everything=True) == len(scene.splats)
 
 
 def test_a_conversation_in_the_viewer(default, gpu):
     from contextlib import nullcontext
-
-    from lang3dxl_ns.plugin.light import in_light
-    from lang3dxl_ns.plugin.viewer.splats import splats
 
     from lang3dxl_ns.plugin.cameras import view_of
     from lang3dxl_ns.plugin.viewer.session import Conversation
@@ -357,9 +352,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
         camera = pipeline.scene_file.photos[0].camera
         outputs = model.get_outputs_for_camera(view_of(camera))
         assert all(value.device == CUDA for value in outputs.values())
-        gaussians, colors = in_light(model, camera, None)
-        assert gaussians.means.device == colors.device == CUDA
-        assert len(splats(gaussians, colors, 1.0).centers) > 0
+        assert model.scene(pipeline.scene_file).baked().means.device == CUDA
         model.answers = None
 
 

@@ -316,7 +316,7 @@ class CompressedField(SemanticField):
 
     def fit_codes(self, codes: Float[Tensor, "n code"]) -> None:
         """Make room for the weights of a field of such codes, to be loaded."""
-        if codes.shape[1] != self.code_dim:
+        if codes.dim() == 2 and codes.shape[1] != self.code_dim:
             self.take(SemanticField(replace(self.config, code_dim=codes.shape[1]), self.clip_dim))
 
 

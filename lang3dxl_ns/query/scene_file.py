@@ -27,7 +27,7 @@ from torch import Tensor
 from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.looks import Looks
@@ -38,6 +38,7 @@ from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
 from lang3dxl_ns.query.teach import TaughtWord, words_from_json
 from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
 
@@ -106,9 +107,13 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         field = scene.looks.field
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
+        if scene.file.clip is not None:
+            words = common_words()
+            described["words"] = list(words)
+            content["words"] = _array(scene.text.vectors(words), np.float16)
     masks = {i: _mask_of(photo) for i, photo in enumerate(scene.photos) if photo.mask is not None}
     content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
-    described["words"] = [word.to_json() for word in scene.words.values()]
+    described["taught"] = [word.to_json() for word in scene.words.values()]
     file = replace(scene.file, photos=[replace(photo, mask=None) for photo in scene.photos])
     described["scene"] = asdict(replace(file, data=Path(file.data).name))
     data = save(content, {_KEY: json.dumps(described)})
@@ -133,7 +138,7 @@ def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
         begin = 8 + int.from_bytes(content[:8], "little")
         header = json.loads(content[8:begin])
         described = json.loads(header["__metadata__"][_KEY])
-        described["words"] = [word.to_json() for word in words]
+        described["taught"] = [word.to_json() for word in words]
         header["__metadata__"][_KEY] = json.dumps(described)
         start = json.dumps(header).encode()
         start += b" " * (-len(start) % 8)  # tensors stay aligned
@@ -215,7 +220,7 @@ def read_scene(
     Raises:
         UserError: the file is missing, damaged, cut short, or of a newer version.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     with _reported(path):
         return _read(path, torch.device(device or best_device()), config, encode_texts)
 
@@ -226,7 +231,7 @@ def describe_scene_file(path: str | Path) -> dict[str, Any]:
 
     Raises UserError as `read_scene` does; no tensor is read.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     with _reported(path), _opened(path) as file:
         described, sizes = _description(file), _sizes(file)
         return {
@@ -275,7 +280,8 @@ class _Description:
     background: list[float] | None
     decoder: dict[str, Any] | None
     looks: dict[str, Any] | None
-    words: list[TaughtWord]
+    words: list[str] | None
+    taught: list[TaughtWord]
 
 
 def _read(
@@ -290,6 +296,7 @@ def _read(
             codes = _codes(file, sizes, decoder.bounded, len(splats)).to(device)
         if about.looks is not None:
             looks = Looks(_looks(file, sizes, about.looks).to(device))
+        vectors = None if about.words is None else _vectors(file, sizes, about.words)
         photos = [
             replace(photo, mask=_checked_mask(file.get_tensor(f"mask.{i}")) if f"mask.{i}" in sizes else None)
             for i, photo in enumerate(about.scene.photos)
@@ -298,7 +305,7 @@ def _read(
     return Scene(
         splats, replace(about.scene, photos=photos), decoder, codes,
         looks=looks, background=background, config=config, encode_texts=encode_texts,
-        cache=path.with_name(f".{path.stem}.visible"), words=about.words,
+        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"), words=about.taught,
     )  # fmt: skip
 
 
@@ -328,7 +335,8 @@ def _description(file: Any) -> _Description:
         background,
         content.get("decoder"),
         content.get("looks"),
-        words_from_json(content.get("words", [])),
+        content.get("words"),
+        words_from_json(content.get("taught", [])),
     )
 
 
@@ -386,6 +394,12 @@ def _parameters(settings: Mapping[str, Any], channels: int) -> int:
     table = settings["levels"] * 2 ** int(settings["log2_table_size"]) * settings["features_per_level"]
     inputs = settings["levels"] * settings["features_per_level"] + channels + 100
     return table + width * (inputs + depth * width + channels)
+
+
+def _vectors(file: Any, sizes: Mapping[str, list[int]], words: list[str]) -> dict[str, Float[Tensor, " c"]]:
+    _expect(isinstance(words, list) and all(isinstance(word, str) for word in words), "its words")
+    _expect(len(sizes["words"]) == 2 and sizes["words"][0] == len(words), "its words")
+    return dict(zip(words, F.normalize(_tensor(file, "words"), dim=1), strict=True))
 
 
 def _looks(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> AppearanceField:

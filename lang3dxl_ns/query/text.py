@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -131,12 +131,18 @@ class TextEncoder:
 
     Args:
         encode: the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
+        known: unit vectors of texts that need not be encoded.
     """
 
-    def __init__(self, encode: EncodeTexts, config: TextConfig | None = None) -> None:
+    def __init__(
+        self,
+        encode: EncodeTexts,
+        config: TextConfig | None = None,
+        known: Mapping[str, Float[Tensor, " c"]] | None = None,
+    ) -> None:
         self.config = config or TextConfig()
         self._encode = encode
-        self._vectors: dict[str, Float[Tensor, " c"]] = {}
+        self._vectors = dict(known or {})
         self._synonyms: dict[str, list[str]] = {}
         self._table = SynonymTable()
         self._lock = threading.Lock()
