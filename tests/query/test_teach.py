@@ -64,7 +64,7 @@ def test_one_click_on_one_window_finds_the_other(scene):
         "hatch", Example("left/0001.jpg", points=(pixel(scene, "left/0001.jpg", -1.8, -0.8),))
     )
     found = torch.from_numpy(taught.find("hatch").gaussians)
-    assert (found == painted(2)).float().mean() > 0.995
+    assert found[painted(2)].all() and not found[painted(0)].any()  # this photo doesn't show the dome
 
 
 def test_a_word_is_found_from_behind(scene):
