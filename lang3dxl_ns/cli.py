@@ -32,6 +32,10 @@ BENCHMARKS = {
     "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
+    "teaching": (
+        "benchmarks.teaching:TeachingBenchmark",
+        "Words taught by example, beside the text alone.",
+    ),
     "ablation": (
         "benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",
@@ -54,6 +58,8 @@ COMMANDS = {
         "commands.query:Export",
         "Write a scene, or what matches a text, as a splat file or a web page.",
     ),
+    "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
+    "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
     "info": ("commands.info:Info", "Tell what a scene file holds, and where it comes from."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (

@@ -10,6 +10,9 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from jaxtyping import Bool
+from numpy import ndarray as Array
+from PIL import Image
 
 from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say
@@ -17,6 +20,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.query.coco import CocoLabels
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Match, save_picture, together
 from lang3dxl_ns.query.question import Question
@@ -55,11 +59,17 @@ class Query:
     """Use the views of all photos, including held-out ones."""
     camera_path: Path | None = None
     """Use the views of a camera path saved by the viewer."""
+    coco: Path | None = None
+    """With --all, also write the masks to this file as labels in COCO's format, for all photos and texts."""
+    without_taught: bool = False
+    """Ask for the texts alone, leaving out what the scene was taught by example (lang3dxl teach)."""
     clip: str | None = None
     """Name or folder of the scene's CLIP, if it is not where the scene says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
+        if self.coco is not None and not self.all:
+            raise UserError("--coco labels all photos: give --all too")
         if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
             raise UserError("--image, --all and --camera-path exclude each other: give one of them")
         prompts = parse_texts(self.text, self.not_)  # fail now rather than after the work
@@ -67,8 +77,11 @@ class Query:
             raise UserError("there is no --text: say what to look for, such as --text windows")
         make_folder(self.out)
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        scene = scene.with_words(()) if self.without_taught else scene
         question = scene.ask(prompts)
+        prompts = list(question.prompts)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
+        labels = CocoLabels([prompt.text for prompt in prompts])
         views, best = [], [-1.0] * len(prompts)
         where = [""] * len(prompts)
         with progress_bar() as bar:
@@ -79,9 +92,13 @@ class Query:
                     write_match(match, folders[i] / name)
                     if match.score > best[i]:
                         best[i], where[i] = match.score, f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
+                if self.coco is not None and isinstance(place, str):
+                    labels.add(place, [of_file(scene, place, match.mask) for match in matches])
                 if len(matches) > 1:
                     save_picture(together(matches), shared / f"{name}.png")
                 views.append(_view_report(name, matches))
+        if self.coco is not None:
+            write_atomically(self.coco, json.dumps(labels.content) + "\n")
         doubts, levels = question.doubts, question.thresholds
         texts = zip(prompts, doubts, levels, folders, strict=True)
         report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
@@ -89,8 +106,9 @@ class Query:
         found = zip(prompts, doubts, levels, folders, best, where, strict=True)
         for prompt, doubt, level, folder, score, place in found:
             closest = "" if score > level else " (no match; this view comes closest)"
-            say(f"{prompt.text}: {score:.2f} at {place}; {folder}{closest}")
-            if advice := doubtful(prompt.text, doubt):
+            by = "" if prompt.taught is None else " (taught)"
+            say(f"{prompt.text}{by}: {score:.2f} at {place}; {folder}{closest}")
+            if advice := doubtful(prompt.text, doubt, prompt.taught is not None):
                 say(f"  {advice}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
@@ -129,6 +147,13 @@ def file_names(photos: list[str]) -> list[str]:
     return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
 
 
+def of_file(scene: Scene, photo: str, mask: Bool[Array, "h w"]) -> Bool[Array, "H W"]:
+    """A view's mask at the size of the photo's file."""
+    found = scene.file.photo(photo)
+    size = found.size or (found.lens.width, found.lens.height)
+    return np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST))
+
+
 def write_match(match: Match, stem: Path) -> None:
     """Write `stem`.overlay.png, .mask.png and .npy."""
     match.save(stem.with_name(f"{stem.name}.overlay.png"))
@@ -141,6 +166,7 @@ def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, f
         "text": prompt.text,
         "negatives": list(prompt.negatives),
         "synonyms": scene.synonyms(prompt),
+        "taught": prompt.taught is not None,
         "doubt": doubt,
         "threshold": threshold,
         "folder": folder.name,

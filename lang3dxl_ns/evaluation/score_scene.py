@@ -13,6 +13,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.language import LanguageScorer
 from lang3dxl_ns.evaluation.scores import map_size
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.teach import known_word
 from lang3dxl_ns.scene.photo import Photo
 
 SceneSplit = Literal["held-out", "seen", "all"]
@@ -39,6 +40,8 @@ def score_scene(
     if not photos:
         raise UserError(f"no label in {truth.folder} belongs to a {split} photo of the scene")
     scorer = LanguageScorer(truth, scene.text.vectors)
+    words = [scene.words.get(known_word(category)) for category in truth.categories]
+    queries_shown = scorer.queries.taught(words)
     figures: dict[str, dict[str, float]] = {}
     with progress_bar() as bar:
         for photo in bar.track(photos, description="evaluating"):
@@ -47,7 +50,7 @@ def score_scene(
             keep = None if keep is None else keep.to(scene.device)
             raw, published = (
                 scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
-                for queries in (scorer.queries, scorer.published_queries)
+                for queries in (queries_shown, scorer.published_queries)
             )
             of_published = None if scorer.smooths else published
             variants = scorer.variants(raw, keep, scene.engine.temperature, of_published)
@@ -58,6 +61,7 @@ def score_scene(
     protocol = {
         "split": split,
         "evaluated_photos": len(photos),
+        "taught_words": [word.name for word in words if word is not None],
         **scorer.protocol(mask if masked else "none"),
     }
     return figures, protocol
