@@ -103,14 +103,12 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         described["decoder"] = _described(scene.decoder)
         content["codes"] = _stored_codes(scene.codes, scene.decoder.bounded)
         content |= _stored_state("decoder", scene.decoder)
+        described["words"] = list(common_words())
+        content["words"] = _array(scene.text.vectors(described["words"]), np.float16)
     if scene.looks is not None:
         field = scene.looks.field
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
-        if scene.file.clip is not None:
-            words = common_words()
-            described["words"] = list(words)
-            content["words"] = _array(scene.text.vectors(words), np.float16)
     masks = {i: _mask_of(photo) for i, photo in enumerate(scene.photos) if photo.mask is not None}
     content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
     described["taught"] = [word.to_json() for word in scene.words.values()]
