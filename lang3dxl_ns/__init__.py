@@ -11,6 +11,7 @@ from lang3dxl_ns.common.console import silence_libraries
 
 _PUBLIC = {
     "load_scene": "plugin.load_scene",
+    "attach": "attach.attach",
     "Scene": "query.scene",
     "together": "query.match",
     "QueryConfig": "query.scene",

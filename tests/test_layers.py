@@ -46,7 +46,7 @@ ORDER = (
     {"components", "rendering"},
     {"preparation"},
     {"baselines", "query", "evaluation"},
-    {"demo", "numerics"},
+    {"attach", "demo", "numerics"},
     {"plugin"},
     {"methods", "commands", "benchmarks"},
     {"cli"},
@@ -147,7 +147,15 @@ def top_level_imports(source: str, modules) -> set[str]:
 
 def test_rooms_below_the_plugin_load_neither_nerfstudio_nor_cuda_code():
     below = modules(
-        "common", "scene", "components", "rendering", "preparation", "query", "evaluation", "baselines"
+        "common",
+        "scene",
+        "components",
+        "rendering",
+        "preparation",
+        "query",
+        "evaluation",
+        "baselines",
+        "attach",
     )
     loaded = json.loads(run(IMPORT_ALL.format(names=below)))
     assert not {"nerfstudio", "gsplat", "tinycudann"} & set(loaded)

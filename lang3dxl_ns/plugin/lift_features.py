@@ -5,19 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import partial
 
-import torch
-import torch.nn.functional as F
-from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from torch import Tensor
 from torch.nn import Parameter
 
-from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
-from lang3dxl_ns.components.losses import resize
-from lang3dxl_ns.components.principal_basis import PrincipalBasis
+from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.rendering.gathering import gather
 
 
 def learn_from_photos(
@@ -25,58 +18,26 @@ def learn_from_photos(
     photos: Iterable[tuple[Cameras, Batch]],
     advance: Callable[[], None] = lambda: None,
 ) -> None:
-    """Gather the photos' target features onto the Gaussians, sharpen them where there are dense features, and
-    let the encoder make codes of them.
+    """Give the model's Gaussians codes of the photos' targets; see `learn_codes`.
 
     model: in training mode, so that it renders its photos as in training. photos: cameras and batches, with
     targets. advance: called as the encoder learns, `learning_steps` times.
     """
     encoder, facts = model.semantic_field, model.facts
-    assert encoder is not None
-    basis = fine_basis = None
-    width = channels = len(model.clip_mean)
-    if encoder.gathered_channels is not None and encoder.gathered_channels < width:
-        assert facts.clip_targets is not None
-        width = channels = encoder.gathered_channels
-        basis = PrincipalBasis.of(facts.clip_targets(), width)
-    if facts.dense_targets is not None:
-        fine_basis = PrincipalBasis.of(map(_unit, facts.dense_targets()), DENSE_AXES)
-        channels += fine_basis.axes.shape[1]
-
-    def views():
-        for camera, batch in photos:
-            size = batch["image"].shape[:2]
-            mask = batch["mask"][..., 0] if "mask" in batch else None
-            clip = batch["clip_target"]
-            clip = clip if basis is None else basis.to(clip).coordinates(clip)
-            dense = None
-            if fine_basis is not None:
-                dense = fine_basis.to(clip).coordinates(_unit(batch["dense_target"]))
-            yield partial(model.composite, camera), pixel_features(clip, dense, mask, size)
-
-    features, mass = gather(model.num_points, views(), channels, model.means.detach())
-    if fine_basis is not None:
-        features = sharpen(features[:, :width], features[:, width:], mass)
-    codes = encoder.learn_gaussians(features, mass, advance, basis)
-    # Features that are many lie on the CPU, and those that are codes themselves come from there.
+    assert encoder is not None and facts.clip_targets is not None
+    views = (_view(model, camera, batch) for camera, batch in photos)
+    codes = learn_codes(
+        encoder, views, model.means.detach(), facts.clip_targets, facts.dense_targets, advance
+    )
     model.gauss_params["codes"] = Parameter(codes.to(model.device), requires_grad=False)
 
 
-def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:
-    return F.normalize(dense.float(), dim=-1)
-
-
-def pixel_features(
-    clip: Float[Tensor, "hd wd c"],
-    dense: Float[Tensor, "t t d"] | None,
-    mask: Tensor | None,
-    size: tuple[int, int],
-) -> Float[Tensor, "h w out"]:
-    """A photo's targets at every pixel (bilinear), and a last channel of 1; all 0 outside the mask [H, W],
-    and where a target isn't finite."""
-    maps = [resize(target, size) for target in (clip, dense) if target is not None]
-    pixels = torch.cat([*maps, torch.ones_like(maps[0][..., :1])], dim=-1)
-    counts = pixels.isfinite().all(-1, keepdim=True)
-    if mask is not None:
-        counts &= resize(mask[..., None].to(pixels), size) >= 0.5
-    return torch.where(counts, pixels, 0.0)
+def _view(model: Lang3DXLModel, camera: Cameras, batch: Batch) -> TargetView:
+    rows, columns = batch["image"].shape[:2]
+    return TargetView(
+        partial(model.composite, camera),
+        (rows, columns),
+        batch["clip_target"],
+        batch.get("dense_target"),
+        batch["mask"][..., 0] if "mask" in batch else None,
+    )

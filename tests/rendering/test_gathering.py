@@ -5,7 +5,7 @@ from functools import partial
 import torch
 
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
-from lang3dxl_ns.plugin.lift_features import pixel_features
+from lang3dxl_ns.components.learn_codes import pixel_features
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import filled_pixels, gather
 from lang3dxl_ns.scene.camera import Camera
