@@ -34,6 +34,7 @@ BENCHMARKS = {
         "benchmarks.best_views:BestViews",
         "Whether the views that queries choose show the words.",
     ),
+    "attach": ("benchmarks.attach:AttachBenchmark", "Words attached to a splat, scored beside its run's."),
     "viewer": ("benchmarks.viewer:ViewerBenchmark", "Viewers in a browser: frames, first picture."),
     "ablation": (
         "benchmarks.ablation:Ablation",

@@ -24,7 +24,7 @@ from lang3dxl_ns.scene.photo import Photo
 FITS = 0.5
 """Correlation of renderings with their photos above which a frame is right; wrong ones reach 0.3."""
 _CLOSE = 0.85
-"""Correlation from which a frame isn't refined."""
+"""Correlation from which a frame isn't refined, and no other one tried."""
 _PROMISING = 0.15
 """Correlation below which a frame is not worth refining."""
 _SMALL, _LARGE = 64, 128
@@ -110,6 +110,8 @@ def _best(splats: Splats, comparison: _Comparison, frames: Mapping[str, Similari
         for name, frame in frames.items():
             fits.append(comparison.fit(splats, name, frame))
             advance()
+            if fits[-1].score >= _CLOSE:
+                break
     return sorted(fits, key=lambda fit: fit.score, reverse=True)
 
 

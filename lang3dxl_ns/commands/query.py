@@ -155,6 +155,9 @@ class Export:
     """Line on the page about the photos: who took them, and their licence."""
     all: bool = False
     """Write all Gaussians; with --text a .ply has their relevancy as a property."""
+    index: Path | None = None
+    """With --text and --out: file (.npy or .txt) for the numbers of the matching Gaussians, in the scene's
+    order, which is that of the splat it was attached to."""
     look: str | None = None
     """Light of this training photo, by name (default: of the photo that shows the scene as a whole)."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
@@ -164,6 +167,8 @@ class Export:
 
         if (self.out is None) == (self.web is None):
             raise UserError("give one of --out FILE.ply and --web FOLDER")
+        if self.index is not None and (self.out is None or not self.text):
+            raise UserError("--index lists the Gaussians that match: give --text and --out with it")
         if self.out is not None:
             make_folder(self.out.parent)
             check_splat_name(self.out)
@@ -175,5 +180,5 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
             text = self.text[0] if self.text else None
-            count = scene.export(self.out, text, everything=self.all, look=self.look)
+            count = scene.export(self.out, text, everything=self.all, look=self.look, index=self.index)
             say(f"Wrote {count} of {len(scene.gaussians['means'])} Gaussians to {self.out}")
