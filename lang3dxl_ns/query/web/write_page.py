@@ -6,7 +6,6 @@ import json
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,8 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.query.heat_maps import color
-from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.splat_file import write_gaussians
+from lang3dxl_ns.query.splat_file import write_splats
 from lang3dxl_ns.scene.camera import Camera
 
 _HERE = Path(__file__).parent
@@ -48,29 +46,29 @@ def write_page(
     make_folder(folder)
     prompts = scene.prompts(texts) if texts else []
     # View-dependent colors are drawn as from the overview, since heat replaces colors.
-    gaussians = replace(scene.arrays(look=look), harmonics=None)
-    splats = "scene.spz" if find_spec("gsply") is not None else "scene.ply"
-    write_gaussians(folder / splats, gaussians)
-    middle = np.median(gaussians.means, axis=0)
+    baked = scene.baked(look)
+    baked = baked.with_colors(baked.colors(scene.overview.camera.position))
+    splats, sound = "scene.spz" if find_spec("gsply") is not None else "scene.ply", baked.sound()
+    write_splats(folder / splats, baked)
+    middle = np.median(baked.means.cpu().numpy(), axis=0)
     words = []
     names = slugs([prompt.text for prompt in prompts])
     for found, name in zip(scene.find(prompts) if prompts else [], names, strict=True):
-        scored = replace(gaussians, relevancy=scene.query_gaussians(found.prompt).cpu().numpy()).sound()
-        assert scored.relevancy is not None
-        heat = (scored.relevancy * 255).round().astype(np.uint8)
+        relevancy = found.relevancy[sound.cpu().numpy()]
+        heat = (relevancy * 255).round().astype(np.uint8)
         write_atomically(folder / f"heat-{name}.bin", heat.tobytes())
-        view = (found.viewpoints or found.closest)[0]
+        view = (found.views or found.closest)[0]
         center = middle if found.box is None else np.array(found.box.center)
         words.append(
             {
                 "text": found.prompt.text,
                 "heat": f"heat-{name}.bin",
                 "threshold": found.threshold,
-                "highest": float(scored.relevancy.max(initial=0)),
+                "highest": float(relevancy.max(initial=0)),
                 "view": _view(scene.file.photo(view.name).full_camera, center),
             }
         )
-    start = _view(overview(scene.photos, tuple(middle.tolist())).full_camera, middle)
+    start = _view(scene.overview.full_camera, middle)
     up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
     description = {
         "title": title or Path(scene.file.data).name,
