@@ -46,7 +46,7 @@ ORDER = (
     {"components", "rendering"},
     {"preparation"},
     {"baselines", "query", "evaluation"},
-    {"attach", "demo", "numerics"},
+    {"attachment", "demo", "numerics"},
     {"plugin"},
     {"methods", "open_scene"},
     {"train_scene"},
@@ -157,7 +157,7 @@ def test_rooms_below_the_plugin_load_neither_nerfstudio_nor_cuda_code():
         "query",
         "evaluation",
         "baselines",
-        "attach",
+        "attachment",
     )
     loaded = json.loads(run(IMPORT_ALL.format(names=below)))
     assert not {"nerfstudio", "gsplat", "tinycudann"} & set(loaded)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from lang3dxl_ns.attach.frames import camera_in
+from lang3dxl_ns.attachment.frames import camera_in
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import markdown_table

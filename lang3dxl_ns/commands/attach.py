@@ -39,7 +39,7 @@ class Attach(PreparationConfig):
     """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.attach.attach import AttachConfig, attach
+        from lang3dxl_ns.attachment.attach import AttachConfig, attach
 
         self.check()
         if not 4 <= self.views <= 10_000:

@@ -25,7 +25,9 @@ def some_splats(count: int = 300, bands: int = 4) -> Splats:
     return Splats(rand(3) * 4 - 2, quats, 0.02 + rand(3), 0.05 + 0.9 * rand(), rand(bands, 3) - 0.5)
 
 
-def assert_alike(found: Splats, wanted: Splats, means=1e-6, scales=1e-5, opacities=1e-5, colors=1e-6, turn=1e-6):
+def assert_alike(
+    found: Splats, wanted: Splats, means=1e-6, scales=1e-5, opacities=1e-5, colors=1e-6, turn=1e-6
+):
     assert len(found) == len(wanted)
     torch.testing.assert_close(found.means, wanted.means, atol=means, rtol=0)
     torch.testing.assert_close(found.scales.log(), wanted.scales.log(), atol=scales, rtol=0)

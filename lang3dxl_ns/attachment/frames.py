@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.attach.known_frames import Similarity, known_frames, registered_frames
+from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, registered_frames
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.rendering.rasterize import rasterize

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.attach.known_frames import Similarity
+from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.reports import progress_bar

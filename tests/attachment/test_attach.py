@@ -6,8 +6,8 @@ import torch
 from box_splat import box_splat
 from scenes import write_scene
 
-from lang3dxl_ns.attach.attach import AttachConfig, attach
-from lang3dxl_ns.attach.known_frames import known_frames
+from lang3dxl_ns.attachment.attach import AttachConfig, attach
+from lang3dxl_ns.attachment.known_frames import known_frames
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.preparation.settings import PreparationConfig

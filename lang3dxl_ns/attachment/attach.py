@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lang3dxl_ns.attach.frames import Fit, camera_in, find_frame, side_by_side
-from lang3dxl_ns.attach.known_frames import Similarity
-from lang3dxl_ns.attach.learn import learn, prepare_photos, scene_file, settled
-from lang3dxl_ns.attach.views import Up, rendered_views
+from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame, side_by_side
+from lang3dxl_ns.attachment.known_frames import Similarity
+from lang3dxl_ns.attachment.learn import learn, prepare_photos, scene_file, settled
+from lang3dxl_ns.attachment.views import Up, rendered_views
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError

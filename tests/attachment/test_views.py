@@ -7,8 +7,16 @@ from box_splat import box_splat
 from scenes import CENTER, HALF_SIZES
 from scipy.spatial.transform import Rotation
 
-from lang3dxl_ns.attach import views
-from lang3dxl_ns.attach.views import Extent, LENS, candidates, choose_views, looking, rendered_views, solids
+from lang3dxl_ns.attachment import views
+from lang3dxl_ns.attachment.views import (
+    Extent,
+    LENS,
+    candidates,
+    choose_views,
+    looking,
+    rendered_views,
+    solids,
+)
 
 SPLATS = box_splat(0.1, ground=True)
 
@@ -34,7 +42,9 @@ def test_a_camera_looks_at_its_target_upright():
     up = torch.tensor([0.0, 0.0, 1.0])
     camera = LENS.camera(looking(place, target, up))
     at = camera.view_matrix[:3, :3] @ target + camera.view_matrix[:3, 3]
-    torch.testing.assert_close(at, torch.tensor([0.0, 0.0, float((target - place).norm())]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        at, torch.tensor([0.0, 0.0, float((target - place).norm())]), atol=1e-5, rtol=0
+    )
     above = camera.view_matrix[:3, :3] @ (target + up) + camera.view_matrix[:3, 3]
     assert float(above[0].abs()) < 1e-5
     assert float(above[1]) < 0  # y points down
@@ -64,7 +74,9 @@ def test_rendered_views_are_kept_and_their_points_lie_on_surfaces(tmp_path, monk
     assert len(found.photos) == 6
     points = found.reconstruction.points
     box = np.maximum(np.abs(points - CENTER) - HALF_SIZES, 0)
-    to_box = np.where(box.any(axis=1), np.linalg.norm(box, axis=1), (HALF_SIZES - np.abs(points - CENTER)).min(1))
+    to_box = np.where(
+        box.any(axis=1), np.linalg.norm(box, axis=1), (HALF_SIZES - np.abs(points - CENTER)).min(1)
+    )
     off = np.minimum(to_box, np.abs(points[:, 2]))
     assert np.quantile(off, 0.9) < 0.1
     tracked = found.reconstruction.photos["0000.png"]
@@ -84,9 +96,7 @@ def test_rendered_views_are_kept_and_their_points_lie_on_surfaces(tmp_path, monk
 
 def test_another_splat_gets_other_views(tmp_path, monkeypatch):
     chosen = []
-    monkeypatch.setattr(
-        views, "choose_views", lambda *args: chosen.append(args) or choose_first(args[1])
-    )
+    monkeypatch.setattr(views, "choose_views", lambda *args: chosen.append(args) or choose_first(args[1]))
     rendered_views(SPLATS, 2, "z", tmp_path / "views")
     rendered_views(SPLATS.select(torch.arange(len(SPLATS)) % 2 == 0), 2, "z", tmp_path / "views")
     assert len(chosen) == 2

@@ -9,8 +9,8 @@ from box_splat import box_splat
 from scenes import write_scene
 from scipy.spatial.transform import Rotation
 
-from lang3dxl_ns.attach.frames import camera_in, find_frame
-from lang3dxl_ns.attach.known_frames import RUN_TRANSFORM, known_frames
+from lang3dxl_ns.attachment.frames import camera_in, find_frame
+from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames
 from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.rendering.render import render
 
