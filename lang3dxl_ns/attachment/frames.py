@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
@@ -23,7 +24,7 @@ from lang3dxl_ns.scene.photo import Photo
 
 FITS = 0.5
 """Correlation of renderings with their photos above which a frame is right; wrong ones reach 0.3."""
-_CLOSE = 0.85
+_CLOSE = 0.75
 """Correlation from which a frame isn't refined, and no other one tried."""
 _PROMISING = 0.15
 """Correlation below which a frame is not worth refining."""
@@ -37,6 +38,8 @@ _ROUNDS = ((48, 40), (96, 40))
 """Refinement: longer sides in pixels, and steps at each."""
 _RATE = 4e-3
 """Adam's, in radians and shares of the scene's size."""
+_COVERED = 0.05
+"""Share of a photo that the splat must cover."""
 _SEES = 0.05
 """Opacity of Gaussians that registration takes part of the shape."""
 
@@ -149,8 +152,8 @@ class _Comparison:
     def fit(self, splats: Splats, name: str, similarity: Similarity) -> Fit:
         scores, gains = [], []
         for photo in self.photos:
-            drawn = _gray(splats, camera_in(similarity, photo.tracked))
-            mask, gray = photo.mask.to(drawn.device), photo.gray.to(drawn)
+            drawn, covered = _gray(splats, camera_in(similarity, photo.tracked))
+            mask, gray = photo.mask.to(drawn.device) & covered, photo.gray.to(drawn)
             scores.append(float(_correlation(drawn, gray, mask)))
             gains.append(float(gray[mask].mean() / drawn[mask].mean().clamp_min(1e-3)) if mask.any() else 1.0)
         return Fit(name, similarity, float(np.mean(scores)), tuple(gains))
@@ -171,8 +174,8 @@ class _Comparison:
                 loss = torch.stack([self._loss(splats, whole, photo) for photo in self.photos]).mean()
                 optimizer.zero_grad()
                 loss.backward()
-            if float(loss) < lowest:
-                best, lowest = whole.detach().numpy(), float(loss)
+            if float(loss.detach()) < lowest:
+                best, lowest = whole.detach().numpy(), float(loss.detach())
             optimizer.step()
             advance()
         return best
@@ -183,8 +186,8 @@ class _Comparison:
         view = pose @ similarity.inverse()
         view = torch.cat([view[:3] * scale, view[3:]])
         camera = photo.tracked.lens.camera(view.float())
-        drawn = _gray(splats, camera)
-        return 1 - _correlation(drawn, photo.gray.to(drawn), photo.mask.to(drawn.device))
+        drawn, covered = _gray(splats, camera)
+        return 1 - _correlation(drawn, photo.gray.to(drawn), photo.mask.to(drawn.device) & covered)
 
 
 def _similarity(values: Float[Tensor, "7"], middle: Float[Tensor, "3"], size: float) -> Float[Tensor, "4 4"]:
@@ -198,18 +201,20 @@ def _similarity(values: Float[Tensor, "7"], middle: Float[Tensor, "3"], size: fl
     return torch.cat([top, top.new_tensor([[0.0, 0, 0, 1]])])
 
 
-def _gray(splats: Splats, camera: Camera) -> Float[Tensor, "h w"]:
-    """The brightness of a rendering over black."""
+def _gray(splats: Splats, camera: Camera) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """The brightness of a rendering, and where there is one: what is behind the splat is not in it."""
     pose = camera.view_matrix.detach()
     colors = splats.colors(-pose[:3, :3].T @ pose[:3, 3]).mean(1, keepdim=True)
-    return rasterize(splats.gaussians, camera, colors, antialiased=splats.antialiased).image[..., 0]
+    raster = rasterize(splats.gaussians, camera, colors, antialiased=splats.antialiased)
+    alpha = raster.alpha[..., 0].detach()
+    return raster.image[..., 0], -F.max_pool2d(-alpha[None], 3, 1, 1)[0] > 0.8  # without the edges
 
 
 def _correlation(
     a: Float[Tensor, "h w"], b: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
 ) -> Float[Tensor, ""]:
-    """Pearson's, over the mask; 0 where one is flat."""
-    if int(mask.sum()) < 2:
+    """Pearson's, over the mask; 0 where one is flat, or the mask is small."""
+    if float(mask.float().mean()) < _COVERED:
         return a.sum() * 0
     a, b = a[mask] - a[mask].mean(), b[mask] - b[mask].mean()
     return (a * b).sum() / (a.square().sum() * b.square().sum()).clamp_min(1e-12).sqrt()

@@ -45,9 +45,11 @@ _CLOSE = 0.1
 _MOST_CLOSE = 0.1
 _COVERED = 0.35
 """Share of a view that the splat must cover."""
-_SHARP = (0.5, 8.0)
-"""Median size of the Gaussians in a view, pixels: about one in the photos that a splat was made from; a view
-of much larger ones is blurred."""
+_BLURRED = 2.0
+"""Median size of the Gaussians in a view, relative to that in most views, from which it is blurred: too close
+for what the splat was made from."""
+_TILT = 0.4
+"""Angle in radians between up and the nearest axis, at most."""
 _CANDIDATES = 5
 """Candidates for every view wanted."""
 _SIDE = 96
@@ -93,20 +95,24 @@ def solids(splats: Splats, most: int = 200_000) -> Splats:
 
 
 def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:
-    """The direction, near one of the axes, against which the ground lies: flat Gaussians that face it are
-    at the bottom of the scene, while its top has roofs and trees."""
+    """The direction, near one of the axes, against which the ground lies: of all flat things at an end of the
+    scene, the ground is the largest."""
     normals, area = _normals(solid)
-    near = (solid.means - center).norm(dim=1) < 3 * radius
+    near = (solid.means - center).norm(dim=1) < 4 * radius
+    normals, area, places = normals[near], area[near], solid.means[near] - center
     best, direction = -math.inf, _axis("z").to(normals)
     for name in ("z", "-z", "y", "-y", "x", "-x"):
         axis = _axis(name).to(normals)
-        heights, facing = (solid.means - center) @ axis, (normals @ axis).abs() > math.cos(0.4)
-        low, high = heights[near].quantile(0.25), heights[near].quantile(0.75)
-        bottom, top = near & facing & (heights < low), near & facing & (heights > high)
-        score = float(area[bottom].sum() - area[top].sum())
-        if score > best and bottom.any():
-            turned = normals[bottom] * (normals[bottom] @ axis).sign()[:, None]
-            best, direction = score, F.normalize((turned * area[bottom, None]).sum(0), dim=0)
+        facing = (normals @ axis).abs() > math.cos(_TILT)
+        if not facing.any():
+            continue
+        turned = normals[facing] * (normals[facing] @ axis).sign()[:, None]
+        own = F.normalize((turned * area[facing, None]).sum(0), dim=0)
+        heights = places @ own
+        ground = (heights - heights.quantile(0.03)).abs() < 0.15 * radius
+        score = float(area[ground & ((normals @ own).abs() > math.cos(0.3))].sum())
+        if score > best:
+            best, direction = score, own
     return direction
 
 
@@ -120,7 +126,7 @@ def _normals(solid: Splats) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     thin = solid.scales.argmin(1)
     normals = turns.gather(2, thin[:, None, None].expand(-1, 3, 1))[..., 0]
     area = solid.scales.prod(1) / solid.scales.amin(1).clamp_min(1e-12)
-    return normals, area.clamp_max(float(area.quantile(0.95)))
+    return normals, area.clamp_max(float(area.quantile(0.99)))
 
 
 def _axis(name: str) -> Float[Tensor, "3"]:
@@ -210,16 +216,20 @@ def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
     """
     sample = torch.linspace(0, len(splats) - 1, min(_SAMPLE, len(splats)), dtype=torch.float64).long()
     free = _FreeSpace(solids(splats), extent)
-    shown, cameras = [], []
+    shown, sizes, cameras = [], [], []
     with progress("choosing views", _CANDIDATES * count) as advance:
         for camera in candidates(extent, free, _CANDIDATES * count):
-            if (pixels := _judged(splats, camera, extent)) is not None:
+            if (judged := _judged(splats, camera, extent)) is not None:
+                pixels, size = judged
                 shown.append(pixels[sample.to(pixels.device)].cpu())
+                sizes.append(size)
                 cameras.append(camera)
             advance()
     if not cameras:
         raise UserError("no view shows this splat well: give its photos (--data)")
-    found = _cover(torch.stack(shown), min(count, len(cameras)))
+    sharp = torch.tensor(sizes) <= _BLURRED * torch.tensor(sizes).median()
+    cameras = [camera for camera, keep in zip(cameras, sharp, strict=True) if keep]
+    found = _cover(torch.stack(shown)[sharp], min(count, len(cameras)))
     say(f"{len(found)} views chosen of {len(cameras)} that show the splat well")
     return [cameras[i] for i in found]
 
@@ -235,8 +245,9 @@ def _cover(shown: Float[Tensor, "views n"], count: int) -> list[int]:
     return sorted(chosen)
 
 
-def _judged(splats: Splats, camera: Camera, extent: Extent) -> Float[Tensor, " n"] | None:
-    """Pixels that each Gaussian fills in a small view; None for a view that isn't worth taking."""
+def _judged(splats: Splats, camera: Camera, extent: Extent) -> tuple[Float[Tensor, " n"], float] | None:
+    """Pixels that each Gaussian fills in a small view, and the median size of those seen, in pixels of the
+    large one; None for a view that isn't worth taking."""
     small = resized(camera, _SIDE)
     view = render(splats, small)
     solid = view.alpha > 0.5
@@ -251,11 +262,7 @@ def _judged(splats: Splats, camera: Camera, extent: Extent) -> Float[Tensor, " n
         return None
     pose = camera.view_matrix.to(splats.means)
     depth = (splats.means[seen] @ pose[2, :3] + pose[2, 3]).clamp_min(1e-6)
-    size = splats.scales[seen].amax(1) * LENS.fx / depth
-    order = size.argsort()
-    middle = torch.searchsorted(pixels[seen][order].cumsum(0), pixels[seen].sum() / 2)
-    low, high = _SHARP
-    return pixels if low < float(size[order[middle.clamp_max(len(order) - 1)]]) < high else None
+    return pixels, float((splats.scales[seen].amax(1) * LENS.fx / depth).median())
 
 
 class _FreeSpace:
@@ -283,10 +290,10 @@ def candidates(extent: Extent, free: _FreeSpace, count: int) -> Iterator[Camera]
 
 
 def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """From 0.5 to 2.2 radii, up to 40 degrees above the ground; at something in the inner half."""
+    """From 0.8 to 5 radii away, up to 40 degrees above the ground; at something in the inner half."""
     angle, height, distance, *aim = torch.rand(6, generator=draw).tolist()
     elevation = math.radians(40) * height**2
-    away = extent.radius * 0.5 * 4.4**distance
+    away = extent.radius * 0.8 * 6.0**distance
     side, front = _level(extent.up)
     direction = math.cos(2 * math.pi * angle) * side + math.sin(2 * math.pi * angle) * front
     floor = extent.center + (extent.ground + 0.08 * extent.radius) * extent.up

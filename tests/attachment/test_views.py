@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.attachment import views
 from lang3dxl_ns.attachment.views import (
-    Extent,
     LENS,
+    Extent,
     candidates,
     choose_views,
     looking,
