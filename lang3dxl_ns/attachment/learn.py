@@ -92,6 +92,8 @@ def learn(
             dense,
             lambda: bar.advance(learning),
         )
+    if decoder.learned is not None:
+        say(decoder.learned)
     return decoder.eval().requires_grad_(False), codes
 
 

@@ -125,7 +125,7 @@ def make_all(
                     failed[run] = str(reason)
                 bar.update(task, advance=1, description=run.name)
                 report(figures, failed)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):
             for process in active_children():  # Ctrl-C has reached them; other signals have not
                 process.terminate()
             threads.shutdown(cancel_futures=True)

@@ -232,8 +232,6 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     _reset_peak()
     start = _now()
     trainer.train()
-    if trainer.interrupted:  # an interrupted run exits normally, but has no result
-        raise KeyboardInterrupt
     seconds = _now() - start
     peak = _peak()
     figures = average([photo.metrics for photo in trainer.pipeline.evaluation.evaluate("held-out")])

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import tyro
 
+from lang3dxl_ns.common.checks import check_address
+
 
 @dataclass(kw_only=True)
 class View:
@@ -33,6 +35,7 @@ class View:
         from lang3dxl_ns.plugin.open_run import open_run
         from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 
+        check_address(self.host, self.port)
         if self.text:
             os.environ[QUERY_VARIABLE] = self.text
         config, pipeline, _ = open_run(self.run)

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
-from lang3dxl_ns.components.losses import resize
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.rendering.gathering import Composite, gather
+from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
 
 ClipMaps = Callable[[], Iterable[Float[Tensor, "hd wd c"]]]
 DenseMaps = Callable[[], Iterable[Float[Tensor, "t t d"]]]
@@ -66,11 +64,10 @@ def learn_codes(
 
     def targets():
         for view in views:
-            clip = view.clip if basis is None else basis.to(view.clip).coordinates(view.clip)
-            dense = None
+            maps = [view.clip if basis is None else basis.to(view.clip).coordinates(view.clip)]
             if fine_basis is not None and view.dense is not None:
-                dense = fine_basis.to(clip).coordinates(_unit(view.dense))
-            yield view.composite, pixel_features(clip, dense, view.mask, view.size)
+                maps.append(fine_basis.to(view.clip).coordinates(_unit(view.dense)))
+            yield view.composite, Pixels.of(maps, view.size, view.mask)
 
     features, mass = gather(len(means), targets(), channels, means)
     if fine_basis is not None:
@@ -81,19 +78,3 @@ def learn_codes(
 
 def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:
     return F.normalize(dense.float(), dim=-1)
-
-
-def pixel_features(
-    clip: Float[Tensor, "hd wd c"],
-    dense: Float[Tensor, "t t d"] | None,
-    mask: Bool[Tensor, "h w"] | None,
-    size: tuple[int, int],
-) -> Float[Tensor, "h w out"]:
-    """A photo's targets at every pixel (bilinear), and a last channel of 1; all 0 outside the mask [H, W],
-    and where a target isn't finite."""
-    maps = [resize(target, size) for target in (clip, dense) if target is not None]
-    pixels = torch.cat([*maps, torch.ones_like(maps[0][..., :1])], dim=-1)
-    counts = pixels.isfinite().all(-1, keepdim=True)
-    if mask is not None:
-        counts &= resize(mask[..., None].to(pixels), size) >= 0.5
-    return torch.where(counts, pixels, 0.0)

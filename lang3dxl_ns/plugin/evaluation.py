@@ -173,9 +173,10 @@ class Evaluation:
         synchronize()
         seconds = perf_counter() - start
         metrics, images = self._model.get_image_metrics_and_images(outputs, batch)
+        metrics = {"cc_psnr": self._model.corrected_psnr(outputs, batch)} | metrics
         metrics |= self._model.feature_metrics(camera, batch)
         metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
-        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, "mask" in batch)
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, photo.mask_path is not None)
         if score is not None:
             score(camera, evaluated, batch, photo)
         return evaluated

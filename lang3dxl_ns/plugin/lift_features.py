@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from copy import deepcopy
 from functools import partial
 
+import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch.nn import Parameter
 
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.model import Lang3DXLModel
+
+LONGER_SIDE = 1_600
+"""Pixels of the longer side at which larger photos are gathered: a CLIP crop covers hundreds of pixels, and
+time and memory grow with their number."""
 
 
 def learn_from_photos(
@@ -33,11 +39,20 @@ def learn_from_photos(
 
 
 def _view(model: Lang3DXLModel, camera: Cameras, batch: Batch) -> TargetView:
-    rows, columns = batch["image"].shape[:2]
+    camera = working_camera(camera)
     return TargetView(
         partial(model.composite, camera),
-        (rows, columns),
+        (int(camera.height.item()), int(camera.width.item())),
         batch["clip_target"],
         batch.get("dense_target"),
         batch["mask"][..., 0] if "mask" in batch else None,
     )
+
+
+def working_camera(camera: Cameras) -> Cameras:
+    """The camera, with an image plane of at most `LONGER_SIDE` pixels."""
+    longer = int(torch.maximum(camera.width, camera.height).max())
+    if longer > LONGER_SIDE:
+        camera = deepcopy(camera)
+        camera.rescale_output_resolution(LONGER_SIDE / longer)
+    return camera

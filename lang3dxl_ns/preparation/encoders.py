@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.preparation.light import in_known_light
 
 CLIP_OPTION = "--pipeline.datamanager.clip"
@@ -56,7 +57,7 @@ def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     Raises UserError if there is no such folder, the model can't be downloaded, or files are missing.
     """
     name = str(name_or_dir)
-    local = Path(name).expanduser()
+    local = expanded(name)
     if name == BUILTIN:
         folder = _BUILTIN_FOLDERS[option]
     else:

@@ -17,7 +17,7 @@ from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import FARTHEST, Reconstruction, TrackedPhoto, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
-from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.photo import Photo, upright_in_model
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
@@ -65,7 +65,10 @@ def read_collection(data: str | Path) -> PhotoCollection:
         return _collection(folder, *read_transforms(folder / TRANSFORMS))
     place = folder / model if model is not None else reconstruct_scene(folder)[1]
     images, reconstruction = folder / images_path(folder), read_reconstruction(place)
-    photos, left_out = usable_photos(reconstruction, images, lambda name: find_mask(folder / "masks", name))
+    photos, kept, left_out = usable_photos(
+        reconstruction, images, lambda name: find_mask(folder / "masks", name)
+    )
+    reconstruction = replace(reconstruction, photos=kept)
     return _collection(folder, photos, left_out, reconstruction, model is None or model == OWN_MODEL)
 
 
@@ -95,8 +98,9 @@ def images_path(data: Path, named: Path = Path("images")) -> Path:
 
 def usable_photos(
     reconstruction: Reconstruction, images: Path, mask_of: MaskOf, follow_links: bool = False
-) -> tuple[dict[Path, Photo], dict[str, UserError]]:
-    """The photos of a COLMAP model that are on disk, by their files, and why the others can't be used.
+) -> tuple[dict[Path, Photo], dict[str, TrackedPhoto], dict[str, UserError]]:
+    """The photos of a COLMAP model that are on disk, by their files; their entries in the model, turned as
+    the files are; and why the others can't be used.
 
     Args:
         reconstruction: the model.
@@ -105,15 +109,17 @@ def usable_photos(
         follow_links: whether photos may be links that leave the folder.
     """
     photos, left_out = dict[Path, Photo](), dict[str, UserError]()
+    kept = dict[str, TrackedPhoto]()
     for name, tracked in reconstruction.photos.items():
         path = images / name
         try:
             if not inside(images, name, follow_links).is_file():
                 raise UserError(f"there is no {path}")
-            photos[path] = Photo.from_model(tracked, path, mask_of(name))
+            kept[name] = upright_in_model(tracked, path)
+            photos[path] = Photo.from_model(kept[name], path, mask_of(name))
         except UserError as reason:
             left_out[name] = reason
-    return photos, left_out
+    return photos, kept, left_out
 
 
 # ── transforms.json ─────────────────────────────────────────────────────────────────────────────────────

@@ -15,17 +15,30 @@ from lang3dxl_ns.common.errors import UserError
 DistanceRule = Literal["median", "mean", "mean-inner"]
 AngleRule = Literal["half", "paper", "exact"]
 RegionLevel = Literal["small", "medium", "large"]
+Quality = Literal["fast", "normal", "fine"]
 DENSE_MODEL = "facebook/dinov2-small"
 """For semantics that are trained with the scene."""
 
 
-_BOUNDS = {"scales": (1, 100), "dense_tokens": (1, 1024), "crop_batch": (1, 1 << 16), "workers": (1, 1024)}
+_BOUNDS = {
+    "longer_side": (16, 1 << 16),
+    "scales": (1, 100),
+    "dense_tokens": (1, 1024),
+    "crop_batch": (1, 1 << 16),
+    "workers": (1, 1024),
+}
 
 
 @dataclass
 class PreparationConfig:
     """Settings of the targets."""
 
+    longer_side: int = 1600
+    """Pixels of a photo's longer side at most: larger photos are shrunk once, before crops are cut and colors
+    are trained."""
+    quality: Quality = "normal"
+    """Number of crops. normal: at most 2,500 of a photo for an encoder of 224 pixels (as many pixels of other
+    encoders); fast: at most 700; fine: no bound, some 10,000 in a photo of 1,600 pixels."""
     clip: str = "openai/clip-vit-base-patch32"
     """CLIP in Hugging Face format: a name, a folder, or "builtin". Queries need the same one. The paper uses
     this architecture fine-tuned on landmarks."""

@@ -321,7 +321,8 @@ class Scene:
 
     def best_views(self, question: Question) -> list[str]:
         """For each prompt the name of the training photo whose view shows it best, or comes closest."""
-        return [(found.views or found.closest)[0].name for found in self.places(question, most=1)]
+        rows = range(len(question.prompts))
+        return [self._ranked(question, row)[0].name for row in rows]
 
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
@@ -486,15 +487,22 @@ class Scene:
             raise UserError(f"{text!r} are {len(question.prompts)} prompts: ask for one at a time")
         return question
 
-    def _found(self, question: Question, row: int, most: int) -> Found:
-        scores, threshold = question.relevancy[row], question.thresholds[row]
-        means = self.splats.means
-        ranks = rank_views(self.visible, means, scores, threshold)
-        closest = [
+    def _ranked(self, question: Question, row: int) -> list[Viewpoint]:
+        """All training views, those that show a prompt first; best first."""
+        ranks = rank_views(self.visible, self.splats.means, question.relevancy[row], question.thresholds[row])
+        views = [
             Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
             for name, found in ranks.items()
         ]
-        closest.sort(key=lambda v: v.rank, reverse=True)
+
+        def order(view: Viewpoint) -> tuple[bool, float]:
+            return view.area * self.visible[view.name].size >= _LEAST_PIXELS, view.rank
+
+        return sorted(views, key=order, reverse=True)
+
+    def _found(self, question: Question, row: int, most: int) -> Found:
+        scores, threshold = question.relevancy[row], question.thresholds[row]
+        means, closest = self.splats.means, self._ranked(question, row)
         views = [v for v in closest if v.area * self.visible[v.name].size >= _LEAST_PIXELS]
         box = strongest_match(means, scores, self._mass, threshold, self._gap) if views else None
         return Found(

@@ -11,12 +11,16 @@ import pytest
 from painted_scene import painted_scene
 from PIL import Image
 
-from lang3dxl_ns.benchmarks.viewer import SWITCHES
 from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.web.write_page import write_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SIDE = 384
+SWITCHES = [
+    *("--headless", "--no-sandbox", "--disable-background-networking", "--disable-component-update"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+]
+"""WebGL in software, as on a machine without a GPU."""
 
 
 class Quiet(SimpleHTTPRequestHandler):

@@ -19,6 +19,7 @@ from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.query.heat_maps import color
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.scene.camera import Camera
 
 _HERE = Path(__file__).parent
@@ -28,7 +29,7 @@ _FILES = ("index.html", "page.js", "splats.js", "LICENSES.txt")
 def write_page(
     scene: Scene,
     folder: Path,
-    texts: Sequence[str],
+    texts: Sequence[str | Prompt],
     title: str = "",
     credit: str = "",
     look: str | None = None,

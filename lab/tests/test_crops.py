@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from lang3dxl_ns.demo.clip_training.captions import CLASS, CLASSES
-from lang3dxl_ns.demo.clip_training.crops import (
+from lab.clip_training.captions import CLASS, CLASSES
+from lab.clip_training.crops import (
     OUTSIDE,
     SAMPLES,
     Crops,
@@ -17,7 +17,7 @@ from lang3dxl_ns.demo.clip_training.crops import (
     patch_labels,
     soft_labels,
 )
-from lang3dxl_ns.demo.clip_training.views import LandmarkViews
+from lab.clip_training.views import LandmarkViews
 from lang3dxl_ns.demo.landmark.labels import ELEMENT, PART
 from lang3dxl_ns.demo.landmark.materials import MATERIALS
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.demo.clip_training.captions import corpus
+from lab.clip_training.captions import corpus
 from lang3dxl_ns.preparation.encoders import ImageTextEncoder
 
 IMAGE_SIZE, PATCH = 48, 12

@@ -1,6 +1,6 @@
 """Training of the small CLIP that ships with the package, on crops of rendered landmarks with captions.
 
-    python -m lang3dxl_ns.demo.clip_training.train_clip --out DIR --cache DIR
+    python -m lab.clip_training.train_clip --out DIR --cache DIR
 
 About an hour on two CPU cores: one renders landmarks, one trains. --resume continues an interrupted run.
 Equal steps and seed and a complete cache of views give equal weights, unless the time limit applies.
@@ -24,22 +24,21 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from torch import Tensor, nn
 
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.clip_training.captions import (
+from lab.clip_training.captions import (
     ABSENT,
     CLASSES,
     GENERIC,
     Caption,
     draw_caption,
 )
-from lang3dxl_ns.demo.clip_training.contrastive import (
+from lab.clip_training.contrastive import (
     GENERIC_SHARE,
     caption_fit,
     contrastive_loss,
     in_doubt,
     patch_loss,
 )
-from lang3dxl_ns.demo.clip_training.crops import (
+from lab.clip_training.crops import (
     Crops,
     augment,
     draw_crops,
@@ -49,8 +48,8 @@ from lang3dxl_ns.demo.clip_training.crops import (
     patch_labels,
     soft_labels,
 )
-from lang3dxl_ns.demo.clip_training.photos import store_photos
-from lang3dxl_ns.demo.clip_training.small_clip import (
+from lab.clip_training.photos import store_photos
+from lab.clip_training.small_clip import (
     GRID,
     IMAGE_SIZE,
     as_encoder,
@@ -61,8 +60,9 @@ from lang3dxl_ns.demo.clip_training.small_clip import (
     save_clip,
     start_from_principal_components,
 )
-from lang3dxl_ns.demo.clip_training.teacher import score_photos, score_teacher
-from lang3dxl_ns.demo.clip_training.views import SPLITS, LandmarkViews, ViewFolder, background_rendering
+from lab.clip_training.teacher import score_photos, score_teacher
+from lab.clip_training.views import SPLITS, LandmarkViews, ViewFolder, background_rendering
+from lang3dxl_ns.common.errors import UserError
 
 _ABSENT_SHARE = 0.08  # of captions that fit no crop
 _CAPTIONS = 48  # texts per step: fewer than crops, since they repeat

@@ -1,6 +1,6 @@
 """Training of the small dense encoder: the CLIP's vision tower, taught to label patches of any image size.
 
-    python -m lang3dxl_ns.demo.clip_training.train_dense --clip DIR --out DIR --cache DIR
+    python -m lab.clip_training.train_dense --clip DIR --out DIR --cache DIR
 
 The CLIP sees crops of a few patches; a dense encoder sees whole photos of thousands. So its tower continues
 to learn the class of each patch, on larger images whose number of patches changes from step to step.
@@ -17,11 +17,11 @@ import torch
 import tyro
 from torch import nn
 
-from lang3dxl_ns.demo.clip_training.captions import CLASSES
-from lang3dxl_ns.demo.clip_training.contrastive import patch_loss
-from lang3dxl_ns.demo.clip_training.crops import augment, draw_crops, patch_labels
-from lang3dxl_ns.demo.clip_training.small_clip import PATCH, normalize
-from lang3dxl_ns.demo.clip_training.views import ViewFolder
+from lab.clip_training.captions import CLASSES
+from lab.clip_training.contrastive import patch_loss
+from lab.clip_training.crops import augment, draw_crops, patch_labels
+from lab.clip_training.small_clip import PATCH, normalize
+from lab.clip_training.views import ViewFolder
 
 _GRIDS = (6, 8, 12, 24)
 """Patches along an image's side."""

@@ -18,7 +18,7 @@ import tyro
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
-from lang3dxl_ns.demo.clip_training.captions import FAMILIES
+from lab.clip_training.captions import FAMILIES
 
 SPLITS = {"test": range(0, 1_000), "validation": range(5_000, 6_000), "train": range(10_000, 20_000)}
 """Landmark seeds of each split. Nothing is trained or tuned on the test seeds."""

@@ -7,13 +7,13 @@ import pytest
 import torch
 from PIL import Image
 
+from lab.clip_training.captions import CLASS, CLASSES, GENERIC, UNLABELED, Caption
+from lab.clip_training.contrastive import contrastive_loss, in_doubt
+from lab.clip_training.crops import draw_crops, join, label_shares, main_materials, soft_labels
+from lab.clip_training.photos import by_day, sky_mask, store_photos
+from lab.clip_training.small_clip import build_clip, build_tokenizer, load_clip, save_clip
+from lab.clip_training.views import COLOR, PART, LandmarkViews
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.clip_training.captions import CLASS, CLASSES, GENERIC, UNLABELED, Caption
-from lang3dxl_ns.demo.clip_training.contrastive import contrastive_loss, in_doubt
-from lang3dxl_ns.demo.clip_training.crops import draw_crops, join, label_shares, main_materials, soft_labels
-from lang3dxl_ns.demo.clip_training.photos import by_day, sky_mask, store_photos
-from lang3dxl_ns.demo.clip_training.small_clip import build_clip, build_tokenizer, load_clip, save_clip
-from lang3dxl_ns.demo.clip_training.views import COLOR, PART, LandmarkViews
 
 LABELS = {
     **{"window": 1, "facade": 2, "vegetation": 3, "street": 4, "car": 5, "balcony-fence": 6, "fence": 7},

@@ -11,9 +11,9 @@ from numpy import ndarray as Array
 from PIL import Image
 from scipy import ndimage
 
+from lab.clip_training.captions import CLASS, UNLABELED
+from lab.clip_training.views import COLOR, PART, LandmarkViews
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.clip_training.captions import CLASS, UNLABELED
-from lang3dxl_ns.demo.clip_training.views import COLOR, PART, LandmarkViews
 
 # their label: our class
 _CLASS_OF = {

@@ -17,8 +17,8 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.demo.clip_training.captions import CLASS, UNLABELED
-from lang3dxl_ns.demo.clip_training.views import (
+from lab.clip_training.captions import CLASS, UNLABELED
+from lab.clip_training.views import (
     COLOR,
     ELEMENT,
     HEIGHT,

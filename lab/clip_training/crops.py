@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.demo.clip_training.captions import CLASS, CLASSES, UNLABELED
-from lang3dxl_ns.demo.clip_training.views import COLOR, ELEMENT, MATERIAL, PART, LandmarkViews
+from lab.clip_training.captions import CLASS, CLASSES, UNLABELED
+from lab.clip_training.views import COLOR, ELEMENT, MATERIAL, PART, LandmarkViews
 from lang3dxl_ns.demo.landmark.labels import PARTS
 from lang3dxl_ns.demo.landmark.materials import MATERIALS
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.demo.clip_training.captions import FIT_OF_LABEL, FITS, MAY_BE, Caption
+from lab.clip_training.captions import FIT_OF_LABEL, FITS, MAY_BE, Caption
 
 GENERIC_SHARE = 0.1
 """How well a canonical phrase fits any crop, and the share of such captions."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lang3dxl_ns.demo.clip_training.captions import (
+from lab.clip_training.captions import (
     ADJECTIVES,
     CANONICAL,
     CLASS,
