@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy import ndarray as Array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.scene.colmap import Reconstruction
 
 Similarity = Float[Array, "4 4"]
@@ -52,7 +52,7 @@ def known_frames(reconstruction: Reconstruction, splat: Path) -> dict[str, Simil
 def _of_run(splat: Path) -> dict[str, Similarity]:
     for folder in splat.parents[:2]:
         try:
-            content = json.loads((folder / RUN_TRANSFORM).read_text())
+            content = read_json(folder / RUN_TRANSFORM)
             rows = np.array(content["transform"], np.float64).reshape(3, 4) * float(content["scale"])
         except (OSError, ValueError, LookupError, TypeError):
             continue

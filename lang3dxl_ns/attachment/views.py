@@ -19,7 +19,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import make_folder, write_atomically
+from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.match import as_bytes, save_picture
@@ -48,6 +48,8 @@ _COVERED = 0.35
 _BLURRED = 2.0
 """Median size of the Gaussians in a view, relative to that in most views, from which it is blurred: too close
 for what the splat was made from."""
+_PROBES, _ROOFED = 64, 0.7
+"""Places tried, and the share of them with matter above from which a scene is indoors."""
 _TILT = 0.4
 """Angle in radians between up and the nearest axis, at most."""
 _CANDIDATES = 5
@@ -175,7 +177,7 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCol
 def _kept(folder: Path, stamp: str) -> list[Camera] | None:
     """The cameras of an earlier call for the same splat."""
     try:
-        content = json.loads((folder / "views.json").read_text())
+        content = read_json(folder / "views.json")
         if content["of"] != stamp:
             return None
         return [
@@ -266,15 +268,32 @@ def _judged(splats: Splats, camera: Camera, extent: Extent) -> tuple[Float[Tenso
 
 
 class _FreeSpace:
-    """Where no matter is."""
+    """Where no matter is: not close to it and, in scenes under the sky, not below it either: a building of
+    which only the outside was seen is hollow."""
 
     def __init__(self, solid: Splats, extent: Extent) -> None:
-        self._tree, self._margin = KDTree(solid.means.cpu().numpy()), _NEAR * extent.radius
+        near = (solid.means - extent.center).norm(dim=1) < 3 * extent.radius
+        solid = solid.select(near)
+        self._extent, self._margin = extent, _NEAR * extent.radius
+        self._tree = KDTree(solid.means.cpu().numpy())
         self._reach = solid.scales.amax(1).clamp_max(0.2 * extent.radius).cpu().numpy()
+        self._plan = torch.stack(_level(extent.up), dim=1)
+        self._from_above = KDTree((solid.means @ self._plan).cpu().numpy())
+        self._heights = (solid.means @ extent.up).cpu().numpy()
+        self._width = 2 * (self._margin + float(np.median(self._reach)))
+        draw = torch.Generator().manual_seed(1)
+        places = [_inside(extent, draw)[0] for _ in range(_PROBES)]
+        self.indoors = sum(map(self.roofed, places)) > _ROOFED * _PROBES
 
     def __contains__(self, place: Float[Tensor, "3"]) -> bool:
         distance, rows = self._tree.query(place.cpu().numpy(), k=8)
-        return bool((distance - 2 * self._reach[np.minimum(rows, len(self._reach) - 1)] > self._margin).all())
+        far = distance - 2 * self._reach[np.minimum(rows, len(self._reach) - 1)] > self._margin
+        return bool(far.all()) and (self.indoors or not self.roofed(place))
+
+    def roofed(self, place: Float[Tensor, "3"]) -> bool:
+        """Whether there is matter above a place."""
+        rows = self._from_above.query_ball_point((place @ self._plan).cpu().numpy(), self._width)
+        return bool((self._heights[rows] > float(place @ self._extent.up) + self._margin).any())
 
 
 def candidates(extent: Extent, free: _FreeSpace, count: int) -> Iterator[Camera]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -12,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded, read_json
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.preparation.foreground import find_mask
-from lang3dxl_ns.scene.camera import Lens
-from lang3dxl_ns.scene.colmap import FARTHEST, Reconstruction, TrackedPhoto, read_reconstruction
+from lang3dxl_ns.scene.camera import Lens, check_pose
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
 from lang3dxl_ns.scene.photo_folder import find_photos
@@ -54,7 +54,7 @@ def read_collection(data: str | Path) -> PhotoCollection:
     Raises:
         UserError: there are no photos, or they can't be used, or the poses are damaged.
     """
-    folder = Path(data).expanduser().absolute()
+    folder = expanded(data).absolute()
     if is_video(folder) or (not folder.exists() and frames_folder(folder).is_dir()):
         folder = extract_frames(folder)
     if not folder.is_dir():
@@ -140,7 +140,7 @@ def read_transforms(path: Path) -> _Read:
         UserError: the file is damaged, or lists no photo.
     """
     try:
-        content = json.loads(path.read_text())
+        content = read_json(path)
         frames = content["frames"]
         photos, left_out, tracked = dict[Path, Photo](), dict[str, UserError](), dict[str, TrackedPhoto]()
         for frame in frames:
@@ -211,11 +211,8 @@ def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
 
 
 def _transforms_pose(photo: Photo, matrix: Any) -> TrackedPhoto:
+    check_pose(matrix)
     pose = np.array(matrix, dtype=np.float64)
-    if pose.shape not in ((3, 4), (4, 4)) or not (np.abs(pose) < FARTHEST).all():
-        raise ValueError(f"{photo.name} has no pose")
-    if not 1 / 8 < np.linalg.det(pose[:3, :3]) < 8:
-        raise ValueError(f"{photo.name} has a pose that is not a rotation and a position")
     rotation = (pose[:3, :3] * [1, -1, -1]).T  # OpenGL's camera axes to OpenCV's, inverted
     camera_from_world = np.hstack([rotation, -rotation @ pose[:3, 3:]])
     return TrackedPhoto(photo.name, photo.lens, camera_from_world, np.zeros((0, 3)), np.zeros((0, 2)))

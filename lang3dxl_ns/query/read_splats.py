@@ -21,6 +21,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.rendering.splats import Splats, harmonics_of
 
@@ -46,7 +47,7 @@ def find_splats(path: str | Path) -> Path:
     Raises:
         UserError: there is none.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     if path.is_file():
         return path
     if not path.is_dir():

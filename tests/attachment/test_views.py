@@ -59,8 +59,15 @@ def test_no_camera_stands_in_matter():
     inside = (np.abs(places - CENTER) < HALF_SIZES).all(axis=1)
     assert not inside.any()
     assert places[:, 2].min() > 0
-    assert torch.tensor([0.0, 0, 0.52]) not in free or np.abs(CENTER[2] - 0.5) > 0.1
+    assert torch.from_numpy(CENTER).float() not in free  # hollow, but under a roof
     assert torch.tensor([1.2, 0.0, 0.5]) not in free  # on a wall
+    assert torch.tensor([2.0, -2.0, 0.5]) in free
+
+
+def test_a_room_is_seen_from_within():
+    """The box without anything around it, from which most places have its top above them."""
+    room = Extent(torch.from_numpy(CENTER).float(), 0.6, torch.tensor([0.0, 0, 1]), -0.5)
+    assert torch.from_numpy(CENTER).float() in views._FreeSpace(solids(box_splat(0.1)), room)
 
 
 def test_chosen_views_show_more_than_the_first_ones():
