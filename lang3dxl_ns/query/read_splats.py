@@ -6,6 +6,7 @@ Sizes are compared with the file's before anything of that size is allocated. No
 from __future__ import annotations
 
 import gzip
+import pickle
 import re
 import struct
 from collections.abc import Callable, Mapping
@@ -323,7 +324,10 @@ def _splat(path: Path) -> Splats:
 
 
 def _checkpoint(path: Path) -> Splats:
-    state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        raise ValueError("it holds more than tensors, or is no checkpoint; nothing in it was run") from error
     if isinstance(state, dict) and isinstance(state.get("pipeline"), dict):
         return _splatfacto(state["pipeline"], path)
     if isinstance(state, dict) and isinstance(state.get("splats"), dict):

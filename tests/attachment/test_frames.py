@@ -66,7 +66,7 @@ def test_nerfstudio_frame_is_what_nerfstudio_computes(collection, tmp_path):
     poses[:, :3, 1:3] *= -1
     poses = poses[:, [0, 2, 1, 3]]
     poses[:, 2] *= -1
-    oriented, _ = cameras.auto_orient_and_center_poses(torch.from_numpy(poses), "up", "poses")
+    oriented, _ = cameras.auto_orient_and_center_poses(torch.from_numpy(poses).float(), "up", "poses")
     wanted = oriented[:, :3, 3] / oriented[:, :3, 3].abs().max()
     frame = known_frames(collection.reconstruction, tmp_path / "a.ply")["nerfstudio's, with z up"]
     centers = np.array([p.center for p in photos])
