@@ -35,7 +35,7 @@ _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
 class AttachConfig:
     """Settings of `attach`."""
 
-    views: int = 60
+    views: int = 48
     """Without photos: views of the splat to render and learn from."""
     up: Up = "auto"
     """Without photos: the splat's axis that points up (auto: by where its ground is)."""

@@ -31,11 +31,11 @@ from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
 
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
-LENS = Lens(640, 480, 512.0, 512.0, 320.0, 240.0)
+LENS = Lens(480, 360, 384.0, 384.0, 240.0, 180.0)
 """Of the views: 64 degrees wide, as a phone's."""
 BACKGROUND = (0.75, 0.8, 0.85)
 """Behind the splat: a pale sky."""
-_RULE = 1
+_RULE = 2
 """Increased when views are chosen or rendered in another way."""
 _OPAQUE = 0.3
 _NEAR = 0.03

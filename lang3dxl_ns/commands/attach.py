@@ -31,7 +31,7 @@ class Attach(PreparationConfig):
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Texts to look for at the end ("windows; towers"): a picture of the best view of each is written beside
     the scene."""
-    views: int = 60
+    views: int = 48
     """Without --data: number of views to render."""
     up: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
     """Without --data: the splat's axis that points up (auto: by where its ground is)."""
