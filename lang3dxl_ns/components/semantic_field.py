@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, MOST_DIMENSIONS, HashGrid
+from lang3dxl_ns.components.linear import linear
 
 Preset = Literal["default", "short", "paper", "official"]
 
@@ -173,7 +174,7 @@ class SemanticField(SemanticEncoder):
         grid_dim = clip_dim if s.indexed else self.grid.output_dim
         fourier_dim = s.code_dim * (1 + 2 * s.fourier_frequencies) if s.fourier_frequencies else 0
         self.layers = _hidden_layers(grid_dim + fourier_dim, s, generator)
-        self.output = _linear(s.hidden_width, clip_dim + dense_dim, generator)
+        self.output = linear(s.hidden_width, clip_dim + dense_dim, generator)
 
         self.level_weights: Tensor | None
         # All levels are open until `set_progress` is called.
@@ -269,16 +270,8 @@ def _hidden_layers(inputs: int, settings: FieldSettings, generator: torch.Genera
     layers: list[nn.Module] = []
     for depth in range(settings.hidden_layers):
         layers.append(
-            _linear(inputs if depth == 0 else settings.hidden_width, settings.hidden_width, generator)
+            linear(inputs if depth == 0 else settings.hidden_width, settings.hidden_width, generator)
         )
         if settings.activation == "every" or depth == settings.hidden_layers - 1:
             layers.append(nn.ReLU())
     return nn.Sequential(*layers)
-
-
-def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
-    """A linear layer with torch's default initial range, sampled from the given generator."""
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
-    for parameter in layer.parameters():
-        nn.init.uniform_(parameter, -(inputs**-0.5), inputs**-0.5, generator=generator)
-    return layer

@@ -13,7 +13,7 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES, without
-from lang3dxl_ns.preparation.encoders import BUILTIN
+from lang3dxl_ns.preparation.model_files import BUILTIN
 from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 
 

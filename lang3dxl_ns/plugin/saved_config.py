@@ -45,15 +45,19 @@ def read_config(path: Path) -> TrainerConfig:
 
 def read_model_config(path: Path) -> tuple[Any, Path]:
     """The model's settings of a run, and the folder of its checkpoints, relative to the run's: as
-    `read_config`, but without loading what the other settings belong to."""
-    model, checkpoints = _read(path, [("pipeline", "model"), ("relative_model_dir",)])
+    `read_config`, but without loading what the other settings belong to. Settings that an earlier version
+    did not have take their defaults: the checkpoint beside the file tells whether they fit."""
+    model, checkpoints = _read(path, [("pipeline", "model"), ("relative_model_dir",)], complete=True)
     if not is_dataclass(model) or not isinstance(checkpoints, Path):
         raise _no_config(path)
     return model, checkpoints
 
 
-def _read(path: Path, places: Sequence[Sequence[str]]) -> list[Any]:
-    """The settings at these places of a file, each named from the outermost in; None where there are none."""
+def _read(path: Path, places: Sequence[Sequence[str]], complete: bool = False) -> list[Any]:
+    """The settings at these places of a file, each named from the outermost in; None where there are none.
+
+    complete: give missing settings their defaults.
+    """
     try:
         found = _construct(read_text(path), places)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
@@ -66,6 +70,9 @@ def _read(path: Path, places: Sequence[Sequence[str]]) -> list[Any]:
             f"{path} can't be read ({error}): it is damaged, or from a version whose settings are no longer "
             "known; restore it, or train anew"
         ) from error
+    for settings in found if complete else ():
+        if is_dataclass(settings):
+            _complete(settings)
     odd = (line for settings in found if is_dataclass(settings) for line in _differences(settings))
     if first := next(odd, None):
         raise UserError(
@@ -111,6 +118,16 @@ def _differences(settings: Any, place: str = "") -> Iterator[str]:
             yield from _differences(value, f"{place}{name}.")
         elif name in hints and not _fits(value, hints[name]) and _fits(_default(settings, name), hints[name]):
             yield f"sets {place}{name} to {str(value)[:40]!r}, of another kind than this setting"
+
+
+def _complete(settings: Any) -> None:
+    """Give the settings that a file lacks their defaults."""
+    for field in fields(settings):
+        if field.name not in vars(settings):
+            setattr(settings, field.name, _default(settings, field.name))
+        value = getattr(settings, field.name)
+        if is_dataclass(value) and not isinstance(value, type):
+            _complete(value)
 
 
 def _default(settings: Any, name: str) -> Any:

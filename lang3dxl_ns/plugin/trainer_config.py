@@ -28,7 +28,7 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.saved_config import load_configs, read_config
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
-from lang3dxl_ns.preparation.encoders import check_encoders
+from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize

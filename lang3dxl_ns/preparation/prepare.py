@@ -22,6 +22,7 @@ from torch import Tensor
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.crop_budget import Crops, choose_crops, input_side
+from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import (
     CLIP_OPTION,
     DENSE_OPTION,
@@ -30,6 +31,7 @@ from lang3dxl_ns.preparation.encoders import (
     find_model,
     load_dense_encoder,
     load_image_text_encoder,
+    patch_reading,
     spoken,
 )
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
@@ -47,6 +49,8 @@ _READERS = 2
 """Threads that read photos while others are encoded."""
 _ANNOUNCED_CROPS = 5_000
 """Fewer are encoded in seconds: no duration is measured."""
+_PATCHES_PER_CROP = 32
+"""Windows of patch features are encoded this many times fewer at once than crops: they hold more."""
 _LONG_S = 1800.0
 """Seconds on a CPU from which the remedies are named."""
 
@@ -78,6 +82,8 @@ class _Task:
     has_regions: bool
     is_fine: bool = False
     """Whether the crops are small ones alone, on a finer grid."""
+    grids: tuple[Grid, Grid] | None = None
+    """Grids of a map of patch features, which then takes the place of crops."""
 
     @property
     def clip_kind(self) -> str:
@@ -145,6 +151,7 @@ def _plan(
     """A task per photo; unreadable photos go to `left_out`."""
     clip_model = find_model(config.clip, CLIP_OPTION)
     input_pixels = input_side(clip_model.folder)
+    patches = patch_reading(config.clip, config.clip_features)
     dense_model = None if not config.makes_dense else find_model(config.dense, DENSE_OPTION).identity
 
     def crops_of(photo: Photo, quality: Quality) -> Crops:
@@ -163,11 +170,18 @@ def _plan(
         clip = {**source, "encoder": clip_model.identity, "crop_sides": crops.sides, "rule": _CROP_RULE}
         if is_fine and crops.steps != THIRD:
             clip["steps"] = crops.steps
+        grids = None
+        if patches is not None:
+            grids = map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
+            sides = sorted(math.ceil(photo.width / columns) for _, columns in grids)
+            clip = {**source, "encoder": clip_model.identity, "crop_sides": sides}
+            clip |= {"patches": patches.recipe, "grids": grids, "rule": RULE}
         has_dense = dense_model is not None and (is_fine or not fine)
         dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if has_dense else None
         labels = None if regions is None else regions.settings(photo)
         settings = None if labels is None else {**source, **labels}
-        task = _Task(photo, crops, fast, clip, dense, settings, has_dense, labels is not None, is_fine)
+        has_regions = labels is not None
+        task = _Task(photo, crops, fast, clip, dense, settings, has_dense, has_regions, is_fine, grids)
         task.drop_current(store)
         tasks.append(task)
     without = [task.photo.name for task in tasks if not task.has_regions]
@@ -277,7 +291,13 @@ def _encode(
     crop_batch: int,
     store: FeatureStore,
 ) -> None:
-    if task.clip and clip:
+    if task.clip and clip and task.grids:
+        tokens, windows = clip.crop_size // clip.patch_size, max(crop_batch // _PATCHES_PER_CROP, 1)
+        lit = clip.in_known_light(image)
+        features = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
+        tensors = {"features": features, "valid": torch.ones_like(features[..., 0])}
+        store.write(task.clip_kind, task.photo.name, tensors, task.clip)
+    elif task.clip and clip:
         target = build_clip_target(
             clip.in_known_light(image),
             task.crops.sides,
@@ -301,7 +321,8 @@ def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: 
     total = 0
     for task in tasks:
         if task.clip and clip:
-            total += 2 * math.prod(task.crops.grid(task.photo.height, task.photo.width)) * (clip.dim + 1)
+            grid = task.grids[-1] if task.grids else task.crops.grid(task.photo.height, task.photo.width)
+            total += 2 * math.prod(grid) * (clip.dim + 1)
         if task.dense and dense:
             total += 2 * dense.tokens**2 * dense.dim
         if task.regions:
@@ -317,7 +338,7 @@ def _announce_duration(
     device: torch.device,
 ) -> None:
     """Log how many crops are encoded, and for how long, by the time that noise takes."""
-    tasks = [task for task in missing if task.clip]
+    tasks = [task for task in missing if task.clip and not task.grids]
     crops = sum(task.crops.count(task.photo.height, task.photo.width) for task in tasks)
     if crops < _ANNOUNCED_CROPS:
         return

@@ -69,7 +69,9 @@ class Scene:
         looks: lighting of the photos; None where all share one.
         background: color behind the scene, 0…1; None for black.
         config: defaults of queries.
-        encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text.
+        encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text that
+            is not among `vectors`.
+        vectors: unit vectors of common words, which need no CLIP.
         cache: file to keep which Gaussians the photos show; None: they are measured in every process.
         backend: the rasterizer, see `rasterize`.
         watch: called with a short description of slow work; None: a progress bar.
@@ -86,6 +88,7 @@ class Scene:
         background: Float[Tensor, "3"] | None = None,
         config: QueryConfig | None = None,
         encode_texts: EncodeTexts | None = None,
+        vectors: Mapping[str, Float[Tensor, " c"]] | None = None,
         cache: Path | None = None,
         backend: Backend = "auto",
         watch: Callable[[str], None] | None = None,
@@ -93,7 +96,8 @@ class Scene:
         self.splats, self.file, self.decoder, self.codes = splats, file, decoder, codes
         self.looks, self.background, self.backend = looks, background, backend
         self.config = config or QueryConfig()
-        self._encode_texts, self._cache, self._watch = encode_texts, cache, watch
+        self._encode_texts, self._vectors = encode_texts, vectors
+        self._cache, self._watch = cache, watch
         self._doubt_alone: dict[str, float] = {}
         """Doubt about texts without their synonyms."""
 
@@ -526,13 +530,19 @@ class Scene:
     @cached_property
     def engine(self) -> QueryEngine:
         """The query engine; decodes the features of all Gaussians at first use."""
-        return make_engine(*self._semantics(), self.config.temperature)
+        engine = make_engine(*self._semantics(), self.config.temperature)
+        return engine.calibrated(self.text.yardstick.to(self.device))
 
     @cached_property
     def text(self) -> TextEncoder:
-        """The encoder of prompts; loads the scene's CLIP at first use."""
+        """The encoder of prompts; loads the scene's CLIP at the first text that it doesn't know."""
         self._semantics()
-        return TextEncoder(self._encode_texts or text_encoder(self.file, self.device), self.config.text)
+        return TextEncoder(self._encode, self.config.text, self._vectors)
+
+    def _encode(self, texts: list[str]) -> Float[Tensor, "n c"]:
+        if self._encode_texts is None:
+            self._encode_texts = text_encoder(self.file, self.device)
+        return self._encode_texts(texts)
 
     @cached_property
     def doubts(self) -> Doubts:

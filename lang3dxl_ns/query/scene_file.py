@@ -27,7 +27,7 @@ from torch import Tensor
 from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.looks import Looks
@@ -37,6 +37,7 @@ from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
 from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
 
@@ -105,6 +106,10 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         field = scene.looks.field
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
+        if scene.file.clip is not None:
+            words = common_words()
+            described["words"] = list(words)
+            content["words"] = _array(scene.text.vectors(words), np.float16)
     masks = {i: _mask_of(photo) for i, photo in enumerate(scene.photos) if photo.mask is not None}
     content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
     file = replace(scene.file, photos=[replace(photo, mask=None) for photo in scene.photos])
@@ -189,7 +194,7 @@ def read_scene(
     Raises:
         UserError: the file is missing, damaged, cut short, or of a newer version.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     with _reported(path):
         return _read(path, torch.device(device or best_device()), config, encode_texts)
 
@@ -200,7 +205,7 @@ def describe_scene_file(path: str | Path) -> dict[str, Any]:
 
     Raises UserError as `read_scene` does; no tensor is read.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     with _reported(path), _opened(path) as file:
         described, sizes = _description(file), _sizes(file)
         return {
@@ -249,6 +254,7 @@ class _Description:
     background: list[float] | None
     decoder: dict[str, Any] | None
     looks: dict[str, Any] | None
+    words: list[str] | None
 
 
 def _read(
@@ -263,6 +269,7 @@ def _read(
             codes = _codes(file, sizes, decoder.bounded, len(splats)).to(device)
         if about.looks is not None:
             looks = Looks(_looks(file, sizes, about.looks).to(device))
+        vectors = None if about.words is None else _vectors(file, sizes, about.words)
         photos = [
             replace(photo, mask=_checked_mask(file.get_tensor(f"mask.{i}")) if f"mask.{i}" in sizes else None)
             for i, photo in enumerate(about.scene.photos)
@@ -271,7 +278,7 @@ def _read(
     return Scene(
         splats, replace(about.scene, photos=photos), decoder, codes,
         looks=looks, background=background, config=config, encode_texts=encode_texts,
-        cache=path.with_name(f".{path.stem}.visible"),
+        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
     )  # fmt: skip
 
 
@@ -301,6 +308,7 @@ def _description(file: Any) -> _Description:
         background,
         content.get("decoder"),
         content.get("looks"),
+        content.get("words"),
     )
 
 
@@ -358,6 +366,12 @@ def _parameters(settings: Mapping[str, Any], channels: int) -> int:
     table = settings["levels"] * 2 ** int(settings["log2_table_size"]) * settings["features_per_level"]
     inputs = settings["levels"] * settings["features_per_level"] + channels + 100
     return table + width * (inputs + depth * width + channels)
+
+
+def _vectors(file: Any, sizes: Mapping[str, list[int]], words: list[str]) -> dict[str, Float[Tensor, " c"]]:
+    _expect(isinstance(words, list) and all(isinstance(word, str) for word in words), "its words")
+    _expect(len(sizes["words"]) == 2 and sizes["words"][0] == len(words), "its words")
+    return dict(zip(words, F.normalize(_tensor(file, "words"), dim=1), strict=True))
 
 
 def _looks(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> AppearanceField:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -17,6 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
+from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 
@@ -127,12 +128,18 @@ class TextEncoder:
 
     Args:
         encode: the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
+        known: unit vectors of texts that need not be encoded.
     """
 
-    def __init__(self, encode: EncodeTexts, config: TextConfig | None = None) -> None:
+    def __init__(
+        self,
+        encode: EncodeTexts,
+        config: TextConfig | None = None,
+        known: Mapping[str, Float[Tensor, " c"]] | None = None,
+    ) -> None:
         self.config = config or TextConfig()
         self._encode = encode
-        self._vectors: dict[str, Float[Tensor, " c"]] = {}
+        self._vectors = dict(known or {})
         self._synonyms: dict[str, list[str]] = {}
         self._table = SynonymTable()
         self._lock = threading.Lock()
@@ -164,6 +171,12 @@ class TextEncoder:
             self.vectors(self.config.negatives),
             against=[self._against(text) for text in texts],
         )
+
+    @cached_property
+    def yardstick(self) -> Queries:
+        """The words by which an encoder's cosines are measured, whatever the settings are."""
+        words = self.vectors((*NEGATIVES, *UNRELATED))
+        return Queries(words, (), ())
 
     def _against(self, text: str) -> list[int]:
         return competitors(self.config.negatives, [text, *self.synonyms(text)])

@@ -17,6 +17,7 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 from lang3dxl_ns.common import console as progress
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import prepare as module
+from lang3dxl_ns.preparation.dense_map import build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
 from lang3dxl_ns.preparation.prepare import TargetReader, prepare
 from lang3dxl_ns.preparation.pyramid import build_clip_target
@@ -266,6 +267,25 @@ def test_a_disk_that_fills_up_keeps_what_was_written_and_nothing_half_written(
     assert set(entries(store)) == {store.path(kind, NAMES[0]).name for kind in ("clip", "dense")}
     monkeypatch.undo()
     assert run(photos, config, store).encoded == 2
+
+
+def test_dense_clip_features_take_the_place_of_crops(photos, config, store, calls, models):
+    crops = run(photos, config, store).reader.clip("north/b.png")
+    dense = replace(config, clip_features="dense")
+    calls.clear()
+    reader = run(photos, dense, store).reader
+    assert calls == {"clip loaded": 1, "read": 3}  # no crop, and DINO's entries stay
+    found = reader.clip("north/b.png")
+    clip = load_image_text_encoder(models["clip"], "cpu")
+    grids = map_grids(80, 100, tokens=4, least=6)
+    expected = build_dense_map(photos[1].read(), grids, clip.encode_patches, 4, clip.patch_size, 1)
+    torch.testing.assert_close(found.features, expected.half(), atol=2e-3, rtol=2e-3)
+    assert found.features.shape[:2] == grids[-1] != crops.features.shape[:2]
+    assert (found.valid == 1).all() and found.crop_fractions == sorted(found.crop_fractions)
+    reader.check(clip)
+    calls.clear()
+    assert run(photos, dense, store).encoded == 0 and not calls
+    assert run(photos, replace(dense, dense_tokens=12), store).encoded == 3
 
 
 def test_without_dense_features_no_dense_entry_is_made_or_read(photos, config, store):

@@ -7,7 +7,7 @@ import torch
 
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.gathering import Pixels, filled_pixels, gather
+from lang3dxl_ns.rendering.gathering import Pixels, filled_pixels, gather, lift_masks
 from lang3dxl_ns.scene.camera import Camera
 
 SIZE = 24
@@ -187,3 +187,17 @@ def test_pixels_that_a_gaussian_fills_are_its_weights():
         alone[index] = 1
         expected = (composite(camera, alone)[..., 0] * weight).sum()
         torch.testing.assert_close(filled[index], expected)
+
+
+def test_masks_vote_for_the_gaussians_that_they_show():
+    """A vote is the share of a Gaussian's pixels in masks, by sums over pixels; unseen ones get none."""
+    weights = torch.rand(2, 5, 7, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights[..., 3] = 0
+    masks = torch.rand(2, 5, 7, generator=torch.Generator().manual_seed(1)) > 0.6
+    views = [(lambda carried, w=w: w @ carried, mask) for w, mask in zip(weights, masks, strict=True)]
+    votes = lift_masks(4, views, torch.zeros(1, dtype=torch.float64))
+    expected = (weights * masks[..., None]).sum((0, 1, 2)) / weights.sum((0, 1, 2)).clamp_min(1e-9)
+    torch.testing.assert_close(votes, expected)
+    assert votes[3] == 0 and (votes[:3] > 0).all()
+    everything = [(composite, torch.ones_like(mask)) for composite, mask in views]
+    torch.testing.assert_close(lift_masks(4, everything, weights)[:3], torch.ones(3, dtype=torch.float64))
