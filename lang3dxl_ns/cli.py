@@ -36,6 +36,7 @@ BENCHMARKS = {
         "benchmarks.teaching:TeachingBenchmark",
         "Words taught by example, beside the text alone.",
     ),
+    "attach": ("benchmarks.attach:AttachBenchmark", "Words attached to a splat, scored beside its run's."),
     "ablation": (
         "benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",
@@ -51,6 +52,7 @@ COMMANDS = {
         "COLMAP model from photos, or a video.",
     ),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
+    "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),
     "needs": ("commands.needs:Needs", "Which optional components a scene needs, and why."),
     "query": ("commands.query:Query", "Search a trained scene for texts: heat maps, masks, relevancy maps."),

@@ -206,6 +206,9 @@ class Export:
     """Terms under which photos and scene may be used."""
     all: bool = False
     """Write all Gaussians; with --text a .ply has their relevancy as a property."""
+    index: Path | None = None
+    """With --text and --out: file (.npy or .txt) for the numbers of the matching Gaussians, in the scene's
+    order, which is that of the splat it was attached to."""
     look: str | None = None
     """Light of this training photo, by name (default: of the photo that shows the scene as a whole)."""
     clip: str | None = None
@@ -215,6 +218,8 @@ class Export:
     def main(self) -> None:
         if sum(target is not None for target in (self.out, self.web, self.scene_file)) != 1:
             raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
+        if self.index is not None and (self.out is None or not self.text):
+            raise UserError("--index lists the Gaussians that match: give --text and --out with it")
         prompts = parse_texts(self.text, self.not_)
         if self.out is not None:
             make_folder(self.out.parent)
@@ -231,5 +236,5 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
             text = prompts[0] if prompts else None
-            count = scene.export(self.out, text, everything=self.all, look=self.look)
+            count = scene.export(self.out, text, everything=self.all, look=self.look, index=self.index)
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")

@@ -32,7 +32,7 @@ from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.rank_views import rank_views
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import MARK_SIDE, Example, TaughtWord, Weights, known_word, learn, marks
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts
 from lang3dxl_ns.query.threshold import match_thresholds
@@ -352,8 +352,9 @@ class Scene:
         threshold: float | None = None,
         everything: bool = False,
         look: str | None = None,
+        index: str | Path | None = None,
     ) -> int:
-        """Write the Gaussians as a .ply or .spz file for splat viewers.
+        """Write the Gaussians as a .ply or .spz file for splat viewers, in the scene's order.
 
         Args:
             path: the file.
@@ -361,6 +362,8 @@ class Scene:
             threshold: see `ask`.
             everything: with a text, write all Gaussians; a PLY has their relevancy as a property.
             look: training photo whose lighting is baked into the colors; default: of the overview photo.
+            index: with a text, a .npy or .txt file for the numbers of the matching Gaussians: their places in
+                the scene, and so in the splat that it was attached to, from 0.
 
         Returns:
             How many were written.
@@ -378,6 +381,8 @@ class Scene:
                     f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
                     f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
                 )
+            if index is not None:
+                write_index(Path(index), keep)
             if not everything:
                 splats, relevancy = splats.select(keep), relevancy[keep]
         return write_splats(Path(path), splats, relevancy)
