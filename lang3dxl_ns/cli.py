@@ -65,7 +65,7 @@ COMMANDS = {
     "info": ("commands.info:Info", "Tell what a scene file holds, and where it comes from."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (
-        "demo.landmark.demo_scene:DemoScene",
+        "commands.demo_scene:GenerateScene",
         "Generate a demo scene: photos of a procedural landmark.",
     ),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),
