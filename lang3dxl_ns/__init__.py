@@ -1,36 +1,32 @@
 """Language in large 3D scenes: Lang3D-XL as a nerfstudio plugin.
 
-Each name loads its module at first use, so that importing the package costs nothing; only `load_scene` needs
-nerfstudio.
+Each name loads its module at first use, so that importing the package costs nothing. Only `train`, and
+`load_scene` for runs without a scene file, need nerfstudio.
 """
 
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from lang3dxl_ns.common.console import silence_libraries
-
 _PUBLIC = {
-    "load_scene": "plugin.load_scene",
+    "load_scene": "open_scene",
     "Scene": "query.scene",
-    "together": "query.match",
-    "QueryConfig": "query.scene",
-    "Camera": "scene.camera",
-    "Gaussians": "rendering",
-    "Rendering": "rendering",
+    "Match": "query.match",
+    "Found": "query.match",
+    "train": "train_scene",
+    "reconstruct": "scene.reconstruct:reconstruct_scene",
     "rasterize": "rendering",
-    "AttenuatedDownsampler": "components.downsampler",
-    "DownsamplerConfig": "components.downsampler",
-    "HashGrid": "components.hash_grid",
-    "SemanticField": "components.semantic_field",
-    "SemanticFieldConfig": "components.semantic_field",
     "UserError": "common.errors",
 }
 __all__ = list(_PUBLIC)
+try:
+    __version__ = version("lang3dxl-ns")
+except PackageNotFoundError:  # a checkout that isn't installed
+    __version__ = "0"
 
 
 def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "load_scene":  # imports nerfstudio, whose imports warn of what a user can do nothing about
-        silence_libraries()
-    return getattr(import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    module, _, member = _PUBLIC[name].partition(":")
+    return getattr(import_module(f"{__name__}.{module}"), member or name)

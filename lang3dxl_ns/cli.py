@@ -29,12 +29,6 @@ BENCHMARKS = {
     "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
-    "queries": ("benchmarks.queries:QueryBenchmark", "From a new text to its picture."),
-    "best-views": (
-        "benchmarks.best_views:BestViews",
-        "Whether the views that queries choose show the words.",
-    ),
-    "viewer": ("benchmarks.viewer:ViewerBenchmark", "Viewers in a browser: frames, first picture."),
     "ablation": (
         "benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",
@@ -57,6 +51,7 @@ COMMANDS = {
         "commands.query:Export",
         "Write a scene, or what matches a text, as a splat file or a web page.",
     ),
+    "info": ("commands.info:Info", "Tell what a scene file holds, and where it comes from."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (
         "demo.landmark.demo_scene:DemoScene",

@@ -239,10 +239,11 @@ def test_export(default, tmp_path):
 def test_a_conversation_in_the_viewer(default):
     from contextlib import nullcontext
 
-    from lang3dxl_ns.plugin.cameras import view_of
     from lang3dxl_ns.plugin.light import in_light
-    from lang3dxl_ns.plugin.viewer.session import Conversation
     from lang3dxl_ns.plugin.viewer.splats import splats
+
+    from lang3dxl_ns.plugin.cameras import view_of
+    from lang3dxl_ns.plugin.viewer.session import Conversation
 
     pipeline = default.pipeline
     model = pipeline.model.eval()

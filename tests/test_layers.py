@@ -48,7 +48,9 @@ ORDER = (
     {"baselines", "query", "evaluation"},
     {"demo", "numerics"},
     {"plugin"},
-    {"methods", "commands", "benchmarks"},
+    {"methods", "open_scene"},
+    {"train_scene"},
+    {"commands", "benchmarks"},
     {"cli"},
 )
 """Packages from the bottom up: each imports only from its own layer and those below."""

@@ -75,6 +75,6 @@ def _train_and_keep(
         if trainer.interrupted:
             raise KeyboardInterrupt
     _, pipeline, _ = open_run(config.get_base_dir())
-    results = pipeline.scored(get_std=True)
+    results = pipeline.evaluation.scored(get_std=True)
     write_scores(folder, run.label, results, pipeline.device)
     return {name: value for name, value in results.items() if isinstance(value, float)}

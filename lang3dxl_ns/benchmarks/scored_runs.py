@@ -236,7 +236,7 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
         raise KeyboardInterrupt
     seconds = _now() - start
     peak = _peak()
-    figures = average([photo.metrics for photo in trainer.pipeline.evaluate("held-out")])
+    figures = average([photo.metrics for photo in trainer.pipeline.evaluation.evaluate("held-out")])
     figures = {name: value for name, value in figures.items() if name not in _UNWANTED}
     figures |= _beside(trainer.pipeline)
     return figures | {
@@ -253,13 +253,13 @@ def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     are any; both are far more numerous than the held-out photos."""
     from lang3dxl_ns.evaluation.aggregate import PREFIXES, average
 
-    scorer, photos = pipeline.scorer, pipeline.datamanager.train_dataset.photos
+    scorer, photos = pipeline.evaluation.scorer, pipeline.datamanager.train_dataset.photos
     splits: list[Literal["test", "seen"]] = [] if pipeline.datamanager.test_views is None else ["test"]
     if scorer is not None and any(scorer.truth.key(photo.name) is not None for photo in photos):
         splits.append("seen")
     found = {}
     for split in splits:
-        for name, value in average([photo.metrics for photo in pipeline.evaluate(split)]).items():
+        for name, value in average([photo.metrics for photo in pipeline.evaluation.evaluate(split)]).items():
             plain = next((name.removeprefix(p) for p in PREFIXES if p and name.startswith(p)), name)
             if plain in _BESIDE or plain.startswith("ap_"):
                 found[f"{split}_{name}"] = value
@@ -280,7 +280,7 @@ def _peak() -> float:
 @torch.no_grad()
 def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     """Median milliseconds to render a held-out view, and a view that answers all prompts."""
-    scorer = pipeline.scorer
+    scorer = pipeline.evaluation.scorer
     if scorer is None:
         return {}
     pipeline.eval()
@@ -289,7 +289,7 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
-        pipeline.relevancy(camera, scorer.queries.to(pipeline.device))
+        pipeline.evaluation.relevancy(camera, scorer.queries.to(pipeline.device))
         times["render_ms"].append(1000 * (rendered - start))
         times["answer_ms"].append(1000 * (_now() - rendered))
     return {name: median(values) for name, values in times.items()}

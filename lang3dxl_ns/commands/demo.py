@@ -93,10 +93,10 @@ class Demo:
         else:
             say("train: skipped, the run is finished")
         with stages.stage("evaluate"):
-            photos = list(trainer.pipeline.evaluate("held-out"))
+            photos = list(trainer.pipeline.evaluation.evaluate("held-out"))
             splits = {"Held-out photos": photos}
             if trainer.pipeline.datamanager.test_views is not None:
-                splits = {"Test views": list(trainer.pipeline.evaluate("test")), **splits}
+                splits = {"Test views": list(trainer.pipeline.evaluation.evaluate("test")), **splits}
             report = self._report(splits, trainer)
         report |= stages.figures()
         folder = config.get_base_dir()
@@ -253,7 +253,7 @@ def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, thresholds: di
     from lang3dxl_ns.demo.picture import PictureRow
 
     real, rendered = photo.images["img"].cpu().chunk(2, dim=1)
-    scorer, truth = trainer.pipeline.scorer, {}
+    scorer, truth = trainer.pipeline.evaluation.scorer, {}
     if scorer is not None:
         size = next(iter(photo.maps.values())).shape
         truth = scorer.truth.masks(photo.name, (size[0], size[1]))

@@ -98,7 +98,7 @@ class EvaluateRun:
             pipeline.config.ground_truth = self.ground_truth
         if self.ground_truth is not None or self.layout != "auto":
             pipeline.config.ground_truth_layout = self.layout
-        results = pipeline.scored(get_std=True)
+        results = pipeline.evaluation.scored(get_std=True)
         write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
 

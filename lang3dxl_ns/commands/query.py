@@ -11,14 +11,18 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.common.reports import progress_bar
+from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Match, save_picture, together
+from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import QueryConfig, Scene
+from lang3dxl_ns.query.scene_file import Provenance, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.web.write_page import write_page
@@ -35,8 +39,8 @@ class Query:
     texts share also come as one picture, with a color for each and a legend, in `together`.
     """
 
-    run: tyro.conf.Positional[Path | None] = None
-    """Folder of the run, or its config.yml (default: the newest under outputs/)."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Text to look for; repeat the flag, or separate with `;`. Negatives: '"windows" not "arcades"'."""
     out: Path
@@ -47,30 +51,32 @@ class Query:
     """Use the views of all photos, including held-out ones."""
     camera_path: Path | None = None
     """Use the views of a camera path saved by the viewer."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
-        from lang3dxl_ns.plugin.load_scene import load_scene
-
         if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
             raise UserError("--image, --all and --camera-path exclude each other: give one of them")
         make_folder(self.out)  # fail now rather than after the work
-        scene = load_scene(self.run, settings=self.settings)
-        prompts = scene.prompts(self.text)
+        scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        question = scene.ask(self.text)
+        prompts = question.prompts
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
         views, best = [], [-1.0] * len(prompts)
-        where, doubts, levels = [""] * len(prompts), [1.0] * len(prompts), [1.0] * len(prompts)
+        where = [""] * len(prompts)
         with progress_bar() as bar:
-            for name, place, asked in bar.track(self._places(scene, prompts), description="rendering"):
-                matches = scene.match([prompts[i] for i in asked], place)
+            for name, place, asked in bar.track(self._places(scene, question), description="rendering"):
+                wanted = question if len(asked) == len(prompts) else scene.ask([prompts[i] for i in asked])
+                matches = scene.matches(wanted, place)
                 for i, match in zip(asked, matches, strict=True):
                     write_match(match, folders[i] / name)
-                    doubts[i], levels[i] = match.doubt, match.threshold
                     if match.score > best[i]:
                         best[i], where[i] = match.score, f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
                 if len(matches) > 1:
                     save_picture(together(matches), shared / f"{name}.png")
                 views.append(_view_report(name, matches))
+        doubts, levels = question.doubts, question.thresholds
         texts = zip(prompts, doubts, levels, folders, strict=True)
         report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
         write_atomically(self.out / "query.json", json.dumps(report, indent=2, ensure_ascii=False) + "\n")
@@ -81,11 +87,9 @@ class Query:
             if advice := doubtful(prompt.text, doubt):
                 say(f"  {advice}")
 
-    def _places(
-        self, scene: Scene, prompts: Sequence[Prompt]
-    ) -> list[tuple[str, Camera | str, Sequence[int]]]:
+    def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
         """File name (no suffix) of every requested view, its camera or photo, and the prompts it is for."""
-        everything = range(len(prompts))
+        everything = range(len(question.prompts))
         if self.camera_path is not None:
             return [(f"{i:05d}", c, everything) for i, c in enumerate(read_camera_path(self.camera_path))]
         if self.all:
@@ -94,7 +98,7 @@ class Query:
         if self.image is not None:
             name = scene.file.photo(self.image).name
             return [(file_names([name])[0], name, everything)]
-        best = scene.best_views(prompts)
+        best = scene.best_views(question)
         photos = list(dict.fromkeys(best))
         asked = [[i for i, b in enumerate(best) if b == photo] for photo in photos]
         return list(zip(file_names(photos), photos, asked, strict=True))
@@ -111,7 +115,7 @@ def file_names(photos: list[str]) -> list[str]:
 def write_match(match: Match, stem: Path) -> None:
     """Write `stem`.overlay.png, .mask.png and .npy."""
     match.save(stem.with_name(f"{stem.name}.overlay.png"))
-    save_picture(match.mask.cpu().numpy() * np.uint8(255), stem.with_name(f"{stem.name}.mask.png"))
+    save_picture(match.mask * np.uint8(255), stem.with_name(f"{stem.name}.mask.png"))
     match.save(stem.with_name(f"{stem.name}.npy"))
 
 
@@ -127,53 +131,59 @@ def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, f
 
 
 def _view_report(name: str, matches: list[Match]) -> dict:
-    found = [
-        {"text": m.prompt.text, "peak": m.peak, "score": m.score, "area": float(m.mask.float().mean())}
-        for m in matches
-    ]
+    found = [{"text": m.prompt.text, "peak": m.peak, "score": m.score, "area": m.area} for m in matches]
     seconds = {"render_seconds": matches[0].view.seconds, "query_seconds": matches[0].seconds}
     return {"view": name, **seconds, "matches": found}
 
 
 @dataclass(kw_only=True)
 class Export:
-    """Write the Gaussians that match a text to a splat file that ordinary viewers open (--out), in the
-    model's frame; or a web page to walk through the scene, with a button for each text (--web).
+    """Write a scene in another form: a splat file of the Gaussians that match a text, in the model's frame,
+    which ordinary viewers open (--out); a web page to walk through it (--web); or the scene itself, in one
+    file to share, that can be queried without its run and its photos (--scene-file).
     """
 
-    run: tyro.conf.Positional[Path | None] = None
-    """Folder of the run, or its config.yml (default: the newest under outputs/)."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Text to look for (default: write everything); with --web, repeat the flag or separate with `;`."""
     out: Path | None = None
     """The .ply or .spz file to write."""
     web: Path | None = None
     """Folder for a web page that any static server can serve."""
+    scene_file: Path | None = None
+    """The .scene file to write."""
     title: str = ""
-    """Of the page (default: name of the photos' folder)."""
+    """Heading of page and scene (default: name of the photos' folder)."""
     credit: str = ""
-    """Line on the page about the photos: who took them, and their licence."""
+    """Line about the photos: who took them."""
+    license: str = ""
+    """Terms under which photos and scene may be used."""
     all: bool = False
     """Write all Gaussians; with --text a .ply has their relevancy as a property."""
     look: str | None = None
     """Light of this training photo, by name (default: of the photo that shows the scene as a whole)."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
-        from lang3dxl_ns.plugin.load_scene import load_scene
-
-        if (self.out is None) == (self.web is None):
-            raise UserError("give one of --out FILE.ply and --web FOLDER")
+        if sum(target is not None for target in (self.out, self.web, self.scene_file)) != 1:
+            raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
         if self.out is not None:
             make_folder(self.out.parent)
             check_splat_name(self.out)
             if len(self.text) > 1:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
-        scene = load_scene(self.run, settings=self.settings)
+        scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        if self.scene_file is not None:
+            told = Provenance(self.title, self.credit, self.license, f"lang3dxl-ns {__version__}")
+            size = write_scene(self.scene_file, scene, told)
+            say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: lang3dxl query {self.scene_file}")
         if self.web is not None:
             size = write_page(scene, self.web, self.text, self.title, self.credit, self.look)
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
             text = self.text[0] if self.text else None
             count = scene.export(self.out, text, everything=self.all, look=self.look)
-            say(f"Wrote {count} of {len(scene.gaussians['means'])} Gaussians to {self.out}")
+            say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")

@@ -12,7 +12,7 @@ from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import Rendering, render
 from lang3dxl_ns.rendering.splats import Splats, harmonics_of
-from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.scene.camera import Camera, in_view
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +25,21 @@ class Look:
     """The photo's appearance code."""
 
     @torch.no_grad()
-    def apply(self, splats: Splats, center: Float[Tensor, "3"]) -> Splats:
-        """The Gaussians under this lighting, in colors as seen from one point.
+    def apply(self, splats: Splats, camera: Camera, everywhere: bool = True) -> Splats:
+        """The Gaussians under this lighting, in colors as one camera sees them.
 
         Args:
             splats: the Gaussians in the field's world frame.
-            center: viewing position, world units. It matters only where colors depend on the view: the change
-                of lighting depends on the color that is seen.
+            camera: the view. Its position matters only where colors depend on it: the change of lighting
+                depends on the color that is seen.
+            everywhere: relight all Gaussians; False: only those that the camera may see.
         """
-        everything = torch.arange(len(splats), device=splats.means.device)
-        colors, lit = self.field(splats.gaussians, splats.colors(center), self.vector, everything)
+        camera = camera.to(splats.means.device)
+        rows = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
+        if not everywhere:
+            rows = in_view(camera, splats.means, splats.scales)
+        seen = rows.nonzero().squeeze(1)
+        colors, lit = self.field(splats.gaussians, splats.colors(camera.position), self.vector, seen)
         return replace(splats, opacities=lit.opacities, harmonics=harmonics_of(colors))
 
 
@@ -56,9 +61,8 @@ class Looks:
 
     def of_view(self, camera: Camera) -> Look:
         """The look of a view that is no training photo, by the field's rule (`AppearanceConfig.unseen`)."""
-        pose = camera.view_matrix.to(self.field.vectors.device)
-        position = -pose[:3, :3].T @ pose[:3, 3]
-        return Look(self.field, self.field.vector_of_view(position, pose[2, :3]).detach())
+        there = camera.to(self.field.vectors.device)
+        return Look(self.field, self.field.vector_of_view(there.position, there.view_matrix[2, :3]).detach())
 
 
 def render_in_look(
@@ -84,8 +88,7 @@ def render_in_look(
     settings = {"background": background, "backend": backend}
     if look is None:
         return render(splats, camera, channels, **settings)  # type: ignore[arg-type]
-    pose = camera.view_matrix
-    lit = look.apply(splats, -pose[:3, :3].T @ pose[:3, 3])
+    lit = look.apply(splats, camera, everywhere=False)
     if lit.opacities is splats.opacities:
         return render(lit, camera, channels, **settings)  # type: ignore[arg-type]
     photo = render(lit, camera, **settings)  # type: ignore[arg-type]

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map
-from lang3dxl_ns.preparation.encoders import ImageTextEncoder
+from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.relevancy import CANONICAL
-from lang3dxl_ns.query.text import Prompt, TextConfig, TextEncoder
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextConfig, TextEncoder
 
 
 class LanguageScorer(MapScorer):
@@ -20,11 +20,11 @@ class LanguageScorer(MapScorer):
     learned from, had the photo been used in training.
     """
 
-    def __init__(self, truth: GroundTruth, encoder: ImageTextEncoder) -> None:
+    def __init__(self, truth: GroundTruth, encode_texts: EncodeTexts) -> None:
         super().__init__(truth)
-        self.queries = TextEncoder(encoder.encode_texts).plain_queries(truth.categories)
+        self.queries = TextEncoder(encode_texts).plain_queries(truth.categories)
         """Queries of the categories, in their order."""
-        published = TextEncoder(encoder.encode_texts, TextConfig(combine="joined", negatives=CANONICAL))
+        published = TextEncoder(encode_texts, TextConfig(combine="joined", negatives=CANONICAL))
         self.published_queries = published.queries([Prompt(category) for category in truth.categories])
         """As published: a specialist word joined with common ones, against canonical phrases alone."""
 
@@ -41,6 +41,4 @@ class LanguageScorer(MapScorer):
 
 def open_scorer(truth: GroundTruth, clip: str, device: torch.device | str) -> LanguageScorer:
     """The scorer for targets made with this CLIP (name or folder)."""
-    from lang3dxl_ns.preparation.encoders import load_image_text_encoder
-
-    return LanguageScorer(truth, load_image_text_encoder(clip, device))
+    return LanguageScorer(truth, load_image_text_encoder(clip, device).encode_texts)

@@ -101,7 +101,7 @@ def _relevancy(width: int) -> Problem:
         fixed = {name: value.detach() for name, value in given.items()}
         engine = PerGaussian(GaussianFeatures.of(field.float(), fixed["codes"].float()))
         asked = queries(torch.zeros(1))
-        carried = engine.carried(asked).to(fixed["means"])
+        carried = engine.channels(asked).to(fixed["means"])
         return {"relevancy": engine.maps(_drawn(fixed, carried), asked)}
 
     def reference(given: Maps) -> Maps:

@@ -27,6 +27,19 @@ class Densification(DefaultStrategy):
     loss_scale: float = 1.0
     """Factor in the latest step's gradients, under mixed precision."""
 
+    def step_pre_backward(
+        self, params: Any, optimizers: Any, state: dict[str, Any], step: int, info: dict[str, Any]
+    ) -> None:
+        """Called with a step's rendering (`Raster.info`), which is kept until its backward pass is done."""
+        super().step_pre_backward(params, optimizers, state, step, info)
+        state["rendered"] = info
+
+    def step_post_backward(  # type: ignore[override]
+        self, params: Any, optimizers: Any, state: dict[str, Any], step: int
+    ) -> None:
+        """Called after the backward pass of the rendering that `step_pre_backward` was told of."""
+        super().step_post_backward(params, optimizers, state, step, state.pop("rendered"), packed=False)
+
     def _update_state(
         self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:

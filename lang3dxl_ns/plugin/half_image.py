@@ -7,8 +7,6 @@ NerfBaselines therefore let half of the photo tell its light.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -18,6 +16,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from lang3dxl_ns.common.reports import synchronize
+from lang3dxl_ns.components.looks import Look
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.handover import Batch
@@ -58,8 +57,8 @@ def half_image(model: Lang3DXLModel, camera: Cameras, batch: Batch) -> HalfImage
     vector = fit_look(model, camera, photo[:, :middle], mask)
     synchronize()
     seconds = perf_counter() - start
-    with shown_in(model, vector):
-        rendering = model.get_outputs(camera)["rgb"]
+    assert model.appearance is not None
+    rendering = model.seen(camera, Look(model.appearance, vector)).rgb
     scores = model.image_metrics(rendering[:, middle:], photo[:, middle:])
     figures = {f"half_{name}": value for name, value in scores.items()} | {"fit_seconds": seconds}
     return HalfImage(vector, rendering, figures)
@@ -112,13 +111,3 @@ def _in_view(
     seen = in_view(view.to(model.device), gaussians.means, gaussians.scales)
     colors = model.colors_from(model.gauss_params, position)[seen]
     return Gaussians(*(values[seen] for values in vars(gaussians).values())), colors
-
-
-@contextmanager
-def shown_in(model: Lang3DXLModel, vector: Float[Tensor, " v"]) -> Iterator[None]:
-    """Render views in this look."""
-    model.fitted_look = vector
-    try:
-        yield
-    finally:
-        model.fitted_look = None

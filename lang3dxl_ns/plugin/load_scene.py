@@ -1,42 +1,31 @@
-"""Loading a `Scene` from a run folder, without a data manager or photos."""
+"""Conversion of a run's folder to a `Scene`, without a data manager or photos."""
 
 from __future__ import annotations
 
 import pickle
 import struct
-import time
 import zipfile
 import zlib
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from jaxtyping import Float
 from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.plugin.handover import SceneFacts
-from lang3dxl_ns.plugin.light import harmonics, in_light
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.plugin.saved_config import read_model_config
-from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, load_image_text_encoder
-from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.find_run import find_config
-from lang3dxl_ns.query.match import View
+from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, ScenePhoto
-from lang3dxl_ns.query.scene import QueryConfig, Scene
-from lang3dxl_ns.query.splat_file import GaussianArrays
+from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import EncodeTexts
-from lang3dxl_ns.rendering.gathering import filled_pixels
-from lang3dxl_ns.scene.camera import Camera
 
 if TYPE_CHECKING:  # training's
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
@@ -48,7 +37,6 @@ NOT_A_CHECKPOINT = (
 )
 """Exceptions raised on reading a file that is not a checkpoint."""
 NOT_FINISHED = "this run has no semantics yet: they are learned when training ends; resume it (--load-dir)"
-NO_SEMANTICS = "this run has no semantics (it was trained with clip none): it can't be queried"
 
 
 def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
@@ -83,105 +71,36 @@ def _photos(datamanager: Lang3DXLDataManager, split: Literal["train", "eval"]) -
     ]
 
 
-def load_scene(
+def load_run(
     run: str | Path | None = None,
     device: torch.device | str | None = None,
-    settings: QueryConfig | None = None,
+    config: QueryConfig | None = None,
+    encode_texts: EncodeTexts | None = None,
 ) -> Scene:
-    """The scene of a run.
+    """The scene of a run, from its latest checkpoint.
 
     Args:
         run: the run's folder, a folder above it (the newest run there is taken), or its config.yml; None:
             the newest under outputs/. The file is loaded without executing code (nerfstudio's own
-            commands, ns-eval and others, do trust it). The latest checkpoint beside it is used.
+            commands, ns-eval and others, do trust it).
         device: by default a GPU if there is one.
-        settings: of queries.
+        config: defaults of queries.
+        encode_texts: the run's CLIP, if it is already loaded.
 
-    Raises UserError for a folder without a checkpoint, a run without semantics, or another CLIP than the
-    run's.
+    Raises:
+        UserError: the folder has no checkpoint, or the run is damaged or of another method.
     """
     path = find_config(run)
     settings_of_model, checkpoints = read_model_config(path)
     file = SceneFile.read(path.parent / SCENE_FILE)
-    device = torch.device(device or best_device())
-    model = _load_model(settings_of_model, path.parent / checkpoints, file, device)
-    return scene_of_model(model, file, path.parent, settings)
-
-
-def scene_of_model(
-    model: Lang3DXLModel,
-    file: SceneFile,
-    cache_dir: Path | None = None,
-    settings: QueryConfig | None = None,
-    guard: Callable[[], AbstractContextManager] = nullcontext,
-    encode_texts: EncodeTexts | None = None,
-    watch: Callable[[str], None] | None = None,
-) -> Scene:
-    """A scene around a loaded model, even one still in training (then without `cache_dir`).
-
-    Args:
-        guard: entered around every use of the model, which other threads may be using.
-        encode_texts: the run's CLIP, if it is already loaded (`text_encoder`).
-        watch: see `Scene`.
-
-    Raises UserError if the model has no semantics, or its CLIP has changed.
-    """
-    field = model.semantic_field
-    encode_texts = encode_texts or text_encoder(file, model.device)
-    if field is None:
-        raise UserError(NO_SEMANTICS)
-    carried = model.carried
-    if carried is None:
-        raise UserError(NOT_FINISHED)
-    parts = gaussians_of(model)
-
-    def render(camera: Camera, features: Float[Tensor, "n d"] | None) -> View:
-        with guard():
-            return _draw(model, camera, features)
-
-    def fill(camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
-        with guard():
-            return filled_pixels(partial(model.composite, view_of(camera)), weight, model.num_points)
-
-    def paint(camera: Camera, look: str | None) -> GaussianArrays:
-        with guard():
-            return GaussianArrays.of(*in_light(model, camera, look), harmonics=harmonics(model))
-
-    def engine() -> QueryEngine:
-        with guard():
-            return make_engine(field, carried.detach(), temperature)
-
-    temperature = (settings or QueryConfig()).temperature
-    return Scene(
-        render=render,
-        fill=fill,
-        engine=engine,
-        gaussians=parts,
-        file=file,
-        encode_texts=encode_texts,
-        state=model.state_dict(),
-        paint=paint,
-        cache_dir=cache_dir,
-        config=settings,
-        watch=watch,
+    model = _load_model(
+        settings_of_model, path.parent / checkpoints, file, torch.device(device or best_device())
     )
-
-
-def gaussians_of(model: Lang3DXLModel) -> dict[str, Tensor]:
-    """The model's parameters per Gaussian, without gradients."""
-    return {name: parameter.detach() for name, parameter in model.gauss_params.items()}
-
-
-def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
-    """The CLIP that a run was trained with. Raises UserError if there is none, or it has changed."""
-    if file.clip is None:
-        raise UserError(NO_SEMANTICS)
-    encoder = load_image_text_encoder(file.clip, device)
-    if encoder.identity != file.clip_identity:
-        raise UserError(
-            f"the CLIP in {file.clip} is not the one this run was trained with: restore it, or train anew"
-        )
-    return encoder.encode_texts
+    if model.semantic_field is not None and model.carried is None:
+        raise UserError(NOT_FINISHED)
+    return model.scene(
+        file, config=config, encode_texts=encode_texts, cache=path.parent / "lang3dxl_visible.safetensors"
+    )
 
 
 def _load_model(config: Any, checkpoints: Path, file: SceneFile, device: torch.device) -> Lang3DXLModel:
@@ -270,14 +189,3 @@ def check_checkpoint(place: Path) -> None:
             f"the checkpoint {checkpoints[-1]} is damaged ({damaged}), perhaps by an incomplete copy: copy "
             "it again, move it away to resume from an earlier one, or train anew (prepared targets are kept)"
         )
-
-
-@torch.no_grad()
-def _draw(model: Lang3DXLModel, camera: Camera, features: Float[Tensor, "n d"] | None) -> View:
-    """Render a camera of the rasterizer with a model in evaluation mode."""
-    start = time.perf_counter()
-    model.set_crop(None)
-    outputs, rendered = model.render(view_of(camera), features)
-    maps = {name: outputs[name][..., 0] for name in ("accumulation", "depth")}
-    seconds = time.perf_counter() - start
-    return View(camera, outputs["rgb"], rendered, maps["accumulation"], maps["depth"], seconds)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from math import isqrt
 from typing import Any
 
@@ -71,7 +70,6 @@ class Lang3DXLModel(RenderingModel):
         if statistics is not None:
             clip, dense = statistics.clip, statistics.dense
             self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean, statistics)
-        self.look = None
         self.appearance = None
         if looks:
             self.appearance = self._make_appearance()
@@ -144,8 +142,9 @@ class Lang3DXLModel(RenderingModel):
         and after a skipped step); write the sky's colors."""
         if step > 0 and self.step_is_sound:
             before = self.num_points
-            with self._gathered_codes_follow():
-                super().step_post_backward(step)
+            self.strategy.step_post_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step
+            )
             if self.num_points != before:
                 CONSOLE.log(f"Step {step}: {before} → {self.num_points} Gaussians")
         if self.sky is not None:
@@ -153,18 +152,10 @@ class Lang3DXLModel(RenderingModel):
                 colors = color_parameters(self.config, self.sky.colors)
                 self.gauss_params["features_dc"][: len(self.sky)] = colors
 
-    @contextmanager
-    def _gathered_codes_follow(self) -> Iterator[None]:
-        """Let densification copy and remove codes held by no optimizer along with their Gaussians."""
-        codes = self.gauss_params.get("codes")
-        if codes is None or self.learns_from_renderings:
-            yield
-            return
-        optimizers = self.optimizers
-        self.optimizers = {**optimizers, "codes": torch.optim.SGD([codes], lr=0.0)}
-        yield
-        self.optimizers = optimizers
-        self.gauss_params["codes"].requires_grad_(False)
+    def forget_gathered_codes(self) -> None:
+        """Remove codes that were gathered for a question in training: the Gaussians go on changing."""
+        if not self.learns_from_renderings and "codes" in self.gauss_params:
+            del self.gauss_params["codes"]
 
     def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
         names = [n for n in self.gauss_params if n != "codes" or self.learns_from_renderings]

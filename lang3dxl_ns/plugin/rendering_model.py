@@ -1,86 +1,88 @@
-"""Raster of Gaussians in a photo's look, with what they carry."""
+"""Rendering of Gaussians in training, and of what viewers and evaluations see of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
-from lang3dxl_ns.plugin.answering import AnsweringModel
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
-from lang3dxl_ns.rendering import Gaussians, Raster, rasterize, spherical_harmonics
+from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
+from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.run_file import SceneFile
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.rendering import Gaussians, Raster, Rendering, Splats, composite, rasterize
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
+from lang3dxl_ns.rendering.splats import harmonics_of
 from lang3dxl_ns.scene.camera import Camera, in_view
 
 
-class RenderingModel(AnsweringModel):
-    """Gaussians with colors, and optionally with semantic values and looks."""
+class Answers(Protocol):
+    """What a viewer or `ns-render` adds to the renderings it shows."""
+
+    @property
+    def shows_bottleneck(self) -> bool:
+        """Whether anyone views the picture of the codes, which costs three more channels."""
+
+    @property
+    def look(self) -> str | None:
+        """Photo whose lighting is shown; None: by the appearance's rule."""
+
+    def channels(self) -> Float[Tensor, "n d"] | None:
+        """Values of the Gaussians to composite; None without prompts."""
+
+    def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
+        """Additional outputs, from a rendering with these channels that took so many seconds."""
+
+
+class RenderingModel(SplatfactoModel):
+    """Gaussians with colors, and optionally with semantic values and looks.
+
+    Viewers, `ns-render` and evaluations render through `get_outputs_for_camera`, training through
+    `get_outputs`.
+    """
 
     config: Lang3DXLModelConfig
     semantic_field: SemanticEncoder | None
     appearance: AppearanceField | None
     sky: Sky | None
-    """Of the first Gaussians; None: there is no sky, or it was trained like all Gaussians."""
-    look: str | None
-    """Photo whose look views are rendered with; None: the appearance's rule for unseen views."""
-    fitted_look: Float[Tensor, " v"] | None = None
-    """Vector to render with instead, during the half-image protocol."""
+    """The first Gaussians' colors; None: there is no sky, or it was trained like all Gaussians."""
+    answers: Answers | None = None
 
     @property
     def facts(self) -> SceneFacts:
         """What the data manager knows of the scene."""
         return SceneFacts.of(self.kwargs["metadata"])
 
-    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
-        """Render a camera: `rgb`, `accumulation`, `background`; in training `codes` [H, W, d] if the
-        encoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
-        keep = None
-        self.carried_map = None
-        if self.crop_box is not None and not self.training:
-            keep = self.crop_box.within(self.means).squeeze(-1)
-            if not keep.any():
-                size = int(camera.width.item()), int(camera.height.item())
-                return self.get_empty_outputs(*size, self.background_color.to(self.device))  # type: ignore[return-value]
-        if self.training:
-            return self._training_outputs(camera)
-        asked = None if self.answers is None else self.answers.carried()
-        colors = self._code_colors()
-        carried = [part for part in (asked, colors) if part is not None]
-        outputs, rendered = self.render(camera, torch.cat(carried, dim=1) if carried else None, keep)
-        if self.semantic_field is not None:
-            # Present from the first rendering on, since viewers list its outputs.
-            outputs["bottleneck"] = outputs["background"]
-        if rendered is not None and colors is not None:
-            rendered, outputs["bottleneck"] = rendered.tensor_split([-3], dim=2)
-        if asked is not None:
-            self.carried_map = rendered
-        return outputs
+    @property
+    def backend(self) -> Backend:
+        """The requested rasterizer, which only a GPU has a choice of."""
+        return self.config.rasterizer if self.means.is_cuda else "auto"
 
-    def _training_outputs(self, camera: Cameras) -> dict[str, Tensor]:
-        carried = None
-        if self.learns_from_renderings and self._warm_up_is_over:
-            carried = self.carried
-        outputs, codes = self.render(camera, carried)
-        if self.means.requires_grad:
-            self.strategy.step_pre_backward(
-                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
-            )
-        if codes is not None:
-            outputs["codes"] = codes
-        return outputs
+    @property
+    def antialiased(self) -> bool:
+        """Whether small Gaussians are dimmed."""
+        return self.config.rasterize_mode == "antialiased"
 
     @property
     def carried(self) -> Float[Tensor, "n d"] | None:
@@ -88,139 +90,248 @@ class RenderingModel(AnsweringModel):
         return None if self.semantic_field is None else self.semantic_field.carried(self.gauss_params)
 
     @property
-    def _warm_up_is_over(self) -> bool:
-        return self.step >= self.config.warm_up * self.config.total_steps
-
-    @property
     def learns_from_renderings(self) -> bool:
         """Whether semantics are trained with the scene, not gathered afterwards."""
         return self.semantic_field is not None and not self.semantic_field.needs_lifting
 
+    # ── the scene so far ────────────────────────────────────────────────────────────────────────────
+
+    @torch.no_grad()
+    def splats(self) -> Splats:
+        """The present Gaussians, which share memory with the model: `scene` takes copies."""
+        g = {name: parameter.detach() for name, parameter in self.gauss_params.items()}
+        shapes = self.activated(g)
+        harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
+        if self.config.sh_degree > 0:
+            coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
+            harmonics = coefficients[:, : (self.degree + 1) ** 2]
+        return Splats(
+            shapes.means, shapes.quats, shapes.scales, shapes.opacities, harmonics, self.antialiased
+        )
+
+    @property
+    def looks(self) -> Looks | None:
+        """The photos' looks; None where they share one lighting."""
+        return None if self.appearance is None else Looks(self.appearance)
+
+    @torch.no_grad()
+    def scene(
+        self,
+        file: SceneFile,
+        *,
+        config: QueryConfig | None = None,
+        encode_texts: EncodeTexts | None = None,
+        cache: Path | None = None,
+        watch: Callable[[str], None] | None = None,
+    ) -> Scene:
+        """The present state as a scene of its own, which later training doesn't change.
+
+        file: photos, cameras and CLIP. The rest: see `Scene`. Of a model that has learned no words yet the
+        scene has colors alone.
+        """
+        field, codes, looks = self.semantic_field, self.carried, self.looks
+        return Scene(
+            self.splats().copied(),
+            file,
+            None if codes is None else _frozen(field),
+            None if codes is None else codes.detach().clone(),
+            looks=None if looks is None else Looks(_frozen(looks.field)),
+            background=self._get_background_color().clone(),
+            config=config,
+            encode_texts=encode_texts,
+            cache=cache,
+            backend=self.backend,
+            watch=watch,
+        )
+
+    # ── looking ─────────────────────────────────────────────────────────────────────────────────────
+
+    @torch.no_grad()
+    def get_outputs_for_camera(  # type: ignore[override]
+        self, camera: Cameras, obb_box: OrientedBox | None = None
+    ) -> dict[str, Tensor]:
+        """The camera's outputs, with those of `answers` first, in the order in which viewers list them."""
+        self.set_crop(obb_box)
+        start, answers = time.perf_counter(), self.answers
+        if answers is None:
+            return self.get_outputs(camera)  # type: ignore[return-value]
+        asked = answers.channels()
+        colors = self._code_colors() if answers.shows_bottleneck else None
+        look = None if answers.look is None or self.looks is None else self.looks.of_photo(answers.look)
+        rendering, outputs = self._shown(camera, look, asked, colors)
+        found = answers.outputs(rendering, time.perf_counter() - start)
+        return {"rgb": outputs["rgb"], **found, **outputs}
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
+        """Render a camera: `rgb`, `accumulation`, `background`; in training `codes` [H, W, d] if the
+        encoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
+        if self.training:
+            return self._training_outputs(camera)
+        return self._shown(camera, None, None, self._code_colors())[1]
+
+    def seen(
+        self, camera: Cameras, look: Look | None = None, channels: Float[Tensor, "n d"] | None = None
+    ) -> Rendering:
+        """The present Gaussians from a camera, under a look (default: by the appearance's rule).
+
+        channels: further values to composite.
+        """
+        view = self._camera(camera)
+        if look is None and self.looks is not None:
+            look = self.looks.of_view(view)
+        splats, keep = self.splats(), None
+        if self.crop_box is not None:
+            keep = self.crop_box.within(splats.means).squeeze(-1)
+            splats, channels = splats.select(keep), None if channels is None else channels[keep]
+        background = self._get_background_color()
+        return render_in_look(splats, view, look, channels, background=background, backend=self.backend)
+
+    def _shown(
+        self,
+        camera: Cameras,
+        look: Look | None,
+        asked: Float[Tensor, "n d"] | None,
+        colors: Float[Tensor, "n 3"] | None,
+    ) -> tuple[Rendering, dict[str, Tensor]]:
+        """A rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
+        parts = [part for part in (asked, colors) if part is not None]
+        rendering = self.seen(camera, look, torch.cat(parts, dim=1) if parts else None)
+        background = self._get_background_color().expand_as(rendering.rgb)
+        depth = rendering.depth
+        outputs = {
+            "rgb": rendering.rgb,
+            "accumulation": rendering.alpha[..., None],
+            "background": background,
+            "depth": torch.where(rendering.alpha > 0, depth, depth.max())[..., None],
+        }
+        if self.semantic_field is not None:
+            # Present from the first rendering on, since viewers list its outputs.
+            outputs["bottleneck"] = background
+        if rendering.channels is not None and colors is not None:
+            channels, outputs["bottleneck"] = rendering.channels.tensor_split([-3], dim=2)
+            rendering = replace(rendering, channels=None if asked is None else channels)
+        return rendering, outputs
+
+    def composite(self, camera: Cameras, features: Float[Tensor, "n d"]) -> Float[Tensor, "H W d"]:
+        """Values of Gaussians composited over black in a camera; differentiable in the values alone."""
+        return composite(self.splats(), self._camera(camera).detach(), features, self.backend)
+
     def _code_colors(self) -> Float[Tensor, "n 3"] | None:
-        if self.carried is None or (self.answers is not None and not self.answers.shows_bottleneck):
+        if self.carried is None:
             return None
         assert self.semantic_field is not None
         return self.semantic_field.picture(self.carried.detach()).nan_to_num(0.0)
 
-    def render(
-        self, camera: Cameras, features: Float[Tensor, "n d"] | None = None, keep: Tensor | None = None
-    ) -> tuple[dict[str, Tensor], Float[Tensor, "H W d"] | None]:
-        """`rgb`, `accumulation`, `background`, and outside training `depth`, of a camera; and `features` of
-        the Gaussians composited over black. keep: the Gaussians to render; default all."""
-        with part("render"):
-            rendering, background = self._render(camera, features, keep)
-        self.info = rendering.info
-        outputs = {
-            "rgb": rendering.image.clamp(0.0, 1.0),
-            "accumulation": rendering.alpha,
-            "background": background if self.training else background.expand_as(rendering.image),
-        }
-        if rendering.depth is not None:
-            far = rendering.depth.detach().max()
-            outputs["depth"] = torch.where(rendering.alpha > 0, rendering.depth, far)
-        return outputs, rendering.features
+    # ── training ────────────────────────────────────────────────────────────────────────────────────
 
-    def composite(self, camera: Cameras, features: Float[Tensor, "n d"]) -> Float[Tensor, "H W d"]:
-        """Values of Gaussians composited over black in a camera; differentiable in the features alone."""
-        view, _ = self._view(camera)
-        gaussians = self.activated(self.gauss_params).detach()
-        antialiased, backend = self.config.rasterize_mode == "antialiased", self.backend
-        return rasterize(gaussians, view.detach(), features, antialiased=antialiased, backend=backend).image
+    def _training_outputs(self, camera: Cameras) -> dict[str, Tensor]:
+        carried = self.carried if self.learns_from_renderings and self._warm_up_is_over else None
+        with part("render"):
+            raster, background = self._raster(camera, carried)
+        if self.means.requires_grad:
+            self.strategy.step_pre_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step, raster.info
+            )
+        outputs = {
+            "rgb": raster.image.clamp(0.0, 1.0),
+            "accumulation": raster.alpha,
+            "background": background,
+        }
+        if raster.depth is not None:
+            outputs["depth"] = torch.where(raster.alpha > 0, raster.depth, raster.depth.detach().max())
+        return outputs if raster.features is None else outputs | {"codes": raster.features}
 
     @property
-    def backend(self) -> Backend:
-        """The rasterizer asked for, which only a GPU has a choice of."""
-        return self.config.rasterizer if self.means.is_cuda else "auto"
+    def _warm_up_is_over(self) -> bool:
+        return self.step >= self.config.warm_up * self.config.total_steps
 
-    def _view(self, camera: Cameras) -> tuple[Camera, Float[Tensor, "3 4"]]:
-        """The camera for the rasterizer, refined in training, and its pose (on the model's device). The
-        former stays on the CPU unless it is refined: there, reading its size takes no time."""
-        pose = camera.camera_to_worlds[0]
-        metadata = camera.metadata or {}
+    def _pose(self, camera: Cameras) -> Float[Tensor, "3 4"]:
+        """Camera → world, refined in training. It stays where it is, on the CPU, unless it is refined."""
+        pose, metadata = camera.camera_to_worlds[0], camera.metadata or {}
         if self.training and self.camera_optimizer.config.mode != "off" and "cam_idx" in metadata:
             index, pose = metadata["cam_idx"], to_device(pose, self.device)
             # A slice, since an index would be copied to the GPU first.
             change = self.camera_optimizer(slice(index, index + 1))[0]
             pose = torch.cat([change[:, :3] @ pose[:, :3], pose[:, 3:] + change[:, 3:]], dim=1)
+        return pose
+
+    def _camera(self, camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
+        """The camera for the rasterizer, at a pose (default: its own)."""
         downscale = self._get_downscale_factor()
         if downscale != 1:
             camera.rescale_output_resolution(1 / downscale)
-        view = to_rasterizer(camera, pose)
+        view = to_rasterizer(camera, camera.camera_to_worlds[0] if pose is None else pose)
         if downscale != 1:
             camera.rescale_output_resolution(downscale)
-        self.last_size = (view.height, view.width)
-        return view, to_device(pose, self.device)
+        return view
 
     def activated(self, g: Mapping[str, Tensor]) -> Gaussians:
         """Gaussians of the parameters `g`, which store log scales and logits of opacity."""
         scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
         return Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1))
 
-    def _render(
-        self, camera: Cameras, features: Tensor | None, keep: Tensor | None
-    ) -> tuple[Raster, Float[Tensor, "3"]]:
-        g = {name: p if keep is None else p[keep] for name, p in self.gauss_params.items()}
-        if features is not None and keep is not None:
-            features = features[keep]
-        view, pose = self._view(camera)
+    def _raster(self, camera: Cameras, features: Tensor | None) -> tuple[Raster, Float[Tensor, "3"]]:
+        """A training step's rendering, with gradients."""
+        g, pose = self.gauss_params, self._pose(camera)
+        view, pose = self._camera(camera, pose), to_device(pose, self.device)
         background = self._get_background_color()
         gaussians = self.activated(g)
         colors = self.colors_from(g, pose[:, 3])
-        if self.sky is not None and self.training:
+        if self.sky is not None:
             gaussians, colors = self.sky(gaussians, colors)
         in_photo = gaussians
         if self.appearance is not None:
-            vector = self._light(camera, pose)
+            vector = self._vector(camera, pose)
             near = view.detach().to(self.device)
             visible = in_view(near, gaussians.means, gaussians.scales).nonzero().squeeze(1)
-            seed = self.step if self.training else None
             with part("appearance"):
-                colors, in_photo = self.appearance(gaussians, colors, vector, visible, seed)
-        settings: dict[str, Any] = {
-            "backend": self.backend,
-            "antialiased": self.config.rasterize_mode == "antialiased",
-            "absgrad": self.strategy.absgrad and self.training,
-        }
-        depth = not self.training or self.config.output_depth_during_training
+                colors, in_photo = self.appearance(gaussians, colors, vector, visible, self.step)
+        settings: dict[str, Any] = {"backend": self.backend, "antialiased": self.antialiased}
+        absgrad, depth = self.strategy.absgrad, self.config.output_depth_during_training
         detach = not self.config.feature_gradient_to_geometry
         if in_photo is gaussians:
-            rendering = rasterize(
+            raster = rasterize(
                 gaussians, view, colors, background,
-                features=features, detach_features=detach, render_depth=depth, **settings,
+                features=features, detach_features=detach, render_depth=depth, absgrad=absgrad, **settings,
             )  # fmt: skip
-            return rendering, background
-        photo = rasterize(in_photo, view, colors, background, **settings)
+            return raster, background
+        photo = rasterize(in_photo, view, colors, background, absgrad=absgrad, **settings)
         if features is None and not depth:
             return photo, background
         # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
         carried = colors.detach()[:, :1] if features is None else features
         if detach:
             gaussians, view = gaussians.detach(), view.detach()
-        scene = rasterize(gaussians, view, carried, render_depth=depth, **settings | {"absgrad": False})
+        scene = rasterize(gaussians, view, carried, render_depth=depth, **settings)
         image = None if features is None else scene.image
         return replace(photo, features=image, alpha=scene.alpha, depth=scene.depth), background
 
-    def _light(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
-        """Vector of the training photo, of the chosen look, or by the rule for other views."""
+    def _vector(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
+        """Appearance vector of the training photo, or by the rule for other views."""
         assert self.appearance is not None
         position, direction = pose[:, 3].detach(), -pose[:, 2].detach()
-        if self.training and camera.metadata and "cam_idx" in camera.metadata:
+        if camera.metadata and "cam_idx" in camera.metadata:
             name = self.facts.names[camera.metadata["cam_idx"]]
             self.appearance.remember(name, position, direction)
             return self.appearance.vector(name)
-        if self.fitted_look is not None:
-            return self.fitted_look
-        if self.look is not None:
-            return self.appearance.vector(self.look)
         return self.appearance.vector_of_view(position, direction)
 
+    @property
+    def degree(self) -> int:
+        """Degree of the harmonics in use: it rises by one every 1,000 iterations, or every tenth of a run of
+        under 10,000."""
+        interval = max(min(self.config.sh_degree_interval, self.config.total_steps // 10), 1)
+        return min(self.step // interval, self.config.sh_degree)
+
     def colors_from(self, g: Mapping[str, Tensor], camera_center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-        """Colors seen from a point. The degree of the harmonics rises by one every 1,000 iterations, or
-        every tenth of a run of under 10,000. At degree 0 colors are logits, as in splatfacto."""
+        """Colors seen from a point. At degree 0 colors are logits, as in splatfacto."""
         if self.config.sh_degree == 0:
             return torch.sigmoid(g["features_dc"])
-        interval = max(min(self.config.sh_degree_interval, self.config.total_steps // 10), 1)
-        degree = min(self.step // interval, self.config.sh_degree)
         directions = g["means"].detach() - camera_center
         coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
-        return (spherical_harmonics(degree, directions, coefficients) + 0.5).clamp_min(0.0)
+        return (spherical_harmonics(self.degree, directions, coefficients) + 0.5).clamp_min(0.0)
+
+
+def _frozen(module: Any) -> Any:
+    """A copy without gradients."""
+    return deepcopy(module).eval().requires_grad_(False)

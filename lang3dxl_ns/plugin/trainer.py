@@ -21,6 +21,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch.cuda.amp.grad_scaler import GradScaler
 
+from lang3dxl_ns import __version__
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
@@ -39,6 +40,7 @@ from lang3dxl_ns.plugin.sizes import plan, sizes_of
 from lang3dxl_ns.plugin.step_guard import StepGuard
 from lang3dxl_ns.preparation.needs import write_needs
 from lang3dxl_ns.query.run_file import SCENE_FILE
+from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
 
 if TYPE_CHECKING:
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
@@ -285,7 +287,19 @@ class Lang3DXLTrainer(Trainer):
                 f"--load-dir {self.checkpoint_dir}",
                 soft_wrap=True,
             )
+        else:
+            self.write_scene()
         super()._after_train()
+
+    def write_scene(self) -> Path:
+        """Write the trained scene as one file into the run's folder, to ask and to share."""
+        path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
+        config = self.config.pipeline.model
+        how = f"{self.config.method_name}, {config.encoder.name}, {self.config.max_num_iterations} iterations"
+        scene = self.pipeline.model.scene(self.pipeline.scene_file)
+        told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
+        write_scene(path, scene, told)
+        return path
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:

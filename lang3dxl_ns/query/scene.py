@@ -286,6 +286,13 @@ class Scene:
             for prompt, doubt, level, relevancy in rows
         ]
 
+    @torch.no_grad()
+    def relevancy_maps(self, camera: Camera, queries: Queries) -> Float[Tensor, "q h w"]:
+        """Relevancy of every pixel to every query, 0…1, as it is scored: restricted to no foreground."""
+        rendering = self.draw(camera, self.engine.channels(queries))
+        assert rendering.channels is not None
+        return self.engine.maps(rendering.channels, queries)
+
     def find(
         self,
         texts: Text | Sequence[Text],
@@ -374,9 +381,7 @@ class Scene:
                 self._look(look)
             return self.splats
         camera = self.overview.camera
-        chosen = self._look(look) or self.looks.of_view(camera)
-        pose = camera.view_matrix
-        return chosen.apply(self.splats, -pose[:3, :3].T @ pose[:3, 3])
+        return (self._look(look) or self.looks.of_view(camera)).apply(self.splats, camera)
 
     # ── features ────────────────────────────────────────────────────────────────────────────────────
 

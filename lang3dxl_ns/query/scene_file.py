@@ -194,7 +194,8 @@ def read_scene(
 
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
-    """What a scene file says of itself: `provenance`, `gaussians`, `photos`, `clip`, `decoder`, `bytes`.
+    """What a scene file says of itself: `provenance`, `scene`, `gaussians`, `photos`, `clip`, `decoder`, `looks`
+    and `bytes`.
 
     Raises UserError as `read_scene` does; no tensor is read.
     """
@@ -203,6 +204,7 @@ def describe_scene_file(path: str | Path) -> dict[str, Any]:
         described, sizes = _description(file), _sizes(file)
         return {
             "provenance": described.provenance,
+            "scene": described.scene,
             "gaussians": sizes["means"][0],
             "photos": len(described.scene.photos),
             "clip": described.scene.clip,
@@ -286,9 +288,7 @@ def _description(file: Any) -> _Description:
     if content["version"] != VERSION:
         raise _NewerError(content["version"])
     provenance = Provenance(**content["provenance"])
-    _expect(
-        all(isinstance(text, str) for text in vars(provenance).values()), "its origin is not told in words"
-    )
+    _expect(all(isinstance(text, str) for text in vars(provenance).values()), "its origin is no text")
     background = content["background"]
     if background is not None:
         _expect(len(background) == 3 and all(0 <= float(x) <= 1 for x in background), "its background")

@@ -89,7 +89,8 @@ def _spz(splats: Splats) -> bytes:
         raise UserError(".spz files need gsply: pip install 'lang3dxl-ns[share]', or write a .ply") from error
     quats, harmonics = F.normalize(splats.quats, dim=1), splats.harmonics
     parts = (splats.means, log_scales(splats), quats, logits(splats), harmonics[:, 0], harmonics[:, 1:])
-    data = gsply.GSData(*(np.array(_array(part)) for part in parts))
+    means, scales, turned, opacities, base, rest = (np.array(_array(part)) for part in parts)
+    data = gsply.GSData(means, scales, turned, opacities, base, rest)
     farthest = float(splats.means.abs().max()) if len(splats) else 0.0
     bits = int(np.clip(np.floor(22 - np.log2(max(farthest, 1e-3))), 1, 20))
     with tempfile.TemporaryDirectory() as folder:

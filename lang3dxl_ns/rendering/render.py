@@ -49,11 +49,10 @@ def render(
     Raises:
         ValueError: as `rasterize` does.
     """
-    pose = camera.view_matrix
     raster = rasterize(
         splats.gaussians,
         camera,
-        splats.colors(-pose[:3, :3].T @ pose[:3, 3]),
+        splats.colors(camera.position),
         None if background is None else background.to(splats.means),
         features=channels,
         render_depth=True,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from math import isqrt
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -64,6 +65,10 @@ class Splats:
         """The same Gaussians on a device."""
         return self._mapped(lambda tensor: tensor.to(device))
 
+    def copied(self) -> Splats:
+        """The same Gaussians in memory of their own."""
+        return self._mapped(torch.clone)
+
     def select(self, which: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> Splats:
         """Some of the Gaussians, by a mask or by their indices (tensors or NumPy arrays)."""
         rows = torch.as_tensor(which, device=self.means.device)
@@ -103,7 +108,8 @@ class Splats:
 
     def _mapped(self, change: Callable[[Tensor], Tensor]) -> Splats:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: change(v) for name, v in values.items() if isinstance(v, Tensor)})
+        changed: dict[str, Any] = {n: change(v) for n, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **changed)
 
 
 def harmonics_of(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:

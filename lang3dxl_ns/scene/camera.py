@@ -97,6 +97,11 @@ class Camera:
         """Camera → world, nerfstudio's axes (x right, y up, z backward), as `Scene.camera` takes it."""
         return np.vstack([camera_to_world(self.view_matrix.detach().double()).cpu().numpy(), [0, 0, 0, 1.0]])
 
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        """Where the camera is, world units."""
+        return -self.view_matrix[:3, :3].T @ self.view_matrix[:3, 3]
+
     def detach(self) -> Camera:
         """The same camera, without gradient."""
         return Camera(self.view_matrix.detach(), self.intrinsics.detach(), self.width, self.height)

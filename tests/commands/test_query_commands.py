@@ -9,16 +9,16 @@ from painted_scene import painted_gaussians, painted_scene
 from PIL import Image
 
 from lang3dxl_ns import cli
+from lang3dxl_ns.commands import query as commands
 from lang3dxl_ns.commands.query import file_names
 from lang3dxl_ns.common.files import slugs
-from lang3dxl_ns.plugin import load_scene as scene_loading
 
 
 @pytest.fixture
 def run(monkeypatch):
     """Runs a command on the painted scene."""
     monkeypatch.setattr(
-        scene_loading, "load_scene", lambda path, settings=None: painted_scene(config=settings)
+        commands, "load_scene", lambda path, settings=None, clip=None: painted_scene(config=settings)
     )
     return lambda *words: cli.main([str(word) for word in words])
 

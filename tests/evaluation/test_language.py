@@ -24,7 +24,7 @@ def test_field_and_teacher_are_scored_by_the_same_rules(tmp_path):
     mask = np.zeros((40, 60), bool)
     mask[8:24, 16:48] = True
     write_plain(tmp_path, "domes", "0001", mask)
-    scorer = LanguageScorer(GroundTruth(tmp_path), OneHot(["domes"]))
+    scorer = LanguageScorer(GroundTruth(tmp_path), OneHot(["domes"]).encode_texts)
     features = torch.zeros(40, 60, 8)
     features[..., 7] = 1
     features[torch.from_numpy(mask)] = torch.eye(8)[0]
@@ -42,7 +42,7 @@ def test_published_prompts_are_joined_with_common_words_and_compete_with_canonic
     for category in ("domes", "portals"):
         write_plain(tmp_path, category, "0001", mask)
     encoder = OneHot(["domes", "portals", "doorway, gate, entrance, portals", "object"])
-    published = LanguageScorer(GroundTruth(tmp_path), encoder).published_queries
+    published = LanguageScorer(GroundTruth(tmp_path), encoder.encode_texts).published_queries
     cosines = published.cosines(torch.eye(8)[[0, 2]])  # features of a dome, and of a portal by many names
     relevancy = published.relevancy_of_cosines(cosines)
     assert (relevancy > 0.5).tolist() == [[True, False], [False, True]]

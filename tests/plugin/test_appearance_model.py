@@ -42,9 +42,8 @@ def eval_camera(trainer):
 
 def show(model, camera, look=None) -> dict[str, torch.Tensor]:
     model.eval()
-    model.look = look
-    with torch.no_grad():
-        return model.get_outputs(camera)
+    rendering = model.seen(camera, None if look is None else model.looks.of_photo(look))
+    return {"rgb": rendering.rgb, "accumulation": rendering.alpha[..., None], "depth": rendering.depth}
 
 
 def gaussians(trainer) -> dict[str, torch.Tensor]:

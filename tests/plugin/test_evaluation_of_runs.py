@@ -12,7 +12,9 @@ from PIL import Image
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
+from lang3dxl_ns.evaluation.score_scene import score_scene
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.load_scene import load_run
 
 
 def label(scene, folder, numbers):
@@ -40,7 +42,7 @@ def evaluate(trainer, monkeypatch):
     pipeline = trainer.pipeline
 
     def run(**changes):
-        pipeline.__dict__.pop("scorer", None)
+        pipeline.__dict__.pop("evaluation", None)
         for name, value in changes.items():
             monkeypatch.setattr(pipeline.config, name, value)
         return pipeline.get_average_eval_image_metrics(get_std=True)
@@ -147,3 +149,13 @@ def test_folders_of_pt_ovs_are_read_as_published(scene, tmp_path):
     outputs = PhotoCollectionDataParserConfig(data=data).setup().get_dataparser_outputs("test")
     truth = GroundTruth(find_ground_truth(data))
     assert [truth.key(photo.name) for photo in outputs.metadata["photos"]] == ["photo_000", None]
+
+
+def test_a_scene_alone_has_the_scores_of_its_run(evaluate, trainer, scene, tmp_path):
+    folder = label(scene, tmp_path / "truth", range(12))
+    expected = evaluate(ground_truth=folder)["photos"]
+    found, protocol = score_scene(load_run(trainer.base_dir), GroundTruth(folder), "held-out")
+    assert set(found) == set(expected) and protocol["prompts"] == ["dome"]
+    for photo, figures in found.items():
+        for name in ("ap_dome", "raw_ap_dome", "authors_ap_dome", "iou_dome"):
+            assert figures[name] == pytest.approx(expected[photo][name], abs=1e-5)

@@ -4,9 +4,10 @@ import pytest
 import torch
 from conftest import make_trainer
 
+from lang3dxl_ns.components.looks import Look
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.evaluation.image_metrics import psnr
-from lang3dxl_ns.plugin.half_image import fit_look, half_image, shown_in
+from lang3dxl_ns.plugin.half_image import fit_look, half_image
 
 USE = "pipeline__model__appearance__use"
 SHIFT = "pipeline__model__appearance__opacity_shift"
@@ -42,8 +43,7 @@ def halves(image):
 
 @torch.no_grad()
 def shown(model, camera, vector=None):
-    with shown_in(model, vector):
-        return model.get_outputs(camera)["rgb"]
+    return model.seen(camera, None if vector is None else Look(model.appearance, vector)).rgb
 
 
 def test_nothing_of_the_right_half_is_seen(pipeline, photo):
@@ -105,7 +105,6 @@ def test_an_evaluation_leaves_the_model_as_it_was(pipeline):
     after = model.state_dict()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
     assert all(parameter.grad is None for parameter in model.parameters())
-    assert model.fitted_look is None and model.look is None
     pipeline.eval()
 
 

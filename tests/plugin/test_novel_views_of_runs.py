@@ -71,7 +71,7 @@ def test_in_another_light_colors_are_compared_once_matched(pipeline, data):
     read = vars(pipeline.datamanager)
     read.pop("test_views", None)
     try:
-        metrics = next(iter(pipeline.evaluate("test"))).metrics
+        metrics = next(iter(pipeline.evaluation.evaluate("test"))).metrics
     finally:
         path.write_text(content)
         read.pop("test_views")
@@ -92,4 +92,4 @@ def test_a_scene_without_test_views_says_so(train, scene):
     pipeline = train(scene, iterations=2, semantics=False).pipeline
     assert "test_views" not in pipeline.get_average_eval_image_metrics(get_std=True)
     with pytest.raises(UserError, match=r"has no test views: `lang3dxl demo-scene` makes"):
-        list(pipeline.evaluate("test"))
+        list(pipeline.evaluation.evaluate("test"))

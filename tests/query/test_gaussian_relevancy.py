@@ -78,7 +78,7 @@ def slab(count: int, seed: int = 0) -> tuple[Gaussians, Camera]:
 
 
 def map_of(engine, asked, gaussians, camera):
-    carried = engine.carried(asked).double()
+    carried = engine.channels(asked).double()
     drawn = rasterize(gaussians, camera, torch.zeros(len(carried), 1).double(), features=carried)
     return engine.maps(drawn.features, asked), drawn.alpha[..., 0]
 

@@ -75,18 +75,18 @@ class Tour:
     def best(self) -> Viewpoint:
         """The best viewpoint."""
         self.place = 0
-        return self.found.viewpoints[0]
+        return self.found.views[0]
 
     def move(self, step: int) -> Viewpoint:
         """The viewpoint `step` further on; at first, forward leads to the best, backward to the last."""
         nowhere = 0 if step < 0 else -1
-        self.place = ((nowhere if self.place < 0 else self.place) + step) % len(self.found.viewpoints)
-        return self.found.viewpoints[self.place]
+        self.place = ((nowhere if self.place < 0 else self.place) + step) % len(self.found.views)
+        return self.found.views[self.place]
 
     def __str__(self) -> str:
-        viewpoint = self.found.viewpoints[self.place]
+        viewpoint = self.found.views[self.place]
         return (
-            f"{self.place + 1} of {len(self.found.viewpoints)}: {viewpoint.name}, "
+            f"{self.place + 1} of {len(self.found.views)}: {viewpoint.name}, "
             f"{viewpoint.area:.0%} of it matches"
         )
 

@@ -26,6 +26,7 @@ from lang3dxl_ns.plugin.viewer.worker import Worker
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.run_file import ScenePhoto
+from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera
 
 if TYPE_CHECKING:
@@ -206,7 +207,7 @@ class AskPanel(ViewerControl):
         self._finder.submit(self._guarded(self._find))
 
     def _find(self) -> None:
-        if not self.conversation.question.prompts:
+        if self.conversation.question is None:
             self._say(INVITATION)
             return
         self._say("Looking for the best viewpoints…")
@@ -221,7 +222,7 @@ class AskPanel(ViewerControl):
     def _summary(self, found: list[Found]) -> str:
         lines = []
         for one in found:
-            count, best = len(one.viewpoints), max((v.score for v in one.viewpoints), default=0.0)
+            count, best = len(one.views), max((v.score for v in one.views), default=0.0)
             where = f"{count} good views, best {best:.2f}" if count else "nowhere"
             lines.append(f"**{plain(shortened(one.prompt.text))}**: {where}")
         if max(len(one.prompt.text) for one in found) > LONG_TEXT:
@@ -244,18 +245,16 @@ class AskPanel(ViewerControl):
         )
         c.per_scene = self._stretch.value == PER_SCENE
         look = self._look.value
-        self._pipeline.model.look = None if look == OWN_LOOK else look
+        c.look = None if look == OWN_LOOK else look
         self._rerender()
-        if find and c.question.prompts:
+        if find and c.question is not None:
             self._finder.submit(self._guarded(self._find), _TYPING)
 
     # ── showing ─────────────────────────────────────────────────────────────────────────────────────
 
-    def answer(
-        self, outputs: dict[str, Tensor], rendered: Tensor | None, seconds: float
-    ) -> dict[str, Tensor]:
+    def answer(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
         """Called by the render thread, which holds the lock."""
-        found = self.conversation.outputs(outputs, rendered, seconds)
+        found = self.conversation.outputs(rendering, seconds)
         self._status.content = self.conversation.status()
         if self._first_frame:
             self._first_frame = False
@@ -287,7 +286,7 @@ class AskPanel(ViewerControl):
 
     def _show_results(self, found: list[Found]) -> None:
         self._clear_results()
-        self._tours = [Tour(one) for one in found if one.viewpoints]
+        self._tours = [Tour(one) for one in found if one.views]
         if not self._tours:
             return
         self._tour = self._tours[0]
@@ -391,10 +390,12 @@ class _Answers:
     def shows_bottleneck(self) -> bool:
         return self._panel.conversation.shows_bottleneck
 
-    def carried(self) -> Tensor | None:
-        return self._panel.conversation.carried()
+    @property
+    def look(self) -> str | None:
+        return self._panel.conversation.look
 
-    def outputs(
-        self, outputs: dict[str, Tensor], rendered: Tensor | None, seconds: float
-    ) -> dict[str, Tensor]:
-        return self._panel.answer(outputs, rendered, seconds)
+    def channels(self) -> Tensor | None:
+        return self._panel.conversation.channels()
+
+    def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
+        return self._panel.answer(rendering, seconds)

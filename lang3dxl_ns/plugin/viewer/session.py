@@ -1,31 +1,27 @@
-"""Query session of a viewer: prompts to a model and outputs of its views, without user interface."""
+"""Query session of nerfstudio's viewer: questions to snapshots of a model, without user interface."""
 
 from __future__ import annotations
 
 import re
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.plugin.load_scene import scene_of_model, text_encoder
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.query.answer import NOTHING, Asked, Display
+from lang3dxl_ns.query.answer import Display, pictures
 from lang3dxl_ns.query.doubt import doubtful
-from lang3dxl_ns.query.engine import QueryEngine, make_engine
-from lang3dxl_ns.query.heat_maps import strongest
 from lang3dxl_ns.query.match import Found
-from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import SceneFile
-from lang3dxl_ns.query.scene import QueryConfig, Scene
-from lang3dxl_ns.query.text import EncodeTexts, Prompt
-from lang3dxl_ns.query.threshold import matching
+from lang3dxl_ns.query.scene import QueryConfig, Scene, text_encoder
+from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.rendering import Rendering
 
 
 @dataclass
@@ -36,36 +32,18 @@ class Seconds:
     """Encoding the text."""
     frame: float | None = None
     """Rendering, matches included."""
-    words: float = 0.0
-    """Of these, computing the matches."""
-
-
-@dataclass(frozen=True)
-class Question:
-    """Prompts and their vectors."""
-
-    prompts: tuple[Prompt, ...] = ()
-    foreground: str = ""
-    """Prompts that matches must lie on."""
-    queries: Queries = field(default=NOTHING)
-    """Of the prompts, then of the foreground."""
-    thresholds: tuple[float, ...] = ()
-    """Relevancy above which places match each query, by the scene."""
-
-    @property
-    def confining(self) -> int:
-        """Number of foreground queries."""
-        return len(self.queries) - len(self.prompts)
 
 
 class Conversation:
-    """Queries to a model, which may be in training in another thread.
+    """Questions to a model, which may be in training in another thread.
 
-    The render thread calls `outputs`, holding the lock, with the model in evaluation mode; the panel's
-    threads call the rest, without the lock. While the model trains and its semantics don't, a question has
-    them learned from the photos (`learn`) if they are missing or outdated.
+    A question is put to a snapshot of the model, a scene of its own, so that nothing but taking the snapshot
+    waits for training. If the model trains and its words don't, they are learned from the photos first.
 
     Args:
+        model: the model.
+        file: photos, cameras and CLIP.
+        run: folder of the run, for what is computed once.
         lock: held while using the model.
         learning: whether the model still changes.
         learn: makes the Gaussians' codes for the present model, for encoders that need it.
@@ -85,23 +63,21 @@ class Conversation:
         watch: Callable[[str], None],
     ) -> None:
         self.display = Display()
+        self.look: str | None = None
+        """Photo whose lighting is shown; None: by the scene's rule."""
         self.per_scene = False
         """Stretch the color map to the highest relevancy in the scene instead of in each view."""
-        self.question = Question()
+        self.question: Question | None = None
         self.found: list[Found] | None = None
         """None: not searched yet."""
         self.seconds = Seconds()
         self._model, self._file, self._run, self._lock = model, file, run, lock
         self._learning, self._learn, self._shown, self._watch = learning, learn, shown, watch
-        self._making = threading.RLock()
-        self._holder: int | None = None
+        self._making = Lock()
         self._scene: Scene | None = None
-        self._scene_was_learned = False
+        self._scene_step: int | None = None
+        """Iteration of the snapshot; None: training was over."""
         self._encode_texts: EncodeTexts | None = None
-        self._engine: QueryEngine | None = None
-        self._engine_codes: Tensor | None = None
-        self._asked: Asked | None = None
-        self._learned_at: int | None = None
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -111,138 +87,90 @@ class Conversation:
         nothing can be asked."""
         scene = self._scene_now()
         phrases = [" ".join(phrase.split()) for phrase in negatives.replace(";", ",").split(",")]
-        extra = tuple(phrase for phrase in phrases if phrase)
-        prompts = tuple(replace(p, negatives=p.negatives + extra) for p in scene.prompts(text))
         start = time.perf_counter()
-        foreground = foreground.strip()
-        everything = [*prompts, *(scene.prompts(foreground) if foreground else ())]
-        # In the order of `find`: who asks the scene first has to wait for nobody who holds the model.
-        with self._making, self._model_to_ourselves() if self._learning() else nullcontext():
-            queries, thresholds = scene.queries(everything), scene.thresholds(everything)
+        question = scene.ask(text, negatives=[p for p in phrases if p], foreground=foreground.strip())
         self.seconds.text = time.perf_counter() - start
-        self.found = None
-        self.question = Question(prompts, foreground, queries, thresholds)
-        return self.question
+        self.question, self.found = question, None
+        return question
 
     def forget(self) -> None:
         """Clear the question."""
-        self.question, self.found = Question(), None
+        self.question = self.found = None
 
     def find(self) -> list[Found]:
-        """Matches of each prompt in the scene. First examines the scene, which takes long once per
-        checkpoint."""
-        # While the model trains, the number of Gaussians changes, so training has to wait.
-        with self._making, self._model_to_ourselves() if self._learning() else nullcontext():
-            question, scene = self.question, self._scene_now()
-            scene.config.threshold, scene.config.foreground = self.display.threshold, question.foreground
-            found = scene.find(question.prompts)
+        """Matches of each prompt in the scene. First examines the scene, which takes long once."""
+        question, scene = self.question, self._scene
+        assert question is not None and scene is not None
+        if self.display.threshold is not None:
+            levels = (self.display.threshold,) * len(question.prompts)
+            found = scene.places(replace(question, thresholds=levels))
+        else:
+            found = scene.places(question)
         if question is self.question:
             self.found = found
         return found
 
     def _scene_now(self) -> Scene:
-        """The present scene; while the model trains, a new one every time."""
+        """A snapshot of the present model: after training the last one, in training one that is at most a
+        tenth of the run old."""
         with self._making:
-            learning = self._learning()
-            if self._scene is None or not self._scene_was_learned:
+            learning, step = self._learning(), self._model.step
+            behind = self._model.config.total_steps / 10
+            kept = self._scene is not None and (
+                self._scene_step is None or (learning and step - self._scene_step <= behind)
+            )
+            if not kept:
                 self._encode_texts = self._encode_texts or text_encoder(self._file, self._model.device)
-                if learning:
-                    self._catch_up()
-                # Examined anew for every question, so keep it brief.
-                settings = QueryConfig(views=24, view_side=160) if learning else QueryConfig()
-                self._scene = scene_of_model(
-                    self._model,
-                    self._file,
-                    None if learning else self._run,
-                    settings,
-                    self._model_to_ourselves,
-                    self._encode_texts,
-                    self._watch,
-                )
-                self._scene_was_learned = not learning
+                self._scene = self._snapshot(learning)
+                self._scene_step = step if learning else None
+            assert self._scene is not None
             return self._scene
 
-    @contextmanager
-    def _model_to_ourselves(self) -> Iterator[None]:
-        """Hold the lock, with the model in evaluation mode; reentrant."""
-        if self._holder == threading.get_ident():
-            yield
-            return
+    def _snapshot(self, learning: bool) -> Scene:
+        # Examined anew for every snapshot in training, so keep that brief.
+        config = QueryConfig(views=24, view_side=160) if learning else QueryConfig()
+        cache = None if learning else self._run / "lang3dxl_visible.safetensors"
+        field = self._model.semantic_field
         with self._lock, torch.no_grad():
-            training, self._holder = self._model.training, threading.get_ident()
+            training = self._model.training
             self._model.eval()
             try:
-                yield
+                if learning and field is not None and field.needs_lifting:
+                    self._watch("gathering the photos' features onto the present scene…")
+                    self._learn()
+                return self._model.scene(
+                    self._file, config=config, encode_texts=self._encode_texts, cache=cache, watch=self._watch
+                )
             finally:
+                if learning:
+                    self._model.forget_gathered_codes()
                 self._model.train(training)
-                self._holder = None
 
-    def _catch_up(self) -> None:
-        """Learn codes if the model has none, or if they are older than a tenth of the run."""
-        encoder = self._model.semantic_field
-        if encoder is None or not encoder.needs_lifting:
-            return
-        behind = self._model.config.total_steps / 10
-        if self._learned_at is None or self._model.step - self._learned_at > behind:
-            self._watch("gathering the photos' features onto the present scene…")
-            with self._model_to_ourselves():
-                self._learn()
-            self._learned_at = self._model.step
-
-    # ── answering ───────────────────────────────────────────────────────────────────────────────────
+    # ── answering: called by the render thread, which holds the lock ────────────────────────────────
 
     @property
     def shows_bottleneck(self) -> bool:
         """Whether anyone views the picture of the codes."""
         return "bottleneck" in self._shown()
 
-    def carried(self) -> Float[Tensor, "n d"] | None:
-        """Values that Gaussians carry in the next rendering."""
-        self._asked = self._ask_now()
-        return None if self._asked is None else self._asked.carried
+    def channels(self) -> Tensor | None:
+        """Values that Gaussians carry in the next rendering; None while they may not be the snapshot's."""
+        return None if self.question is None or self._learning() else self.question.channels
 
-    def _ask_now(self) -> Asked | None:
-        """The question to the present model; carried values are computed once for both."""
-        codes, question = self._model.carried, self.question
-        if codes is None or not len(question.queries):
-            return None
-        if self._engine is None or codes is not self._engine_codes:
-            encoder = self._model.semantic_field
-            assert encoder is not None
-            self._engine, self._engine_codes, self._asked = make_engine(encoder, codes.detach()), codes, None
-        if self._asked is None or self._asked.queries is not question.queries:
-            return Asked(self._engine, question.queries, question.confining, thresholds=question.thresholds)
-        return self._asked
-
-    def outputs(
-        self, outputs: dict[str, Tensor], rendered: Float[Tensor, "h w d"] | None, seconds: float
-    ) -> dict[str, Tensor]:
-        """The outputs of `Asked.outputs` for a rendering that took so many seconds. There is always an
-        `overlay`, since viewers break if an output they show is missing."""
-        start = time.perf_counter()
-        asked = replace(self._asked or Asked(), highest=self.highest(), display=self.display)
-        found = asked.outputs(outputs["rgb"], rendered, outputs["accumulation"][..., 0])
-        self.seconds.words = time.perf_counter() - start
-        self.seconds.frame = seconds + self.seconds.words
+    def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
+        """`overlay` and the relevancy of a rendering that took so many seconds. There is always an `overlay`,
+        since viewers break if an output they show is missing."""
+        start, question, scene = time.perf_counter(), self.question, self._scene
+        if question is not None and scene is not None and rendering.channels is None:
+            of_snapshot = scene.draw(rendering.camera, question.channels)
+            rendering = replace(rendering, channels=of_snapshot.channels, alpha=of_snapshot.alpha)
+        found = pictures(rendering, question, replace(self.display, highest=self.highest()))
+        self.seconds.frame = seconds + time.perf_counter() - start
         return found
-
-    def of_gaussians(self) -> tuple[Float[Tensor, " n"], float] | None:
-        """Relevancy of every Gaussian to the best prompt that it matches, 0 outside the foreground, and the
-        relevancy from which to show it; None without prompts."""
-        question = self.question
-        if not question.prompts:
-            return None
-        scores = self._scene_now().engine.of_gaussians(question.queries)
-        if question.confining:
-            scores, within = scores.tensor_split([-question.confining])
-            scores = scores * matching(within, question.thresholds[len(scores) :]).any(0)
-        asked, own = self.display.threshold, question.thresholds[: len(scores)]
-        best, _, lowest = strongest(scores, own if asked is None else (asked,) * len(scores))
-        return best, lowest
 
     def highest(self) -> float | None:
         """Relevancy for the last color of the heat map; None: the highest shown."""
-        scores = [v.score for found in self.found or () for v in found.viewpoints]
+        scores = [v.score for found in self.found or () for v in found.views]
         return max(scores) if self.per_scene and scores else None
 
     # ── saying how it went ──────────────────────────────────────────────────────────────────────────
@@ -251,7 +179,7 @@ class Conversation:
         """Advice about the answer, if something is odd about it."""
         found = self.found or []
         lines = [plain(line) for f in found if (line := doubtful(shortened(f.prompt.text), f.doubt))]
-        if found and not any(f.viewpoints for f in found):
+        if found and not any(f.views for f in found):
             words = " or ".join(plain(shortened(f.prompt.text)) for f in found)
             asked = self.display.threshold
             level = "" if asked is None else f" by the threshold of {asked:.2f}. Lower it, or try other words"
@@ -265,8 +193,8 @@ class Conversation:
             parts.append(f"{s.frame * 1e3:.0f} ms per frame")
         if s.text is not None:
             parts.append(f"{s.text * 1e3:.0f} ms per text")
-        if self._learned_at is not None and self._learning():
-            parts.append(f"words as of iteration {self._learned_at}, since the model still learns")
+        if self._scene_step is not None and self._learning():
+            parts.append(f"words as of iteration {self._scene_step}, since the model still learns")
         return " · ".join(parts)
 
 

@@ -1,0 +1,73 @@
+"""Scores of a scene by itself: its words against ground truth, without its run, targets or photos."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import progress_bar
+from lang3dxl_ns.evaluation.annotations import Truth
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.language import LanguageScorer
+from lang3dxl_ns.evaluation.scores import map_size
+from lang3dxl_ns.query.relevancy import TEMPERATURE
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.scene.photo import Photo
+
+SceneSplit = Literal["held-out", "seen", "all"]
+
+
+def score_scene(
+    scene: Scene, truth: GroundTruth, split: SceneSplit = "all"
+) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
+    """Render the labeled photos' views and score the words in them, as `ns-eval` does.
+
+    Args:
+        scene: the scene.
+        truth: labels of its photos.
+        split: photos held out of training, those seen in it, or both.
+
+    Returns:
+        The figures of each photo (`ap_{category}` etc., see `evaluation.aggregate`), and what they mean.
+
+    Raises:
+        UserError: the scene has colors alone, or no photo of the split has a label.
+    """
+    wanted = {"held-out": ("eval",), "seen": ("train",), "all": ("train", "eval")}[split]
+    photos = [p for p in scene.photos if p.split in wanted and truth.key(p.name) is not None]
+    if not photos:
+        raise UserError(f"no label in {truth.folder} belongs to a {split} photo of the scene")
+    scorer = LanguageScorer(truth, scene.text.vectors)
+    figures: dict[str, dict[str, float]] = {}
+    with progress_bar() as bar:
+        for photo in bar.track(photos, description="evaluating"):
+            width, height = photo.size or (photo.lens.width, photo.lens.height)
+            size, keep = truth.scoring_size(height, width), photo.foreground()
+            keep = None if keep is None else keep.to(scene.device)
+            raw, published = (
+                scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
+                for queries in (scorer.queries, scorer.published_queries)
+            )
+            variants = scorer.variants(raw, keep, TEMPERATURE, None if scorer.smooths else published)
+            truths = truths_of(truth, photo.photo(), map_size(raw))
+            figures[photo.name] = scorer.scores_of(photo.name, variants, truths)
+    masked = sum(photo.mask is not None for photo in photos)
+    mask = f"predictions are 0 outside the foreground masks of {masked} of {len(photos)} photos"
+    protocol = {
+        "split": split,
+        "evaluated_photos": len(photos),
+        **scorer.protocol(mask if masked else "none"),
+    }
+    return figures, protocol
+
+
+def truths_of(truth: GroundTruth, photo: Photo, size: tuple[int, int]) -> dict[str, Truth]:
+    """The photo's labels, undistorted like the photo, on whose file they were drawn. (Boxes no longer
+    fit then, so masks take their place.)"""
+    truths = truth.truths(photo.name, size)
+    if not photo.lens.distorts:
+        return truths
+    masks = {category: torch.from_numpy(found.mask).int() for category, found in truths.items()}
+    return {category: Truth(photo.undistort_labels(mask).numpy() == 1) for category, mask in masks.items()}

@@ -1,0 +1,66 @@
+"""`load_scene`: a scene file, or a run's folder."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.find_run import OUTPUTS, find_config
+from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.scene import Scene, text_encoder
+from lang3dxl_ns.query.scene_file import SUFFIX, describe_scene_file, read_scene
+
+
+def load_scene(
+    path: str | Path | None = None,
+    device: torch.device | str | None = None,
+    *,
+    settings: QueryConfig | None = None,
+    clip: str | None = None,
+) -> Scene:
+    """Open a scene that one can render and ask.
+
+    Args:
+        path: a NAME.scene file; a folder that holds one; or a run of `ns-train lang3dxl`: its folder, or one
+            above it (the newest run there is taken). None: the newest run under outputs/. Runs without a
+            scene file, and any config.yml, are converted, which needs nerfstudio. No file is executed.
+        device: by default a GPU if there is one.
+        settings: defaults of queries.
+        clip: name or folder of the scene's CLIP, where it is not at the place that the scene names.
+
+    Raises:
+        UserError: there is no scene, or it is damaged; or `clip` is another CLIP than the scene's.
+    """
+    file = find_scene_file(path)
+    encode_texts = None
+    if clip is not None and file is not None:
+        about = replace(describe_scene_file(file)["scene"], clip=clip)
+        encode_texts = text_encoder(about, device or best_device())
+    if file is not None:
+        return read_scene(file, device, settings, encode_texts)
+    from lang3dxl_ns.common.console import silence_libraries
+
+    silence_libraries()  # nerfstudio's imports warn of what a user can do nothing about
+    from lang3dxl_ns.plugin.load_scene import load_run
+
+    return load_run(path, device, settings)
+
+
+def find_scene_file(path: str | Path | None = None) -> Path | None:
+    """The scene file that a path names or holds; None for a config.yml, and for a run without one.
+
+    Raises UserError if there is neither a scene nor a run.
+    """
+    place = OUTPUTS if path is None else Path(path).expanduser()
+    if place.suffix == SUFFIX or place.is_file():
+        return None if place.suffix == ".yml" else place
+    folder = place if any(place.glob(f"*{SUFFIX}")) else find_config(path).parent
+    scenes = sorted(folder.glob(f"*{SUFFIX}"), key=lambda file: file.stat().st_mtime)
+    if len(scenes) > 1 and not (folder / "config.yml").exists():
+        names = ", ".join(file.name for file in scenes[:5])
+        raise UserError(f"{place} holds several scenes ({names}): name one of them")
+    return scenes[-1] if scenes else None

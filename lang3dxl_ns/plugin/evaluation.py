@@ -1,0 +1,273 @@
+"""Evaluation of a run: renders and scores the photos of a split, in colors, features and words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal, Protocol
+
+import torch
+from jaxtyping import Float
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.markup import escape
+from torch import Tensor
+
+from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import host_peak, progress_bar, synchronize
+from lang3dxl_ns.evaluation.aggregate import average
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
+from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
+from lang3dxl_ns.evaluation.score_scene import truths_of
+from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resized
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+from lang3dxl_ns.plugin.eval_photos import EvalPhotos
+from lang3dxl_ns.plugin.evaluated_photo import EvaluatedPhoto
+from lang3dxl_ns.plugin.half_image import PROTOCOL, half_image
+from lang3dxl_ns.plugin.handover import Batch
+from lang3dxl_ns.plugin.label_limit import label_limit
+from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
+from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
+from lang3dxl_ns.scene.photo import Photo
+
+Split = Literal["held-out", "seen", "test"]
+Score = Callable[[Cameras, EvaluatedPhoto, Batch, Photo], None]
+"""Adds word scores to an evaluated photo."""
+_COLORS_OF_LIGHT = ("psnr", "ssim", "lpips")
+"""Image metrics that are meaningless where views are lit differently from the photos."""
+
+
+class Settings(Protocol):
+    """What to evaluate: see `Lang3DXLPipelineConfig`."""
+
+    ground_truth: Path | None
+    ground_truth_layout: Layout | Literal["auto"]
+    evaluated_photos: Split
+
+
+class Evaluation:
+    """Scores of a model on photos of its scene.
+
+    Args:
+        model: the model, trained or still in training.
+        datamanager: its photos and their targets.
+        settings: which photos, against which ground truth.
+    """
+
+    def __init__(self, model: Lang3DXLModel, datamanager: Lang3DXLDataManager, settings: Settings) -> None:
+        self._model, self._data, self._settings = model, datamanager, settings
+        self._engine: QueryEngine | None = None
+        """Of the evaluation that is under way."""
+
+    @cached_property
+    def scorer(self) -> LanguageScorer | None:
+        """Scores words in photos, if the scene has ground truth and the run has semantics."""
+        folder = self._settings.ground_truth or find_ground_truth(self._data.data_folder)
+        if folder is None or self._model.semantic_field is None:
+            return None
+        truth = GroundTruth(folder, self._settings.ground_truth_layout)
+        self._check_labels(truth)
+        return open_scorer(truth, self._data.config.clip, self._model.device)
+
+    @cached_property
+    def _test_scorer(self) -> LanguageScorer | None:
+        """Scores words in the test views."""
+        views = self._data.test_views
+        if views is None or self._model.semantic_field is None:
+            return None
+        truth = GroundTruth(views.folder / "ground_truth", "plain")
+        return open_scorer(truth, self._data.config.clip, self._model.device)
+
+    def _scorer_of(self, split: Split) -> LanguageScorer | None:
+        return self._test_scorer if split == "test" else self.scorer
+
+    def _check_labels(self, truth: GroundTruth) -> None:
+        """Labels must belong to photos of the scene, each to one; warns of labels without a photo."""
+        named: dict[str, str] = {}
+        for name in self._data.photos:
+            key = truth.key(name)
+            if key is not None and named.setdefault(key, name) != name:
+                raise UserError(
+                    f"the label {key} in {truth.folder} fits both {named[key]} and {name}: name labels with "
+                    f"their photos' folders"
+                )
+        absent = [photo for photo in truth.labeled if photo not in named]
+        if not named:
+            raise UserError(
+                f"no label in {truth.folder} belongs to a photo of the scene: labels are named like photos, "
+                f"but the first are {absent[0]} and {next(iter(self._data.photos))}"
+            )
+        if absent:
+            CONSOLE.log(
+                f"[yellow]{len(absent)} labels in {truth.folder} belong to no photo of the scene and are not "
+                f"scored:[/yellow] {escape(some(absent))}"
+            )
+
+    @torch.no_grad()
+    def evaluate(self, split: Split | None = None) -> Iterator[EvaluatedPhoto]:
+        """Render and score the photos of a split (by default the configured one), with a progress bar."""
+        self._model.eval()
+        self._engine = None
+        split = split or self._settings.evaluated_photos
+        photos, score = self._photos_of(split), None
+        scorer = self._scorer_of(split)
+        if scorer is not None:
+            score = partial(self._score_words, scorer, self._label_limit(scorer, photos))
+        views = self._data.test_views if split == "test" else None
+        hidden = () if views is None or views.same_light else _COLORS_OF_LIGHT
+        warm = False
+        with progress_bar() as bar:
+            for camera, batch in bar.track(photos, total=len(photos), description="evaluating"):
+                photo = photos.dataset.photos[batch["image_idx"]]
+                if not warm:  # warm-up, excluded from timing
+                    self._evaluate_photo(camera, batch, photo, score)
+                    warm = True
+                evaluated = self._evaluate_photo(camera, batch, photo, score)
+                for name in hidden:
+                    evaluated.metrics.pop(name, None)
+                if self._fits_looks(split):
+                    fitted = half_image(self._model, camera, batch)
+                    evaluated.metrics = fitted.figures | evaluated.metrics
+                    evaluated.images["fitted"] = fitted.rendering
+                yield evaluated
+        self._model.train()
+
+    def _fits_looks(self, split: Split) -> bool:
+        """Whether the half-image protocol applies: photos may have looks, and those of the split are not
+        known from training."""
+        return self._model.appearance is not None and split != "seen"
+
+    def _photos_of(self, split: Split) -> EvalPhotos:
+        if split == "held-out":
+            return self._data.fixed_indices_eval_dataloader
+        if split == "test":
+            return EvalPhotos(self._data, self._data.test_dataset)
+        if self.scorer is None:
+            raise UserError("seen photos can be evaluated only with ground truth and CLIP")
+        seen = self._data.train_dataset
+        labeled = [photo.name for photo in seen.photos if self.scorer.truth.key(photo.name) is not None]
+        if not labeled:
+            raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
+        return EvalPhotos(self._data, seen, labeled)
+
+    def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Cameras], Maps]:
+        """Maps of the labels themselves, lifted from the photos to the Gaussians."""
+        truth = scorer.truth
+
+        def labels():
+            for camera, photo in photos.cameras():
+                truths = truths_of(truth, photo, truth.scoring_size(photo.height, photo.width))
+                yield camera, {category: found.mask for category, found in truths.items()}
+
+        return label_limit(self._model, labels(), truth.categories)
+
+    def _evaluate_photo(self, camera, batch: Batch, photo: Photo, score: Score | None) -> EvaluatedPhoto:
+        start = perf_counter()
+        self._model.set_crop(None)
+        outputs = self._model.get_outputs(camera)
+        synchronize()
+        seconds = perf_counter() - start
+        metrics, images = self._model.get_image_metrics_and_images(outputs, batch)
+        metrics |= self._model.feature_metrics(camera, batch)
+        metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, "mask" in batch)
+        if score is not None:
+            score(camera, evaluated, batch, photo)
+        return evaluated
+
+    def _score_words(
+        self,
+        scorer: LanguageScorer,
+        limit: Callable[[Cameras], Maps],
+        camera: Cameras,
+        evaluated: EvaluatedPhoto,
+        batch: Batch,
+        photo: Photo,
+    ) -> None:
+        size = scorer.truth.scoring_size(photo.height, photo.width)
+        keep = batch["mask"][..., 0] if "mask" in batch else None
+        start = perf_counter()
+        raw = scorer.named(self.relevancy(camera, scorer.queries.to(self._model.device)), size)
+        synchronize()
+        evaluated.metrics["query_seconds"] = perf_counter() - start
+        published = None
+        if not scorer.smooths:
+            queries = scorer.published_queries.to(self._model.device)
+            published = scorer.named(self.relevancy(camera, queries), size)
+        variants = scorer.variants(raw, keep, TEMPERATURE, published)
+        teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
+        evaluated.maps = inside(raw, keep)
+        truths = truths_of(scorer.truth, photo, map_size(raw))
+        evaluated.metrics |= scorer.scores_of(photo.name, variants | {"teacher_": teacher}, truths)
+        evaluated.metrics |= bounds(inside(resized(limit(camera), size), keep), truths)
+
+    @torch.no_grad()
+    def relevancy(self, camera: Cameras, queries: Queries) -> Float[Tensor, "q h w"]:
+        """Relevancy of every pixel to every prompt, of the present model."""
+        model = self._model
+        if self._engine is None:
+            if model.semantic_field is None or model.carried is None:
+                raise UserError(NOT_FINISHED)
+            self._engine = make_engine(model.semantic_field, model.carried.detach())
+        rendering = model.seen(camera, channels=self._engine.channels(queries))
+        assert rendering.channels is not None
+        return self._engine.maps(rendering.channels, queries)
+
+    def scored(self, output_path: Path | None = None, get_std: bool = False) -> dict[str, Any]:
+        """Means and totals over the evaluated photos, and `peak_memory_mb` of the process (or of the GPU, if
+        one is used); see `evaluation.aggregate.average`.
+
+        output_path: folder for a picture of every photo, optional.
+        get_std: adds standard deviations, `protocol` (what was scored, and how),
+            `photos` (the figures of each), and with held-out photos the same for the scene's `test_views`.
+        """
+        results = self._averages(self._settings.evaluated_photos, output_path, get_std)
+        results["peak_memory_mb"] = _peak_memory(self._model.device) / 2**20
+        beside = self._settings.evaluated_photos == "held-out" and self._data.test_views is not None
+        if get_std and beside:
+            results["test_views"] = self._averages("test", output_path, get_std)
+        return results
+
+    def _averages(self, split: Split, output_path: Path | None, get_std: bool) -> dict[str, Any]:
+        evaluated = []
+        for photo in self.evaluate(split):
+            if output_path is not None:
+                photo.write_pictures(output_path)
+            photo.images, photo.maps = {}, {}  # too large for all photos
+            evaluated.append(photo)
+        results = average([photo.metrics for photo in evaluated], get_std)
+        if get_std:
+            results["protocol"] = self._protocol(split, evaluated)
+            results["photos"] = {photo.name: photo.metrics for photo in evaluated}
+        return results
+
+    def _protocol(self, split: Split, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
+        scorer = self._scorer_of(split)
+        trained = {photo.name for photo in self._data.train_dataset.photos}
+        seen, masked = (sum(p.name in trained for p in evaluated), sum(p.masked for p in evaluated))
+        photos: dict[str, Any] = {
+            "split": split,
+            "evaluated_photos": len(evaluated),
+            "seen_in_training": seen,
+        }
+        if self._fits_looks(split):
+            photos["colors"] = PROTOCOL
+        mask = f"predictions are 0 outside the foreground masks of {masked} of {len(evaluated)} photos"
+        if scorer is None:
+            return photos
+        words = scorer.protocol(mask if masked else "none")
+        if words["prompts_without_photos"]:
+            CONSOLE.log(
+                f"[yellow]no evaluated photo shows {', '.join(words['prompts_without_photos'])}; `lang3dxl "
+                f"evaluate run --split seen` scores the labeled training photos"
+            )
+        return photos | words
+
+
+def _peak_memory(device: torch.device | str) -> int:
+    return torch.cuda.max_memory_allocated() if torch.device(device).type == "cuda" else host_peak()

@@ -1,0 +1,63 @@
+"""`train`: photos to a scene, from Python."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.query.scene import Scene
+
+
+def train(
+    data: str | Path,
+    out: str | Path = "outputs",
+    *,
+    iterations: int | None = None,
+    clip: str | None = None,
+    dense: str | None = None,
+    scale: float | None = None,
+) -> Scene:
+    """Train a scene from photos, as `ns-train lang3dxl` does without a viewer.
+
+    Args:
+        data: folder of photos, with or without a COLMAP model or transforms.json; or a video.
+        out: folder for the run, in which NAME.scene is written.
+        iterations: training steps; default: 30,000 on a GPU, 3,000 without.
+        clip: the CLIP to learn words from: "builtin", a Hugging Face name, a folder, or "none" for colors
+            alone; default: that of `ns-train lang3dxl`.
+        dense: dense encoder, the same choices.
+        scale: size of the photos that colors are trained on, as a fraction of the files'.
+
+    Returns:
+        The trained scene.
+
+    Raises:
+        UserError: the photos can't be used, or training was interrupted.
+    """
+    from lang3dxl_ns.common.console import silence_libraries
+    from lang3dxl_ns.common.errors import UserError
+
+    silence_libraries()
+    from lang3dxl_ns.methods import lang3dxl, run_config
+
+    usual = lang3dxl.config.pipeline.datamanager
+    config = run_config(
+        Path(data),
+        Path(out),
+        Path(data).stem,
+        iterations or lang3dxl.config.max_num_iterations,
+        clip or usual.clip,  # type: ignore[attr-defined]
+        dense or usual.dense,  # type: ignore[attr-defined]
+    )
+    if scale is not None:
+        config.pipeline.datamanager.camera_res_scale_factor = scale
+    config.set_timestamp()
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.train()
+    if trainer.interrupted:
+        raise UserError(
+            f"training was interrupted; to resume: ns-train with --load-dir {trainer.checkpoint_dir}"
+        )
+    return load_scene(trainer.base_dir)
