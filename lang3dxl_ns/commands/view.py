@@ -22,26 +22,29 @@ class View:
     """
 
     scene: tyro.conf.Positional[Path | None] = None
-    """A .scene file, or the folder of a run (default: the newest under outputs/)."""
+    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Prompt to start with; repeat the flag, or separate with `;`."""
     vocabulary: Path | None = None
-    """Words that may name a place and are offered as one types, one per line, besides the shipped ones."""
+    """Words that may name a place, one per line, besides the shipped ones."""
     host: str = "127.0.0.1"
     """Address to serve at; 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
     """Port to serve at; by default a free one from 7007 on."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
-        from lang3dxl_ns.commands.open_scene import open_scene
+        from lang3dxl_ns.open_scene import load_scene, provenance_of
         from lang3dxl_ns.query.vocabulary import read_vocabulary
         from lang3dxl_ns.query.web.serve import PageServer
         from lang3dxl_ns.query.web.write_page import Page
 
         words = read_vocabulary(self.vocabulary) if self.vocabulary else ()
-        scene, provenance = open_scene(self.scene, self.settings)
-        server = PageServer(Page(scene, self.text, words, provenance, live=True), self.host, self.port)
+        scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        page = Page(scene, self.text, words, provenance=provenance_of(self.scene), live=True)
+        server = PageServer(page, self.host, self.port)
         who = "anyone with this address" if server.access.needs_token else "this machine only"
         say(f"Open {server.access.address} ({who}). Ctrl-C ends it.")
         with contextlib.suppress(KeyboardInterrupt), server:

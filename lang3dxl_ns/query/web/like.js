@@ -21,7 +21,8 @@ export function likeness(rows, examples) {
   const mean = new Float64Array(width), spread = new Float64Array(width);
   for (const row of others) row.forEach((x, j) => (mean[j] += x / others.length));
   for (const row of others) row.forEach((x, j) => (spread[j] += (x - mean[j]) ** 2 / others.length));
-  const scale = spread.map((variance) => 1 / Math.max(Math.sqrt(variance), 1e-6));
+  const least = 1e-3 * Math.sqrt(Math.max(...spread)); // below it there are rounding errors only
+  const scale = spread.map((variance) => 1 / Math.max(Math.sqrt(variance), least, 1e-9));
   for (const sample of samples) sample.at = [...Array.from(sample.row, (x, j) => (x - mean[j]) * scale[j]), 1];
   const weights = fitted(samples, width + 1), direction = scale.map((s, j) => s * weights[j]);
   const start = weights[width] - mean.reduce((sum, x, j) => sum + x * direction[j], 0);

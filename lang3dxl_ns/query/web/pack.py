@@ -92,7 +92,7 @@ def _octahedral(quats: Float[Tensor, "n 4"]) -> tuple[Float[Array, "n 2"], Float
 
 @dataclass(frozen=True)
 class PackedMeaning:
-    """What the page decodes every Gaussian's row ((h, 1) / |d|) from, and how texts become its counterpart."""
+    """What the page decodes every Gaussian's row ((h, 1) / |d|) from, and how texts are turned to match."""
 
     description: dict[str, Any]
     """Sizes and settings, for the page's decode.js."""

@@ -104,7 +104,11 @@ class Handler(BaseHTTPRequestHandler):
         try:
             status, kind, content = self.server.answer(self.path)
         except (UserError, ValueError) as error:  # ValueError: an impossible address
-            status, kind, content = HTTPStatus.BAD_REQUEST, _KINDS["txt"], f"{error}".encode("utf-8", "replace")
+            status, kind, content = (
+                HTTPStatus.BAD_REQUEST,
+                _KINDS["txt"],
+                f"{error}".encode("utf-8", "replace"),
+            )
         self._send(status, {"Content-Type": kind}, content)
 
     def _send(self, status: HTTPStatus, headers: Mapping[str, str], content: bytes) -> None:

@@ -51,7 +51,8 @@ class Page:
     Args:
         scene: the scene.
         texts: prompts that it opens with, as `Scene.prompts` reads them.
-        words: words that it knows besides the shipped vocabulary of buildings, offered as one types.
+        words: words that may name a place, besides the shipped vocabulary of buildings.
+        more: words that it knows besides.
         provenance: title, credit and license shown on it.
         look: training photo whose lighting is shown; default: of the overview photo.
         live: whether a server encodes any other text (`answer`).
@@ -62,6 +63,7 @@ class Page:
         scene: Scene,
         texts: Sequence[str] = (),
         words: Sequence[str] = (),
+        more: Sequence[str] = (),
         provenance: Provenance | None = None,
         look: str | None = None,
         live: bool = False,
@@ -69,9 +71,8 @@ class Page:
         self.scene, self.live = scene, live
         self.prompts = scene.prompts(list(texts)) if texts else []
         self._about = provenance or Provenance()
-        self._look, self._words = look, words
-        pose = scene.overview.camera.view_matrix
-        self._toward = (-pose[:3, :3].T @ pose[:3, 3]).to(scene.device)
+        self._look, self._words, self._more = look, words, more
+        self._toward = scene.overview.camera.position.to(scene.device)
         self._meaning: PackedMeaning | None = None
         if scene.decoder is not None and scene.codes is not None:
             self._meaning = pack_meaning(scene.decoder, scene.codes)
@@ -130,8 +131,8 @@ class Page:
         """The words that the page knows: those that may name a place first, then all others."""
         negatives = list(self.scene.text.config.negatives)
         asked = [plain(phrase) for prompt in self.prompts for phrase in (prompt.text, *prompt.negatives)]
-        naming = list(dict.fromkeys([*shipped_vocabulary(), *asked]))
-        words = list(dict.fromkeys([*naming, *filter(None, map(plain, self._words))]))
+        naming = list(dict.fromkeys(filter(None, map(plain, [*shipped_vocabulary(), *self._words, *asked]))))
+        words = list(dict.fromkeys([*naming, *filter(None, map(plain, self._more))]))
         own = torch.cat([*self._encoded(meaning, negatives), *self._encoded(meaning, words)])
         chat = self.scene.config.text.synonyms == "chat"  # a question per word would take hours
         special, extra = {}, [own]
