@@ -185,14 +185,21 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: lang3dxl query {self.scene_file}")
         if self.web is not None:
             own = read_vocabulary(self.vocabulary) if self.vocabulary else ()
-            clip = self.clip or scene.file.clip
-            more = whole_words(clip) if clip else ()
-            size = write_page(Page(scene, self.text, own, more, self._told(), self.look), self.web)
+            page = Page(scene, self.text, own, self._clip_words(scene.file.clip), self._told(), self.look)
+            size = write_page(page, self.web)
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
             text = self.text[0] if self.text else None
             count = scene.export(self.out, text, everything=self.all, look=self.look)
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
+
+    def _clip_words(self, clip: str | None) -> tuple[str, ...]:
+        """The words of the CLIP's tokenizer; none on a machine without that CLIP."""
+        try:
+            return whole_words(self.clip or clip or "")
+        except UserError as error:
+            say(f"The page knows the shipped words alone: {error}")
+            return ()
 
     def _told(self) -> Provenance:
         """What the scene's own file tells of its origin, unless told otherwise."""

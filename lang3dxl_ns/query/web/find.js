@@ -36,7 +36,7 @@ export function rankViews(views, centers, relevancy, threshold) {
     const rank = (closeness * Math.sqrt(Math.min(strong / LARGE, 1)) * centered) / Math.max(excess, 1e-12);
     return { name: view.name, index: v, area, rank, shown: area * view.width * view.height >= 1 };
   });
-  return ranked.sort((a, b) => b.rank - a.rank);
+  return ranked.sort((a, b) => b.shown - a.shown || b.rank - a.rank);
 }
 
 function peakOf({ rows, shares }, relevancy) {

@@ -6,7 +6,7 @@ import { View } from "./view.js";
 const MOST_REMEMBERED = 20, TYPING = 500; // earlier prompts; milliseconds until negatives take effect
 const $ = (id) => document.getElementById(id);
 const prompts = [];
-let about, view, latest = null, read = "";
+let about, view, latest = null, read = "", settled = false; // settled: the address has been read
 
 // ── the worker ──
 
@@ -51,7 +51,7 @@ async function ask(typed) {
   await reading;
   $("near").replaceChildren();
   let found = null;
-  for (const { text, negatives } of parsePrompts(String(typed))) {
+  for (const { text, negatives } of about.words ? parsePrompts(String(typed)) : []) {
     const old = prompts.find((prompt) => !prompt.examples && prompt.text === text && String(prompt.negatives) === String(negatives));
     const prompt = old ?? { text, negatives, color: unusedColor() };
     found = await answer(prompt);
@@ -87,7 +87,7 @@ async function attempt(work) {
 // ── showing ──
 
 function draw() {
-  const acts = { fly, remove, setThreshold };
+  const acts = { fly, remove, rename, setThreshold, teach };
   $("prompts").replaceChildren(...prompts.map((prompt) => promptCard(prompt, acts)));
   view.recolor(prompts.filter((prompt) => prompt.relevancy));
   drawBoxes();
@@ -128,6 +128,11 @@ function remove(prompt) {
   draw();
 }
 
+function rename(prompt, name) {
+  prompt.text = tidy(name).replaceAll("~", " ") || prompt.text;
+  draw();
+}
+
 async function setThreshold(prompt, value) {
   prompt.chosen = value;
   await attempt(() => answer(prompt));
@@ -138,6 +143,7 @@ async function setThreshold(prompt, value) {
 
 async function whatIs(x, y, most = 5) {
   await reading;
+  if (!about.words) return [];
   latest = await think("whatIs", { camera: view.picking, x, y, most });
   return latest.words;
 }
@@ -157,11 +163,17 @@ async function tell({ x, y, without }) {
 /** Light up what looks like the place clicked last; further clicks are further examples. */
 function likeThis() {
   const number = prompts.filter((prompt) => prompt.examples).length + 1;
-  const prompt = { text: `like this ${number}`, negatives: [], examples: [], color: unusedColor(), open: true };
-  prompts.forEach((other) => (other.open = false));
+  const prompt = { text: `like this ${number}`, negatives: [], examples: [], color: unusedColor() };
   prompts.push(prompt);
-  $("here").hidden = true;
+  teach(prompt, true);
   attempt(() => addExample(prompt, false));
+}
+
+/** Whether clicks are further examples of this prompt. */
+function teach(prompt, open = !prompt.open) {
+  for (const other of prompts) other.open = other === prompt && open;
+  $("here").hidden = true;
+  draw();
 }
 
 function addExample(prompt, without) {
@@ -175,6 +187,7 @@ const asTyped = ({ text, negatives }) => `"${text}"` + (negatives.length ? ` not
 const asExamples = (prompt) => [prompt.text, ...prompt.examples.map(({ rows, without }) => (without ? "-" : "") + rows.join("."))].join("~");
 
 function writeAddress() {
+  if (!settled) return;
   const fields = new URLSearchParams({ view: view.address });
   prompts.forEach((prompt) => fields.append(prompt.examples ? "like" : "ask", prompt.examples ? asExamples(prompt) : asTyped(prompt)));
   if ($("not").value) fields.set("not", $("not").value);
@@ -186,17 +199,24 @@ async function readAddress() {
   const fields = new URLSearchParams(location.hash.slice(1));
   if (fields.has("view")) view.address = fields.get("view");
   $("not").value = fields.get("not") ?? "";
-  prompts.length = 0;
-  for (const typed of fields.getAll("ask").slice(0, 20)) await ask(typed);
-  for (const like of fields.getAll("like").slice(0, 20)) {
-    const [text, ...examples] = like.split("~");
-    const parsed = examples.map((one) => ({ rows: one.replace("-", "").split(".").map(Number), without: one.startsWith("-") }));
-    if (!parsed.every(({ rows }) => rows.every((row) => Number.isInteger(row) && row >= 0 && row < about.count))) continue;
-    const prompt = { text: tidy(text), negatives: [], examples: parsed, color: unusedColor() };
-    prompts.push(prompt);
-    await answer(prompt);
+  [prompts.length, settled] = [0, false];
+  try {
+    for (const typed of fields.getAll("ask").slice(0, 20)) await ask(typed);
+    for (const like of about.words ? fields.getAll("like").slice(0, 20) : []) await readExamples(like);
+  } finally {
+    settled = true;
+    draw();
   }
-  draw();
+}
+
+async function readExamples(like) {
+  const [text, ...examples] = like.split("~");
+  const parsed = examples.map((one) => ({ rows: one.replace("-", "").split(".").map(Number), without: one.startsWith("-") }));
+  const known = (row) => Number.isInteger(row) && row >= 0 && row < about.count;
+  if (!parsed.length || !parsed.every(({ rows }) => rows.every(known))) return;
+  const prompt = { text: tidy(text), negatives: [], examples: parsed, color: unusedColor() };
+  prompts.push(prompt);
+  await answer(prompt);
 }
 
 const memory = `lang3dxl ${location.pathname}`;
@@ -318,12 +338,23 @@ async function readMeaning(splats) {
   say(explain(about));
 }
 
+/** Show what the address says, or what the page opens with. */
+async function begin() {
+  if (location.hash.length > 1) await readAddress();
+  else for (const [text, ...negatives] of about.prompts) await ask(asTyped({ text, negatives }));
+  settled = true;
+  writeAddress();
+}
+
 const drawing = open(), reading = drawing.then(readMeaning);
 window.lang3dxl = {
   drawing,
-  ready: reading.then(() => (location.hash.length > 1 ? readAddress() : Promise.all(about.prompts.map(([text, ...negatives]) => ask(asTyped({ text, negatives })))))),
+  ready: reading.then(begin),
   ask,
   whatIs,
+  get resting() {
+    return view.resting;
+  },
   relevancy: async (text) => [...prompts.find((prompt) => prompt.text === text).relevancy],
   get seconds() {
     return about.seconds;

@@ -139,6 +139,11 @@ export class View extends EventTarget {
     this.frames = 6;
   }
 
+  /** Whether nothing is left to draw. */
+  get resting() {
+    return !this.flight && this.frames <= 0;
+  }
+
   step(now) {
     requestAnimationFrame((next) => this.step(next));
     if (this.flight) this.advance(now);

@@ -5,7 +5,7 @@ export const tidy = (text) => text.replace(/["\0]/g, " ").split(/\s+/).filter(Bo
 
 /** Prompts separated by `;`, each with optional negatives: `"windows" not "doors"; dome`. */
 export function parsePrompts(typed) {
-  const parts = typed.replace(/[“”„«»]/g, '"').match(/(?:"[^"]*"|[^;])+/g) ?? [];
+  const parts = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).match(/(?:"[^"]*"|[^;])+/g) ?? [];
   const negative = /\s*\bnot\s+("[^"]*"(?:\s*,\s*"[^"]*")*)/gi;
   return parts
     .map((part) => ({

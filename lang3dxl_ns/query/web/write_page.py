@@ -15,12 +15,11 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, write_atomically
 from lang3dxl_ns.common.reports import watched
-from lang3dxl_ns.query.doubt import UNRELATED, peaks
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.negatives import competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.scene_file import Provenance
-from lang3dxl_ns.query.text import Prompt, parse_prompts
+from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
 from lang3dxl_ns.query.web.pack import (
     LEAST_PIXELS,
@@ -118,11 +117,10 @@ class Page:
     def _settings(self) -> dict[str, Any]:
         """What answers depend on besides rows and words."""
         scene = self.scene
-        unrelated = peaks(scene.engine.of_gaussians(scene.text.plain_queries(UNRELATED).to(scene.device)))
         return {
-            "temperature": scene.config.temperature,
+            "temperature": scene.engine.temperature,
             "threshold": scene.config.threshold,
-            "unrelated": unrelated.tolist(),
+            "unrelated": scene.doubts._unrelated.tolist(),
             "gap": scene._gap,
             "pixels": [LEAST_PIXELS, PIXEL_STEPS],
         }
@@ -134,10 +132,9 @@ class Page:
         naming = list(dict.fromkeys(filter(None, map(plain, [*shipped_vocabulary(), *self._words, *asked]))))
         words = list(dict.fromkeys([*naming, *filter(None, map(plain, self._more))]))
         own = torch.cat([*self._encoded(meaning, negatives), *self._encoded(meaning, words)])
-        chat = self.scene.config.text.synonyms == "chat"  # a question per word would take hours
         special, extra = {}, [own]
         for i, word in enumerate(words):
-            if word in asked or (i < len(naming) and not chat):
+            if i < len(naming):
                 near, against = self._meant(meaning, word)
             else:
                 near, against = own[:1], competitors(negatives, [word])
@@ -171,9 +168,11 @@ class Page:
         """
         if self._meaning is None:
             raise UserError(NO_SEMANTICS)
-        (prompt,) = parse_prompts(f'"{plain(phrase[:MOST_TEXT])}"')
-        near, against = self._meant(self._meaning, prompt.text)
-        vector = self.scene.text.vectors([prompt.text]).to(self.scene.device)
+        text = plain(phrase[:MOST_TEXT].encode("utf-8", "ignore").decode())
+        if not text:
+            raise UserError("the prompt is empty: type what to look for, such as rose window")
+        near, against = self._meant(self._meaning, text)
+        vector = self.scene.text.vectors([text]).to(self.scene.device)
         own = self._meaning.of_texts(vector)[0].tolist()
         return {"own": own, "near": near.tolist(), "against": against}
 
