@@ -1,4 +1,6 @@
-"""Prints how large the code is: lines by room, longest files, function lengths, docstrings, return types.
+"""Prints how large the code is, and fails where it is larger than agreed.
+
+Lines by room, longest file, function lengths, docstrings, return types.
 
 python .ci/sizes.py
 """
@@ -6,14 +8,14 @@ python .ci/sizes.py
 from __future__ import annotations
 
 import ast
+import sys
 from collections import Counter
 from pathlib import Path
 from statistics import mean, median
 
 PACKAGE = Path(__file__).parent.parent / "lang3dxl_ns"
 TARGETS = {
-    "lines of the package": 19_000,
-    "lines without demo and numerics": 13_000,
+    "lines of the package": 31_000,  # lower this whenever the package shrinks; the goal is 22,000
     "longest file": 400,
     "median function": 10,
 }
@@ -42,10 +44,8 @@ def main() -> None:
                 functions.append(node.end_lineno - node.lineno + 1)
                 typed.append(node.returns is not None or node.name == "__init__")
     total = sum(lines.values())
-    rest = total - lines["demo"] - lines["numerics"]
     figures = {
         "lines of the package": total,
-        "lines without demo and numerics": rest,
         "longest file": longest[1],
         "median function": median(functions),
     }
@@ -54,9 +54,13 @@ def main() -> None:
     shares = {"public names with a docstring": documented, "functions with a return type": typed}
     for name, values in shares.items():
         print(f"{name:34} {mean(values):>8.1%}   (at least {SHARES[name]:.0%})")
+    wrong = [name for name, value in figures.items() if value > TARGETS[name]]
+    wrong += [name for name, values in shares.items() if mean(values) < SHARES[name]]
     print(f"{'own modules that a module imports':34} {mean(imported):>8.1f}")
     print(f"{'longest file is':34} {longest[0]}")
     print("lines by room: " + ", ".join(f"{room} {count:,}" for room, count in lines.most_common()))
+    if wrong:
+        sys.exit(f"over the limit: {', '.join(wrong)}")
 
 
 def definitions(tree: ast.Module, public: bool = True):

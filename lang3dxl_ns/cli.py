@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import operator
+import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import copy_context
 from dataclasses import make_dataclass
+from difflib import get_close_matches
 from functools import reduce
 from importlib import import_module
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import tyro
 
 from lang3dxl_ns.common.checks import disk_trouble
-from lang3dxl_ns.common.console import silence_libraries
+from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
 
 BENCHMARKS = {
@@ -69,25 +72,67 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `lang3dxl` command."""
     words = sys.argv[1:] if arguments is None else arguments
     silence_libraries()
+    accept_any_console()
+    if words[:1] == ["--version"]:
+        return print(version("lang3dxl-ns"))
     try:
         with _terminable():
-            choice = _choice(COMMANDS, words)
-            command = tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
-            copy_context().run(command.main)  # what a command sets for its messages ends with it
+            copy_context().run(_parsed(words).main)  # what a command sets for its messages ends with it
+            sys.stdout.flush()
     except UserError as error:
-        sys.exit(f"Error: {error}")
+        # Messages name the options of ns-train; these commands have the same ones without the prefix.
+        prefix = "--pipeline.datamanager." if words[0] in ("prepare", "needs") else "--"
+        sys.exit(f"Error: {str(error).replace(prefix, '--')}")
+    except BrokenPipeError:  # the reader has seen enough, as in `lang3dxl … | head`
+        _leave_output()
+        sys.exit(1)
     except OSError as error:
         if (trouble := disk_trouble(error)) is None:
             raise
+        if error.filename is None:
+            _leave_output()
         sys.exit(f"Error: {trouble}")
     except KeyboardInterrupt:
         print("\nStopped; finished work is kept.", file=sys.stderr)
         sys.exit(130)
 
 
+_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows --out {}"
+
+
+def _parsed(words: Sequence[str]) -> Any:
+    """The called command with its settings. Exits with a hint if the words make no sense."""
+    _check_name(COMMANDS, words)
+    try:
+        choice = _choice(COMMANDS, words)
+        return tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+    except SystemExit as error:
+        if error.code == 2 and words[0] in ("query", "export"):
+            print(_TEXTS.format(words[0], "found" if words[0] == "query" else "found.ply"), file=sys.stderr)
+        raise
+
+
+def _check_name(commands: Mapping[str, Any], words: Sequence[str], above: str = "lang3dxl") -> None:
+    """Raises UserError with similar names if the first word is no command."""
+    if not words or words[0].startswith("-"):
+        return
+    if words[0] not in commands:
+        similar = get_close_matches(words[0], commands, n=1)
+        hint = f"did you mean {similar[0]}? " if similar else ""
+        raise UserError(f"there is no command {above} {words[0]}: {hint}{above} --help lists all")
+    if isinstance(found := commands[words[0]][0], Mapping):
+        _check_name(found, words[1:], f"{above} {words[0]}")
+
+
+def _leave_output() -> None:
+    """Write what is left of the output nowhere, so that Python does not complain at its end."""
+    with contextlib.suppress(OSError, ValueError):  # some streams have no descriptor
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
     """tyro's type for a choice of subcommands. Only the one called is imported, since most need torch; the
-    others appear in the help and in suggestions for typos such as `lang3dxl pepare`."""
+    others appear in the help."""
     kinds = []
     for name, (place, summary) in commands.items():
         called = words[:1] == [name]

@@ -9,18 +9,16 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from lang3dxl_ns.common.console import silence_libraries
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.saved_config import check_command_line
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 
 check_command_line(sys.argv[1:])
-silence_libraries()
 
 DEVICE: Literal["cuda", "cpu"] = "cuda" if torch.cuda.is_available() else "cpu"
 
@@ -100,6 +98,7 @@ lang3dxl = MethodSpecification(
         steps_per_eval_all_images=0,
         pipeline=Lang3DXLPipelineConfig(),
         optimizers=_optimizers(),
+        logging=LoggingConfig(profiler="none"),  # its table would end every command
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
     ),

@@ -24,7 +24,7 @@ import transformers
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
-from lang3dxl_ns.rendering.compositing import Compositing
+from lang3dxl_ns.rendering.torch_rasterizer import Compositing
 
 aten = torch.ops.aten
 CUDA = torch.device("cuda", 0)
@@ -357,6 +357,18 @@ def fake_gpu(memory: int = MEMORY, capability: tuple[int, int] = (8, 9)) -> Iter
         stack.enter_context(_conversions(True))
         stack.enter_context(_Mode())
         yield Gpu()
+
+
+class RealGpu(Gpu):
+    """This machine's own, which does not tell what the host waits for."""
+
+    syncs = property(lambda self: {})  # type: ignore[assignment]
+
+
+@contextlib.contextmanager
+def real_gpu(**_: Any) -> Iterator[Gpu]:
+    """This machine's GPU."""
+    yield RealGpu()
 
 
 def _cuda(memory: int, capability: tuple[int, int]) -> dict[str, Any]:

@@ -83,8 +83,8 @@ class Painted(SemanticEncoder):
     name = "painted"
     per_gaussian = True
 
-    def __init__(self) -> None:
-        super().__init__(CHANNELS, 0)
+    def __init__(self, channels: int = CHANNELS) -> None:
+        super().__init__(channels, 0)
 
     def initial_codes(self, count, generator=None):
         return None

@@ -1,4 +1,6 @@
-"""The GPU path on a fake GPU (fake_gpu.py): all components keep to one device, and the host rarely waits.
+"""The GPU path: all components keep to one device, and the host rarely waits.
+
+On a fake GPU (fake_gpu.py), and with `-m cuda` on the machine's own, where waits are not counted.
 
 Runs are a few steps on a tiny scene; they are made once and shared.
 """
@@ -8,7 +10,7 @@ from functools import cache
 import pytest
 import torch
 from conftest import make_trainer
-from fake_gpu import CUDA, GpuTensor, fake_gpu
+from fake_gpu import CUDA, GpuTensor, fake_gpu, real_gpu
 from scenes import write_scene
 
 from lang3dxl_ns.baselines.encoders import EncoderConfig
@@ -24,6 +26,20 @@ EVERYTHING = {
     "pipeline__datamanager__regions": "felzenszwalb",
 }
 LOOKS = {"pipeline__model__appearance__use": "on", "pipeline__model__camera_optimization": "on"}
+REAL = [pytest.param(real_gpu, marks=pytest.mark.cuda, id="real")] if torch.cuda.is_available() else []
+
+
+@pytest.fixture(scope="module", params=[pytest.param(fake_gpu, id="fake"), *REAL])
+def gpu(request):
+    """Makes a GPU, fake or real, for a block of code."""
+    return request.param
+
+
+@pytest.fixture
+def fake(gpu):
+    """For tests of what only the fake GPU tells."""
+    if gpu is not fake_gpu:
+        pytest.skip("only the fake GPU counts waits, and can be another one")
 
 
 @pytest.fixture(scope="module")
@@ -32,19 +48,19 @@ def small(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(small, tiny_clip, tiny_dense, tmp_path_factory):
+def trained(gpu, small, tiny_clip, tiny_dense, tmp_path_factory):
     """Trains on the GPU and returns the trainer, with `waits`: the counted waits of every step."""
 
     def run(iterations=4, semantics=True, fake=None, **changes):
         changes = {"machine__device_type": "cuda", "steps_per_eval_image": 0, **changes}
         changes.setdefault("pipeline__model__sky_gaussians", 40)
         folder = tmp_path_factory.mktemp("runs")
-        with fake_gpu(**fake or {}) as gpu:
+        with gpu(**fake or {}) as present:
             trainer = make_trainer(small, tiny_clip, tiny_dense, folder, iterations, semantics, **changes)
             torch.backends.cudnn.benchmark = True  # as ns-train does
             trainer.setup()
             trainer.waits = []
-            count_steps(trainer, gpu)
+            count_steps(trainer, present)
             trainer.train()
         assert all(parameter.device == CUDA for parameter in trainer.pipeline.model.parameters())
         return trainer
@@ -92,12 +108,12 @@ def own(waits) -> int:
 # ── training ────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_a_default_step_waits_once_beside_gsplat(default):
+def test_a_default_step_waits_once_beside_gsplat(default, fake):
     """For the guard, which decides whether the optimizers may step."""
     assert default.waits[1:] == [{"aten._local_scalar_dense": 1, "gsplat": 1}] * 5
 
 
-def test_a_step_of_everything_waits_twice_beside_gsplat(trained):
+def test_a_step_of_everything_waits_twice_beside_gsplat(trained, fake):
     """Also for the Gaussians in view, of which the look is computed."""
     shift = {"pipeline__model__appearance__opacity_shift": True, "pipeline__model__densify_until": 0.0}
     trainer = trained(**EVERYTHING | LOOKS | shift, mixed_precision=True)
@@ -122,7 +138,7 @@ def test_gradients_of_densification_do_not_depend_on_the_loss_scale(densified):
 
 
 @pytest.mark.parametrize("capability", [(8, 6), (7, 5)])
-def test_mixed_precision_is_bfloat16_without_a_scale_where_the_gpu_has_it(trained, capability):
+def test_mixed_precision_is_bfloat16_without_a_scale_where_the_gpu_has_it(trained, fake, capability):
     trainer = trained(2, mixed_precision=True, semantics=False, fake={"capability": capability})
     assert trainer.grad_scaler.is_enabled() is (capability < (8, 0))
     wanted = torch.float16 if capability < (8, 0) else torch.bfloat16
@@ -192,6 +208,38 @@ def test_a_resumed_run_goes_on(trained):
     assert not torch.equal(before, after[: len(before)])
 
 
+def test_hours_without_gsplat_are_not_begun(monkeypatch):
+    """A short run is; a long one says how long it would take, unless torch was chosen."""
+    from lang3dxl_ns.common.errors import UserError
+    from lang3dxl_ns.plugin import trainer_config
+    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+
+    def settings(**changes):
+        config = Lang3DXLTrainerConfig(max_num_iterations=30_000)
+        config.machine.device_type = "cuda"
+        for name, value in changes.items():
+            setattr(config.pipeline.model, name, value)
+        return config
+
+    monkeypatch.setattr(trainer_config, "_torch_rendering_seconds", lambda: 0.1)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(trainer_config, "warn_of_unused_gpu", lambda: None)
+    monkeypatch.setattr(trainer_config.gsplat_build, "ready", lambda: False)
+    with pytest.raises(UserError, match=r"30,000 iterations.*about 2.5 hours.*rasterizer torch"):
+        settings()._check_device()
+    settings(rasterizer="torch")._check_device()
+    short = settings()
+    short.max_num_iterations = 1_000
+    short._check_device()
+
+
+def test_a_rendering_by_torch_takes_time(gpu):
+    from lang3dxl_ns.plugin.trainer_config import _torch_rendering_seconds
+
+    with gpu():
+        assert _torch_rendering_seconds(50, (40, 30)) > 0
+
+
 def test_the_torch_rasterizer_renders_on_the_gpu_without_gsplat(trained, monkeypatch):
     monkeypatch.setattr("fake_gpu.gsplat_stand_in", lambda *_, **__: pytest.fail("gsplat was called"))
     trained(2, semantics=False, pipeline__model__rasterizer="torch")
@@ -200,13 +248,13 @@ def test_the_torch_rasterizer_renders_on_the_gpu_without_gsplat(trained, monkeyp
 # ── after training ──────────────────────────────────────────────────────────────────────────────────────
 
 
-def test_evaluation(default):
-    with fake_gpu():
+def test_evaluation(default, gpu):
+    with gpu():
         metrics = default.pipeline.get_average_eval_image_metrics()
     assert metrics["psnr"] > 0 and metrics["clip_l1"] > 0
 
 
-def test_no_photo_of_a_query_is_waited_for(default):
+def test_no_photo_of_a_query_is_waited_for(default, fake):
     """Rendering and maps wait for nothing (but gsplat); `find` waits as often for one photo as for all."""
     with fake_gpu() as gpu:
         scene = load_scene(default.base_dir / "config.yml")
@@ -229,14 +277,66 @@ def test_no_photo_of_a_query_is_waited_for(default):
         assert scene.match(scene.prompts("tower"), camera)[0].relevancy.device == CUDA
 
 
-def test_export(default, tmp_path):
-    with fake_gpu():
+def test_words_on_the_gpu_are_those_on_the_cpu(default, gpu):
+    """Gathered features, and relevancies of a finished run."""
+    from lang3dxl_ns.rendering import Gaussians, rasterize
+    from lang3dxl_ns.rendering.gathering import Pixels, gather
+    from lang3dxl_ns.scene.camera import Camera
+
+    draw = torch.Generator().manual_seed(0)
+    means = torch.rand(60, 3, generator=draw) - torch.tensor([0.5, 0.5, -2.0])
+    parts = means, torch.randn(60, 4, generator=draw), torch.full((60, 3), 0.1), torch.full((60,), 0.6)
+    values = torch.rand(24, 32, 5, generator=draw)
+    lens = torch.tensor([[30.0, 0.0, 16.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+
+    def gathered(device):
+        cloud, camera = Gaussians(*(part.to(device) for part in parts)), Camera(torch.eye(4), lens, 32, 24)
+        view = lambda probe: rasterize(cloud, camera, probe).image  # noqa: E731
+        features, mass = gather(60, [(view, Pixels.of([values.to(device)], (24, 32)))], 5, cloud.means)
+        return features.cpu(), mass.cpu()
+
+    expected = gathered("cpu")
+    with gpu():
+        found = gathered("cuda")
+        scene = load_scene(default.base_dir / "config.yml")
+        queries = scene.queries(scene.prompts("tower; window"))
+        relevancy = scene.engine.of_gaussians(queries).cpu()
+        codes = default.pipeline.model.gauss_params["codes"].detach().cpu()
+        field = default.pipeline.model.semantic_field
+        state = {name: value.cpu() for name, value in field.state_dict().items()}
+        vectors = queries.vectors.cpu()
+    torch.testing.assert_close(found[1], expected[1], rtol=1e-3, atol=1e-3)
+    seen = expected[1] > 0.1
+    torch.testing.assert_close(found[0][seen], expected[0][seen], rtol=1e-2, atol=1e-3)
+    here = CompressedField(field.config, field.clip_dim)
+    here.fit_codes(codes)
+    here.load_state_dict(state)
+    from lang3dxl_ns.query.engine import make_engine
+    from lang3dxl_ns.query.relevancy import Queries
+
+    asked = Queries(vectors, queries.positive, queries.negative)
+    there = make_engine(here, codes).of_gaussians(asked)
+    torch.testing.assert_close(relevancy, there, rtol=0, atol=5e-3)
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not REAL, reason="needs a GPU")
+def test_a_million_gaussians_are_trained_gathered_and_asked(tmp_path):
+    from lang3dxl_ns.benchmarks import gpu as benchmark
+
+    assert benchmark.step(1_000_000, (1000, 700))["memory"] < 8
+    learned = benchmark.words(1_000_000, (1000, 700), 200)
+    assert learned["memory"] < 8 and learned["cosine"] > 0.9
+
+
+def test_export(default, tmp_path, gpu):
+    with gpu():
         scene = load_scene(default.base_dir / "config.yml")
         count = len(scene.gaussians["means"])
         assert scene.export(tmp_path / "tower.ply", "tower", everything=True) == count
 
 
-def test_a_conversation_in_the_viewer(default):
+def test_a_conversation_in_the_viewer(default, gpu):
     from contextlib import nullcontext
 
     from lang3dxl_ns.plugin.cameras import view_of
@@ -244,7 +344,7 @@ def test_a_conversation_in_the_viewer(default):
 
     pipeline = default.pipeline
     model = pipeline.model.eval()
-    with fake_gpu():
+    with gpu():
         session = Conversation(
             model, pipeline.scene_file, default.base_dir, nullcontext(), lambda: False, lambda: None,
             lambda: {"rgb"}, lambda _: None,
@@ -268,24 +368,24 @@ def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, wid
     assert codes.isfinite().all(1).cpu().any()
 
 
-def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monkeypatch):
-    from lang3dxl_ns.benchmarks import gpu
+def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monkeypatch, gpu):
+    from lang3dxl_ns.benchmarks import gpu as benchmark
 
-    with fake_gpu():
-        gpu.GpuBenchmark(tmp_path, quick=True).main()
+    with gpu():
+        benchmark.GpuBenchmark(tmp_path, quick=True).main()
         report = (tmp_path / "gpu.md").read_text()
-        monkeypatch.setattr(gpu, "step", lambda *_: pytest.fail("measured again"))
+        monkeypatch.setattr(benchmark, "step", lambda *_: pytest.fail("measured again"))
         (tmp_path / "gpu.md").unlink()
-        gpu.GpuBenchmark(tmp_path, quick=True).main()
+        benchmark.GpuBenchmark(tmp_path, quick=True).main()
     assert (tmp_path / "gpu.md").read_text() == report
     assert "hard cases are within their bounds" in report
 
 
-def test_numerics():
+def test_numerics(gpu):
     from lang3dxl_ns.numerics import losses
     from lang3dxl_ns.numerics.command import measure_all
 
-    with fake_gpu():
+    with gpu():
         rows = measure_all(list(losses.cases(quick=True, device="cuda"))[:4], quick=True, device="cuda")
     assert [row.misses for row in rows if row.misses] == []
 
@@ -323,7 +423,7 @@ def bug_cpu_generator(model):
         (bug_cpu_generator, "generator"),
     ],
 )
-def test_planted_bugs_are_found(default, monkeypatch, plant, error):
+def test_planted_bugs_are_found(default, fake, monkeypatch, plant, error):
     model = default.pipeline.model
     monkeypatch.setattr(model, "colors_from", model.colors_from)  # so that it is restored
     plant(model)
@@ -331,7 +431,7 @@ def test_planted_bugs_are_found(default, monkeypatch, plant, error):
         model.get_outputs_for_camera(default.pipeline.datamanager.train_dataset.cameras[0:1])
 
 
-def test_a_planted_wait_is_counted(default, monkeypatch):
+def test_a_planted_wait_is_counted(default, monkeypatch, fake):
     model, colors = default.pipeline.model.eval(), default.pipeline.model.colors_from
     camera = default.pipeline.datamanager.train_dataset.cameras[0:1]
 

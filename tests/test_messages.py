@@ -13,6 +13,7 @@ from lang3dxl_ns import together
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.query.text import parse_prompts
 
 
 def report(path: Path, scene: str, layout: str = "plain", scored: bool = True) -> None:
@@ -111,8 +112,51 @@ def test_ground_truth(write, message, tmp_path):
         (lambda scene: together([]), "pass the matches of a single query"),
         (lambda scene: scene.render(np.eye(3)), r"a pose has shape \[3, 4\] or \[4, 4\]"),
         (lambda scene: scene.render("none.jpg"), "none.jpg"),
+        (lambda scene: scene.render(np.full((3, 4), np.nan)), "a pose is not three rows of four numbers"),
+        (lambda scene: scene.render(np.zeros((3, 4))), "a pose is not a rotation and a position"),
     ],
 )
 def test_python(wrong, message):
     with pytest.raises(UserError, match=message):
         wrong(painted_scene())
+
+
+def test_pictures_larger_than_the_memory_are_told_with_what_fits(monkeypatch):
+    scene = painted_scene()
+    monkeypatch.setattr("lang3dxl_ns.scene.camera.machine_memory", lambda: 2e6)
+    assert scene.camera(scene.photos[0].name, size=100).width <= 100
+    with pytest.raises(UserError, match=r"takes about .* GB, .*: give at most [1-9]\d* pixels"):
+        scene.camera(scene.photos[0].name, size=5_000)
+
+
+@pytest.mark.parametrize("value", ["[1]", "{}", '"a"', "1e999", "1" + "0" * 400, "true", "null", "[" * 9000])
+def test_pooled_figures_that_are_no_numbers(value, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = '{"scene": "a", "results": {"protocol": {}, "photos": {"p": {"ap_x": VALUE}}}}'
+    (tmp_path / "a.json").write_text(text.replace("VALUE", value))
+    with pytest.raises(SystemExit, match=r"a\.json is not a report"):
+        main(["evaluate", "pool", "--reports", "a.json", "--out", "report"])
+
+
+def test_the_test_views_have_labels_of_their_own():
+    with pytest.raises(SystemExit, match="leave --ground-truth off"):
+        main(["evaluate", "run", "none", "--split", "test", "--ground-truth", "nope", "--out", "report"])
+    with pytest.raises(SystemExit, match="nope is not a folder"):
+        main(["evaluate", "run", "none", "--ground-truth", "nope", "--out", "report"])
+
+
+@pytest.mark.parametrize("text", [3, b"dome", None, float("nan")])
+def test_prompts_that_are_no_text_are_type_errors_that_say_so(text):
+    with pytest.raises(TypeError, match="a prompt is a text"):
+        parse_prompts(text)
+
+
+@pytest.mark.parametrize("typed", ["rose window not door", "‘window’ not door", "a NOT 'b'"])
+def test_a_not_without_quotes_is_told_of(typed, capsys):
+    (prompt,) = parse_prompts(typed)
+    assert prompt.negatives == () and "not" in prompt.text.lower()
+    assert "To tell one thing from another" in capsys.readouterr().out
+    assert parse_prompts("‘window’ not ‘door’")[0].negatives == ("door",)
+    assert parse_prompts('"window" not "door"')[0].negatives == ("door",)
+    assert parse_prompts("the king’s door")[0].text == "the king’s door"
+    assert not capsys.readouterr().out

@@ -62,6 +62,7 @@ def test_questions_from_python(demo_output, folder):
     assert "torch.bool" in output(sys.executable, "-c", snippet + shown, cwd=folder, shell=True)
 
 
+@pytest.mark.nightly
 def test_the_notebook_runs_from_top_to_bottom(demo_output, folder):
     import nbformat  # here: they take five seconds to load, in every process that collects tests
     from nbclient import NotebookClient

@@ -8,25 +8,10 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from conftest import build_wheel
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
-
-
-def build(folder: Path, source: Path = ROOT) -> Path:
-    words = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source]
-    subprocess.run(words, check=True, timeout=500)
-    (wheel,) = folder.glob("*.whl")
-    return wheel
-
-
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    return build(tmp_path_factory.mktemp("wheel"))
-
-
-def test_it_is_reproducible(wheel, tmp_path):
-    assert build(tmp_path).read_bytes() == wheel.read_bytes()
 
 
 def test_the_sdist_is_reproducible_and_makes_the_same_wheel(wheel, tmp_path):
@@ -36,7 +21,7 @@ def test_the_sdist_is_reproducible_and_makes_the_same_wheel(wheel, tmp_path):
         subprocess.run(words, check=True, timeout=500, capture_output=True)
         sources += (tmp_path / name).glob("*.tar.gz")
     assert sources[0].read_bytes() == sources[1].read_bytes()
-    assert build(tmp_path / "wheel", sources[0]).read_bytes() == wheel.read_bytes()
+    assert build_wheel(tmp_path / "wheel", sources[0]).read_bytes() == wheel.read_bytes()
 
 
 def test_commands_run_from_it_alone(wheel, tmp_path):

@@ -9,13 +9,13 @@ from typing import Any
 from lang3dxl_ns.common.errors import UserError
 
 FULL, TEACHER, LIMIT, CHANCE = "full", "teacher", "limit", "chance"
-CLIPSEG, LANGSAM = "clipseg", "langsam"
-SEGMENTERS = (CLIPSEG, LANGSAM)
+CLIPSEG, LANGSAM, SAM3 = "clipseg", "langsam", "sam3"
+SEGMENTERS = (CLIPSEG, LANGSAM, SAM3)
 """Rows of networks that segment a picture by text."""
 BOUNDS = (TEACHER, LIMIT, CHANCE)
 """Rows that every run of the full method includes: figures with these prefixes."""
 _FIELD, _DATA = "pipeline.model.semantic_field.", "pipeline.datamanager."
-OF_TARGETS = ("scale_mode", "scale_range", "scales", "dense_tokens")
+OF_TARGETS = ("scale_mode", "scale_range", "scales", "dense_tokens", "clip_features")
 """Data manager settings that determine the targets."""
 
 
@@ -55,6 +55,7 @@ ROWS = (
     Row(CHANCE, "2-D", "a map without information"),
     Row(CLIPSEG, "2-D", "CLIPSeg", published="mAP .56"),
     Row(LANGSAM, "2-D", "LangSAM: GroundingDINO's boxes, masks by SAM", published="mAP .25"),
+    Row(SAM3, "2-D", "SAM 3: masks of what a text names"),
     _encoder("feature3dgs", "Feature 3DGS: wide codes, linear layer", "L1 .149, PSNR 13.3"),
     _encoder("fmgs", "FMGS: hash grid over places, whole features rendered", "mAP .51; L1 .180, PSNR 11.6"),
     _encoder("langsplat", "LangSplat: per-scene autoencoder to 3 numbers", "mAP .19"),

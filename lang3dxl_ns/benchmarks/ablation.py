@@ -58,6 +58,8 @@ class Ablation:
     """CLIPSeg: a Hugging Face name or a folder. If unavailable, its row says "not run here"."""
     langsam: tuple[str, str] = ("IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base")
     """LangSAM's GroundingDINO and SAM, likewise."""
+    sam3: str = "facebook/sam3"
+    """SAM 3, likewise; gated: accept its license at Hugging Face, then `hf auth login`."""
     workers: int = 1
     """Concurrent runs. They slow each other down: keep 1 where seconds matter."""
 
@@ -71,7 +73,14 @@ class Ablation:
         with_regions = any((scene / "regions").is_dir() for scene in scenes.values())
         rows = choose_rows(self.rows, min(self.steps) < SHORT_FIELD_RUN, with_regions)
         settings = RunSettings(
-            self.clip, self.dense, self.foreground, self.scale, self.ns_train, self.clipseg, self.langsam
+            self.clip,
+            self.dense,
+            self.foreground,
+            self.scale,
+            self.ns_train,
+            self.clipseg,
+            self.langsam,
+            self.sam3,
         )
         runs = [
             Run(row, path, label, seed, steps)
@@ -125,7 +134,7 @@ def make_all(
                     failed[run] = str(reason)
                 bar.update(task, advance=1, description=run.name)
                 report(figures, failed)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):
             for process in active_children():  # Ctrl-C has reached them; other signals have not
                 process.terminate()
             threads.shutdown(cancel_futures=True)

@@ -8,13 +8,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
@@ -22,13 +26,14 @@ from lang3dxl_ns.common.reports import (
     markdown_table,
     write_report,
 )
-from lang3dxl_ns.components.compression import CompressedField, CompressionConfig
+from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
+from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, centered_cosine
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.gathering import gather
+from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import Camera
 
 STEPS = 30_000
@@ -38,6 +43,7 @@ CLIP = 512
 _WORDS = {
     "gather a photo (ms)": "gather",
     "compress (s)": "compress",
+    "centered cosine": "cosine",
     "ask a text (ms)": "ask",
     "memory (GB)": "memory",
 }
@@ -48,8 +54,8 @@ _PARTS = ("render", "loss", "backward", "optimizer")
 class GpuBenchmark:
     """Measure what only a GPU can show, in about ten minutes; finished parts are kept in case it is stopped.
 
-    The Gaussians are random ones in front of the camera, with view-independent colors: times are those of
-    rasterizer, loss and optimizer, not of reading photos.
+    The Gaussians are random ones in front of the camera, with view-independent colors. Encoders have random
+    weights in the sizes of real ones.
     """
 
     out: Path
@@ -67,7 +73,11 @@ class GpuBenchmark:
             "parity": lambda: parity(300 if self.quick else 20_000, photo),
             "numerics": lambda: numerics(self.quick),
             **{f"step-{n}": lambda n=n: step(n, photo) for n in sizes},  # type: ignore[misc]
+            "step-paper": lambda: step(sizes[0], photo, paper=True),
+            "step-looks": lambda: step(sizes[0], photo, looks=True),
             **{f"words-{n}": lambda n=n: words(n, photo, 5 if self.quick else 1_000) for n in sizes},  # type: ignore[misc]
+            "encoder": lambda: encoder(self.quick),
+            "reading": lambda: reading((48, 32) if self.quick else (4000, 3000)),
             **{f"frame-{q}": lambda q=q: still(sizes[-1], frame, q) for q in (0, 1, 4)},  # type: ignore[misc]
         }
         results = {name: self._kept(name, work) for name, work in parts.items()}
@@ -135,20 +145,39 @@ def numerics(quick: bool) -> dict[str, Any]:
     return {"rows": len(rows), "missed": missed}
 
 
-def step(count: int, size: tuple[int, int]) -> dict[str, float]:
-    """Milliseconds of a training step of the colors by part, and the peak of its memory, GB."""
+def step(count: int, size: tuple[int, int], paper: bool = False, looks: bool = False) -> dict[str, float]:
+    """Milliseconds of a training step by part, and the peak of its memory, GB.
+
+    paper: with codes, which the published field decodes at 120 pixels. looks: with colors that depend on a
+    photo.
+    """
     raw, camera = cloud(count, size)
+    if paper:
+        raw["codes"] = torch.zeros(count, 3).cuda()
     parameters = {name: torch.nn.Parameter(value) for name, value in raw.items()}
-    optimizer = torch.optim.Adam(parameters.values(), lr=1e-4)
-    target = torch.rand(size[1], size[0], 3, generator=torch.Generator().manual_seed(1)).cuda()
-    state: dict[str, Tensor] = {}
+    field = SemanticField(SemanticFieldConfig("paper"), CLIP).cuda()
+    look = AppearanceField(AppearanceConfig(), ["photo"], raw["means"].mean(0).cpu(), 3.0).cuda()
+    networks = [*(field.parameters() if paper else ()), *(look.parameters() if looks else ())]
+    optimizer = torch.optim.Adam([*parameters.values(), *networks], lr=1e-4)
+    draw = torch.Generator().manual_seed(1)
+    target = torch.rand(size[1], size[0], 3, generator=draw).cuda()
+    small = fitted_size(target, 120)
+    wanted = torch.randn(*small, CLIP, generator=draw).cuda()
+    state: dict[str, Any] = {}
 
     def render() -> None:
         optimizer.zero_grad()
-        state["image"] = rasterize(_gaussians(parameters), camera, parameters["colors"].sigmoid()).image  # type: ignore[arg-type]
+        gaussians, colors = _gaussians(parameters), parameters["colors"].sigmoid()  # type: ignore[arg-type]
+        if looks:
+            everything = torch.arange(count, device=colors.device)
+            colors, gaussians = look(gaussians, colors, look.vector("photo"), everything, 0)
+        state["drawn"] = rasterize(gaussians, camera, colors, features=parameters.get("codes"))
 
     def loss() -> None:
-        state["loss"] = rgb_loss(state["image"], target)
+        state["loss"] = rgb_loss(state["drawn"].image, target)
+        if paper:
+            decoded = field.decode_clip(resize_nearest(state["drawn"].features, small))
+            state["loss"] = state["loss"] + (decoded - wanted).abs().mean()
 
     work = {"render": render, "loss": loss, "backward": lambda: state["loss"].backward()}
     torch.cuda.reset_peak_memory_stats()
@@ -165,28 +194,70 @@ def words(count: int, size: tuple[int, int], steps: int) -> dict[str, float]:
     gaussians, draw = _gaussians(raw), torch.Generator().manual_seed(2)
     axes, _ = torch.linalg.qr(torch.randn(CLIP, CompressedField.gathered_channels, generator=draw))
     basis = PrincipalBasis(torch.zeros(CLIP), axes)
-    pixels = torch.rand(size[1], size[0], axes.shape[1] + 1, generator=draw).cuda()
+    pixels = Pixels.of([torch.rand(40, 60, axes.shape[1], generator=draw).cuda()], (size[1], size[0]))
     views = [(lambda carried: rasterize(gaussians, camera, carried).image, pixels)]
     torch.cuda.reset_peak_memory_stats()
     photo = lambda: gather(count, views, axes.shape[1], raw["means"])  # noqa: E731
     seconds = {"gather": median(interleaved_times({"gather": photo}, repeats=3)["gather"])}
     features, mass = photo()
-    field = CompressedField(SemanticFieldConfig("default"), CLIP, CompressionConfig(steps=steps)).cuda()
+    # Random pixels have no kinds of things, so that features of 100 kinds are compressed instead.
+    kinds = torch.randn(100, features.shape[1], generator=draw).to(features)
+    features = kinds[torch.arange(count, device=features.device) % 100] + 0.15 * torch.randn_like(features)
+    field = CompressedField(SemanticFieldConfig("short"), CLIP, CompressionConfig(steps=steps)).cuda()
     torch.cuda.synchronize()
     start = time.perf_counter()
     codes = field.learn_gaussians(features, mass, basis=basis)
     torch.cuda.synchronize()
     seconds["compress"] = time.perf_counter() - start
-    known = GaussianFeatures.of(field, codes)
+    known = mass > 0
+    cosine = centered_cosine(features[known], field, codes[known.to(codes.device)], basis)
+    rows = GaussianFeatures.of(field, codes)
     text = torch.nn.functional.normalize(torch.randn(CLIP, 1, generator=draw), dim=0).cuda()
-    ask = lambda: known.rows.float() @ (text if known.head is None else known.head @ text)  # noqa: E731
+    ask = lambda: rows.rows.float() @ (text if rows.head is None else rows.head @ text)  # noqa: E731
     seconds["ask"] = median(interleaved_times({"ask": ask}, repeats=20)["ask"])
     return {
         "gather": 1e3 * seconds["gather"],
         "compress": seconds["compress"],
+        "cosine": cosine,
         "ask": 1e3 * seconds["ask"],
         "memory": torch.cuda.max_memory_allocated() / 1e9,
     }
+
+
+def encoder(quick: bool) -> dict[str, float]:
+    """Crops per second of a CLIP of the size of ViT-B/32 and of ViT-L/14, in half precision."""
+    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+    sizes = {"B/32": (768, 12, 12, 32), "L/14": (1024, 24, 16, 14)}
+    found, batch = {}, 2 if quick else 256
+    for name, (width, layers, heads, patch) in sizes.items():
+        config = CLIPVisionConfig(
+            hidden_size=32 if quick else width, intermediate_size=64 if quick else 4 * width,
+            num_hidden_layers=1 if quick else layers, num_attention_heads=2 if quick else heads,
+            patch_size=patch, image_size=224, projection_dim=CLIP,
+        )  # fmt: skip
+        model = CLIPVisionModelWithProjection(config).eval().to("cuda")
+        crops = torch.zeros(batch, 3, 224, 224).cuda()
+
+        def encode(model=model, crops=crops) -> None:
+            with torch.no_grad(), torch.autocast("cuda", torch.float16):
+                model(pixel_values=crops)
+
+        found[name] = batch / median(interleaved_times({"encode": encode}, repeats=3)["encode"])
+    return found
+
+
+def reading(size: tuple[int, int]) -> dict[str, float]:
+    """Photos of a size that one reader decodes per second, and copies to the GPU."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "photo.jpg"
+        draw = torch.randint(0, 256, (size[1] // 8, size[0] // 8, 3), dtype=torch.uint8)
+        Image.fromarray(draw.numpy()).resize(size).save(path, quality=90)
+
+        def read() -> None:
+            torch.from_numpy(np.array(Image.open(path).convert("RGB"))).to("cuda")
+
+        return {"photos": 1 / median(interleaved_times({"read": read}, repeats=3)["read"])}
 
 
 def times_of_parts(parts: dict[str, Callable[[], object]], repeats: int = 20) -> dict[str, float]:
@@ -219,9 +290,10 @@ def _markdown(results: dict[str, Any], machine: str, command: str) -> str:
     steps = {name.removeprefix("step-"): value for name, value in results.items() if name.startswith("step-")}
     rows, total = [], 0.0
     for count, found in steps.items():
-        total = sum(found[part] for part in _PARTS)
-        figures = [*(f"{found[part]:.2f}" for part in _PARTS), f"{total:.2f}", f"{found['memory']:.2f}"]
-        rows.append([f"{int(count):,}", *figures])
+        own = sum(found[part] for part in _PARTS)
+        total = own if count.isdigit() else total
+        figures = [*(f"{found[part]:.2f}" for part in _PARTS), f"{own:.2f}", f"{found['memory']:.2f}"]
+        rows.append([f"{int(count):,}" if count.isdigit() else f"the first, {count}", *figures])
     frames = [
         [name.removeprefix("frame-"), f"{found['frame']:.2f}", f"{found['memory']:.2f}"]
         for name, found in results.items()
@@ -240,7 +312,8 @@ def _markdown(results: dict[str, Any], machine: str, command: str) -> str:
 
 ## Training step, milliseconds
 
-Colors of random Gaussians. 30,000 steps at the largest size: {STEPS * total / 6e4:.0f} minutes.
+Colors of random Gaussians; `paper` also decodes codes, `looks` also computes a photo's look.
+30,000 steps at the largest size: {STEPS * total / 6e4:.0f} minutes.
 
 {markdown_table(["Gaussians", *_PARTS, "step", "memory (GB)"], rows)}
 
@@ -249,6 +322,12 @@ Colors of random Gaussians. 30,000 steps at the largest size: {STEPS * total / 6
 CLIP of {CLIP} channels, {CompressedField.gathered_channels} of them gathered.
 
 {markdown_table(["Gaussians", *_WORDS], learned)}
+
+## Preparation
+
+{markdown_table(["CLIP", "crops per second"], [[k, f"{v:.0f}"] for k, v in results["encoder"].items()])}
+
+One reader decodes {results["reading"]["photos"]:.1f} photos of 12 MP per second.
 
 ## Frame, milliseconds
 

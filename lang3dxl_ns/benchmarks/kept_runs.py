@@ -66,14 +66,12 @@ def _train_and_keep(
     parser.eval_mode = "all"
     checkpoints = config.get_base_dir() / config.relative_model_dir
     latest = max(checkpoints.glob("step-*.ckpt"), default=None)
-    if latest is None or int(latest.stem.removeprefix("step-")) + 1 < run.steps:
-        config.load_dir = None if latest is None else checkpoints
-        config.save_config()
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
+    config.load_dir = None if latest is None else checkpoints
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    if not trainer.is_finished:
         trainer.train()
-        if trainer.interrupted:
-            raise KeyboardInterrupt
     _, pipeline, _ = open_run(config.get_base_dir())
     results = pipeline.evaluation.scored(get_std=True)
     write_scores(folder, run.label, results, pipeline.device)

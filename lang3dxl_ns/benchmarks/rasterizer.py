@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -24,7 +24,6 @@ from lang3dxl_ns.benchmarks.dense_rasterizer import (
     count_pairs,
     render_dense,
 )
-from lang3dxl_ns.benchmarks.rasterizer_peers import load_peer, name_peers
 from lang3dxl_ns.benchmarks.rasterizer_scenes import (
     CHANNELS,
     COLORS,
@@ -50,17 +49,14 @@ from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.rasterize import Backend
 
 OURS, TORCH, DENSE, GSPLAT = "lang3dxl", "torch kernels", "dense tiles", "gsplat"
-Method: TypeAlias = str | Path
-"""One of the four above, or a peer's file."""
+"""Methods that can be compared."""
 
 
 # --- measuring --------------------------------------------------------------------------------------------
 
 
-def forward(problem: Problem, method: Method) -> tuple[Float[Tensor, "h w 6"], Float[Tensor, "h w 1"]]:
+def forward(problem: Problem, method: str) -> tuple[Float[Tensor, "h w 6"], Float[Tensor, "h w 1"]]:
     """Image and alpha by one of the methods compared."""
-    if isinstance(method, Path):
-        return load_peer(method)[1](problem)
     if method == DENSE:
         return render_dense(problem)
     backend: Backend = "gsplat" if method == GSPLAT else "torch"
@@ -71,13 +67,13 @@ def forward(problem: Problem, method: Method) -> tuple[Float[Tensor, "h w 6"], F
     return rendering.image, rendering.alpha
 
 
-def forward_only(problem: Problem, method: Method) -> Tensor:
+def forward_only(problem: Problem, method: str) -> Tensor:
     """The image, without keeping anything for a backward pass."""
     with torch.no_grad():
         return forward(problem, method)[0]
 
 
-def forward_backward(problem: Problem, method: Method) -> tuple[Tensor, tuple[Tensor, ...]]:
+def forward_backward(problem: Problem, method: str) -> tuple[Tensor, tuple[Tensor, ...]]:
     """The image and the gradients of the problem's leaves."""
     image, alpha = forward(problem, method)
     upstream = (problem.image_gradient, problem.alpha_gradient)
@@ -140,7 +136,7 @@ def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
 
 
 def prepared_pass(
-    case: Case, scene: Path | None, device: str, threads: int, seed: int, method: Method
+    case: Case, scene: Path | None, device: str, threads: int, seed: int, method: str
 ) -> Callable[[], object]:
     """For `peak_memory`: forward and backward, with the libraries already loaded by a tiny rendering."""
     torch.set_num_threads(threads)
@@ -154,7 +150,7 @@ def prepared_pass(
 
 @dataclass
 class RasterizerBenchmark:
-    """Measure time, memory and error of the rasterizer, beside a dense one, peers and, on a GPU, gsplat."""
+    """Measure time, memory and error of the rasterizer, beside a dense one and, on a GPU, gsplat."""
 
     out: Path
     """Folder for rasterizer.md, rasterizer.json and rasterizer.png."""
@@ -166,13 +162,6 @@ class RasterizerBenchmark:
     """Widths and heights, pixels."""
     recipes: tuple[Recipe, ...] = ("A", "B")
     """A: random small Gaussians. B: sizes and opacities as in training."""
-    peers: tuple[Path, ...] = ()
-    """Other rasterizers to measure: Python files that define NAME, a string, and render(problem), which
-    returns the image [h w c] and alpha [h w 1], differentiable in problem.leaves. It gets problem.gaussians
-    (means [n 3], world units; quats [n 4], w x y z of any length; scales [n 3], standard deviations in world
-    units, not logarithms; opacities [n], 0 to 1, not logits), problem.channels [n c], problem.background [c],
-    problem.camera (view_matrix [4 4], world to camera, x right, y down, z forward; intrinsics [3 3], pixels,
-    pixel centers at +0.5; width, height)."""
     threads: int = 1
     """CPU threads. With one, processor time is measured, otherwise wall time."""
     repeats: int = 5
@@ -239,7 +228,7 @@ def _measure(plan: RasterizerBenchmark) -> dict[str, Any]:
 def _measure_case(case: Case, plan: RasterizerBenchmark) -> dict[str, Any]:
     problem = make_problem(case, plan.scene, plan.device, seed=plan.seed)
     own = [OURS, DENSE, GSPLAT] if plan.device == "cuda" else [OURS, TORCH, DENSE]
-    methods: dict[str, Method] = {**{name: name for name in own}, **name_peers(plan.peers, own)}
+    methods = {name: name for name in own}
     kept, evaluated = count_pairs(problem.gaussians, problem.camera)
     need = evaluated * DENSE_BYTES_PER_PAIR / 1e9
     forward_ms = _median_ms({name: partial(forward_only, problem, m) for name, m in methods.items()}, plan)
@@ -292,10 +281,9 @@ def _markdown(results: dict[str, Any]) -> str:
 {CHANNELS} channels (colors and features) over a background; gradients of image and alpha for all Gaussian
 parameters and channels; projection included. Medians of interleaved runs; f: forward, f+b: forward and
 backward. **Quote the ratios**: times don't carry over to another machine.
-{TORCH}: the rasterizer in torch operations, for other devices and where numba is missing.
+{TORCH}: the rasterizer in plain torch, for other devices and where numba is missing.
 {DENSE}: the same rendering rules in plain torch with autograd, in tiles of {DENSE_TILE} pixels (the
 fastest size); – where its backward pass would need more than {results["baseline_gigabytes"]:g} GB.
-Any further names are other rasterizers, from files given with `--peers`; their rules may differ.
 
 {markdown_table(header, [_time_row(case, others) for case in results["cases"]])}
 

@@ -1,14 +1,14 @@
-"""`lang3dxl benchmark scale`: growth of memory and time with photos and Gaussians, on generated scenes."""
+"""`lang3dxl benchmark scale`: seconds and memory of every stage, with a phone's photos and many Gaussians."""
 
 from __future__ import annotations
 
-import shutil
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from statistics import median
-from typing import TYPE_CHECKING, Any
+from statistics import mean
+from typing import TYPE_CHECKING, Literal
 
 from lang3dxl_ns.common.reports import (
     command_line,
@@ -21,219 +21,241 @@ from lang3dxl_ns.common.reports import (
 
 if TYPE_CHECKING:
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+    from lang3dxl_ns.scene.photo import Photo
 
+_ZOOM = 20
+"""Makes photos of 7.7 to 15.4 megapixels, 11 on average."""
+_STEP_S = 0.015
+"""A training step on a GPU, which reading ahead must keep up with."""
+_STARTED = 2_000
+"""Photos of the start that is timed."""
+_VISION: dict[str, dict[str, int]] = {
+    "B/32": {"patch_size": 32},
+    "B/16": {"patch_size": 16},
+    "L/14": {
+        "patch_size": 14,
+        "hidden_size": 1024,
+        "intermediate_size": 4096,
+        "num_hidden_layers": 24,
+        "num_attention_heads": 16,
+    },
+}
+"""CLIP's image towers, as far as they differ from transformers' default."""
+Part = Literal["photos", "start", "crops", "run"]
 _alone = partial(in_own_process, preload=("lang3dxl_ns.methods", "pycolmap", "transformers"))
 
-PREDICTION = """Written before measuring. *Photos*: preparation holds one photo, one batch of crops and the
-encoders: constant. Training holds the cache (here `cache_gb`), the photos read ahead, the Gaussians and one
-step: it grows until the cache is full and is constant afterwards, except for the model's tracks (about 100
-bytes per observation) and a few kilobytes of bookkeeping per photo, 20 MB from 200 to 2,000 photos. The time
-of a step does not depend on the number of photos; out of core it may take 10 % longer, since another thread
-decodes photos meanwhile. *Gaussians*: 62 numbers each (59 of 3D Gaussian splatting and a code of 3), with
-gradients and Adam's two moments, are 1 kB each; a step's memory grows linearly on top of a constant for the
-decoder's maps, its time linearly or less."""
+
+@dataclass(frozen=True)
+class Stage:
+    """A measured stage."""
+
+    name: str
+    amount: str
+    """What it was done for."""
+    seconds: float
+    cpu: float
+    """Processor seconds, of all threads: reliable also where other programs run."""
+    each: str
+    """Processor seconds or rate of one item, in words."""
+    bytes: int
+    """Peak memory beyond that of the process with everything imported."""
 
 
 @dataclass
 class ScaleBenchmark:
-    """Prepare, train and evaluate generated scenes with growing numbers of photos and Gaussians."""
+    """Reading, preparation and training of photos of some 11 megapixels, stage by stage."""
 
     out: Path
-    """Folder for scale.md, scale.json and the scenes (deleted afterwards)."""
-    photos: tuple[int, ...] = (200, 500, 1000, 2000)
-    """Numbers of photos."""
-    gaussians: tuple[int, ...] = (10_000, 50_000, 100_000, 400_000)
-    """Numbers of Gaussians, with few photos."""
-    steps: int = 200
-    """Training steps of each run with photos."""
-    gaussian_steps: int = 5
-    """Training steps of each run with Gaussians."""
-    pairs: int = 3
-    """Runs with the fewest photos, alternately out of core and in memory, to compare their steps."""
-    workers: tuple[int, ...] = (1, 2)
-    """Numbers of processes to prepare the fewest photos with."""
-    cache_gb: float = 0.01
-    """Memory for photos and targets: small, so that even the fewest photos fill it."""
-    encoders: str = "builtin"
-    """CLIP and dense encoder; none measures photos alone."""
+    """Folder for scale.md, scale.json and the scenes (kept, and used again)."""
+    parts: tuple[Part, ...] = ("photos", "start", "crops", "run")
+    """What is measured: reading; a start with everything prepared; encoding of crops; whole runs."""
+    photos: int = 24
+    """Photos made."""
+    gaussians: tuple[int, ...] = (20_000, 300_000, 1_000_000)
+    """Numbers of Gaussians, of a run each."""
+    clips: tuple[str, ...] = ("builtin", "B/32", "B/16", "L/14")
+    """CLIPs whose crops are timed: the built-in one, and CLIP's sizes with random weights."""
+    steps: int = 5
+    """Training steps of a run."""
 
     def main(self) -> None:
-        """Runs each measurement in its own process, so that its peak memory can be measured."""
-        rows: dict[str, list[dict[str, Any]]] = {"photos": [], "pairs": [], "workers": [], "gaussians": []}
-        for count in sorted(self.photos):
-            scene = _Measured(
-                self.out / f"photos-{count}", count, 2_000, self.steps, self.cache_gb, self.encoders
-            )
-            rows["photos"].append(_alone(_measure, scene))
-            if count == min(self.photos):
-                self._measure_variants(scene, rows)
-            shutil.rmtree(scene.folder)
-            self._write(rows)
-        for count in self.gaussians:
-            scene = _Measured(
-                self.out / f"gaussians-{count}", 20, count, self.gaussian_steps, self.cache_gb, self.encoders
-            )
-            rows["gaussians"].append(_alone(_measure, scene))
-            shutil.rmtree(scene.folder)
-            self._write(rows)
+        """Measures each stage in its own process, for its peak memory; writes after each."""
+        stages: list[Stage] = []
+        work: dict[Part, list[Callable[[], list[Stage]]]] = {
+            "photos": [partial(_alone, _reading, self.out, self.photos)],
+            "start": [partial(_alone, _start, self.out)],
+            "crops": [partial(_alone, _crops, clip) for clip in self.clips],
+            "run": [partial(_alone, _run, self.out, self.photos, n, self.steps) for n in self.gaussians],
+        }
+        for part in self.parts:
+            for measure in work[part]:
+                stages += measure()
+                write_report(self.out, "scale", markdown(self, stages), {"stages": [vars(s) for s in stages]})
         print(f"Wrote {self.out / 'scale.md'}")
 
-    def _measure_variants(self, scene: _Measured, rows: dict[str, list[dict[str, Any]]]) -> None:
-        for _ in range(self.pairs):
-            pair = {
-                "out of core": _alone(_measure, scene),
-                "in memory": _alone(_measure, replace(scene, cache_gb=1e3)),
-            }
-            rows["pairs"].append(pair)
-        for workers in self.workers if self.encoders != "none" else ():
-            seconds = _alone(_prepare, replace(scene, workers=workers))
-            rows["workers"].append(
-                {"workers": workers, "seconds": seconds, "photos_per_second": scene.photos / seconds}
-            )
 
-    def _write(self, rows: dict[str, list[dict[str, Any]]]) -> None:
-        write_report(self.out, "scale", markdown(self, rows), rows)
-
-
-@dataclass(frozen=True)
-class _Measured:
-    folder: Path
-    photos: int
-    points: int
-    steps: int
-    cache_gb: float
-    encoders: str
-    workers: int = 1
-
-
-def _measure(scene: _Measured) -> dict[str, Any]:
-    """Seconds and peak memory (bytes beyond the process with everything imported) of each part."""
-    from lang3dxl_ns.common import timing
-    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
-
-    config = _configuration(scene)
-    config.save_config()
-    empty = host_peak(reset=True)
-    start = time.perf_counter()
-    trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    prepared, after_preparation = time.perf_counter() - start, host_peak(reset=True)
-    times: list[float] = []
-    iterate = trainer.train_iteration
-
-    def timed(step: int):
-        begin = time.process_time()  # of all threads; excludes other processes
-        result = iterate(step)
-        times.append(time.process_time() - begin)
-        return result
-
-    trainer.train_iteration = timed  # type: ignore[method-assign]
-    with timing.measure() as seconds:
-        trainer.train()
-    after_training = host_peak(reset=True)
-    trainer.pipeline.get_average_eval_image_metrics()
-    store = trainer.pipeline.datamanager.cache_dir
-    return {
-        "photos": scene.photos,
-        "gaussians": trainer.pipeline.model.num_points,
-        "preparation_s": prepared,
-        "preparation_bytes": after_preparation - empty,
-        "training_bytes": after_training - empty,
-        "evaluation_bytes": host_peak() - empty,
-        "step_s": median(times[len(times) // 5 :]),  # without the first steps, which warm up caches
-        "data_s": median(seconds["data"]),
-        "store_bytes": sum(path.stat().st_size for path in store.rglob("*") if path.is_file()),
-    }
-
-
-def _prepare(scene: _Measured) -> float:
-    """Seconds to prepare all photos anew, including the start of the processes."""
-    data = _configuration(scene).pipeline.datamanager
-    data.cache_dir = scene.folder / f"targets-{scene.workers}"
-    start = time.perf_counter()
-    assert data.setup(device="cpu", test_mode="val").targets is not None
-    return time.perf_counter() - start
-
-
-def _configuration(scene: _Measured) -> Lang3DXLTrainerConfig:
-    from lang3dxl_ns.demo.landmark.crowd import write_crowd
-    from lang3dxl_ns.methods import run_config
-
-    data = scene.folder / "scene"
-    if not data.exists():
-        write_crowd(data, scene.photos, scene.points)
-    config = run_config(data, scene.folder / "runs", "scale", scene.steps, scene.encoders, scene.encoders)
-    config.pipeline.datamanager.cache_gb = scene.cache_gb
-    config.pipeline.datamanager.workers = scene.workers
-    config.pipeline.datamanager.scale_mode = "relative"
-    config.pipeline.datamanager.scale_range = (0.4, 0.4)
-    config.pipeline.datamanager.dense_tokens = 16
-    config.pipeline.model.sky_gaussians = 0
-    config.pipeline.model.stop_split_at = 0  # as many Gaussians as there are points
-    config.set_timestamp()
-    return config
-
-
-def markdown(settings: ScaleBenchmark, rows: dict[str, list[dict[str, Any]]]) -> str:
+def markdown(settings: ScaleBenchmark, stages: Sequence[Stage]) -> str:
     """The report in markdown."""
-    photos = [(r, f"{r['photos']:,}") for r in rows["photos"]]
-    photos += [(r, f"{r['photos']:,}, {name}") for pair in rows["pairs"] for name, r in pair.items()]
-    return f"""# Memory and time as scenes grow
+    rows = [
+        [s.name, s.amount, f"{s.seconds:.1f}", f"{s.cpu:.1f}", s.each, f"{s.bytes / 1e9:.2f}"] for s in stages
+    ]
+    return f"""# Memory and time at real size
 
     {command_line("lang3dxl benchmark scale", settings)}
 
 {describe_machine()}
 
-{PREDICTION}
-
-Memory is the peak resident set beyond the process with everything imported. Photos are of 120×160 to 240×160
-pixels, encoders: {settings.encoders}.
-
-## With the number of photos
-
-{settings.steps} steps, 2,000 Gaussians, {settings.cache_gb} GB for photos and targets.
-
-{markdown_table(["photos", *_HEADER], [[name, *_row(r)] for r, name in photos])}
-
-{_comparison(rows["pairs"])}{_workers(rows["workers"])}
-## With the number of Gaussians
-
-20 photos, {settings.gaussian_steps} steps.
-
-{markdown_table(["Gaussians", *_HEADER], [[f"{r['gaussians']:,}", *_row(r)] for r in rows["gaussians"]])}
+{markdown_table(["stage", "of", "seconds", "of CPU", "each", "memory (GB)"], rows)}
 """
 
 
-def _comparison(pairs: list[dict[str, Any]]) -> str:
-    ratios = sorted(pair["out of core"]["step_s"] / pair["in memory"]["step_s"] for pair in pairs)
-    if not ratios:
-        return ""
-    return (
-        f"A step out of core takes {median(ratios):.3f} of the time of one in memory (median of "
-        f"{len(ratios)} pairs, {ratios[0]:.3f} to {ratios[-1]:.3f}).\n"
+def _measured(name: str, amount: str, work: Callable[[], object], each: Callable[[float], str]) -> Stage:
+    """A stage, with its times and peak memory. each: of its processor seconds."""
+    empty, start, used = host_peak(reset=True), time.perf_counter(), time.process_time()
+    work()
+    seconds, cpu = time.perf_counter() - start, time.process_time() - used
+    return Stage(name, amount, seconds, cpu, each(cpu), host_peak() - empty)
+
+
+def _scene(out: Path, photos: int, points: int = 2_000) -> Path:
+    from lang3dxl_ns.demo.landmark.crowd import write_crowd
+
+    folder = out / f"scene-{photos}-{points}"
+    return folder if folder.is_dir() else write_crowd(folder, photos, points, zoom=_ZOOM)
+
+
+def _photos(folder: Path) -> list[Photo]:
+    from lang3dxl_ns.scene.colmap import read_reconstruction
+    from lang3dxl_ns.scene.photo import Photo
+
+    tracked = read_reconstruction(folder / "sparse" / "0").photos.values()
+    return [Photo.from_model(t, folder / "images" / t.name).at_most(1600) for t in tracked]
+
+
+def _reading(out: Path, count: int) -> list[Stage]:
+    """Decoding once, reading the copies, and waiting for them in steps, with a tenth in memory."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from lang3dxl_ns.plugin.photo_cache import PhotoCache
+    from lang3dxl_ns.preparation.store import FeatureStore
+    from lang3dxl_ns.preparation.working_photos import WorkingPhotos
+
+    photos = _photos(_scene(out, count))
+    working = WorkingPhotos(FeatureStore(out / f"working-{time.time_ns()}"))
+    amount, repeated = f"{count} photos", photos * 5
+    decoded = _measured(
+        "decode, shrink, keep", amount, lambda: list(map(working.read, photos)), partial(_each, count)
     )
+    with ThreadPoolExecutor(2) as pool:
+        read = _measured(
+            "read the copies, 2 threads",
+            f"{len(repeated)} photos",
+            lambda: [image.shape for image in pool.map(working.read, repeated)],
+            lambda cpu: f"{len(repeated) / cpu:.0f} a second of one core",
+        )
+    size = sum(working.read(photo).nbytes for photo in photos)
+    cache = PhotoCache(
+        lambda i: {"image": working.read(photos[i % count])}, size * len(repeated) / count / 10
+    )
+    waits: list[float] = []
+
+    def train() -> None:
+        for place in range(len(repeated)):
+            start = time.perf_counter()
+            cache.get(place, list(range(place + 1, min(place + 17, len(repeated)))))
+            waits.append(time.perf_counter() - start)
+            time.sleep(_STEP_S)
+
+    late = lambda _: f"waits {1e3 * mean(waits):.1f} ms, {mean(w > 0.001 for w in waits):.0%} of the steps"  # noqa: E731
+    waiting = _measured("steps of 15 ms, a tenth in memory", f"{len(repeated)} photos", train, late)
+    return [decoded, read, waiting]
 
 
-def _workers(rows: list[dict[str, Any]]) -> str:
-    if not rows:
-        return ""
-    lines = [[str(r["workers"]), f"{r['seconds']:.0f}", f"{r['photos_per_second']:.1f}"] for r in rows]
-    table = markdown_table(["processes", "seconds", "photos per second"], lines)
-    return f"\n## With the number of processes that prepare\n\n{table}\n"
+def _start(out: Path) -> list[Stage]:
+    """A second preparation of small photos, with nothing to do."""
+    import numpy as np
+    from PIL import Image
+
+    from lang3dxl_ns.preparation.prepare import prepare
+    from lang3dxl_ns.preparation.settings import PreparationConfig
+    from lang3dxl_ns.preparation.store import FeatureStore
+    from lang3dxl_ns.scene.camera import Lens
+    from lang3dxl_ns.scene.photo import Photo
+
+    folder, rng = out / "small", np.random.default_rng(0)
+    folder.mkdir(parents=True, exist_ok=True)
+    photos = []
+    for i in range(_STARTED):
+        path = folder / f"{i}.jpg"
+        if not path.exists():
+            Image.fromarray(rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)).save(path)
+        photos.append(Photo(path.name, path, None, Lens(64, 48, 60.0, 60.0, 32.0, 24.0)))
+    config = PreparationConfig(clip="builtin", dense="none")
+    again = partial(prepare, photos, None, config, [1.0], FeatureStore(out / "small-store"), "cpu")
+    again()
+    return [_measured("start, all prepared", f"{_STARTED:,} photos", again, partial(_each, _STARTED))]
 
 
-_HEADER = [
-    "preparation (s)",
-    "its memory (MB)",
-    "training's memory (MB)",
-    "evaluation's memory (MB)",
-    "median step (ms of CPU)",
-    "of it waiting for data (ms)",
-    "store (MB)",
-]
+def _crops(clip: str) -> list[Stage]:
+    """Encoding of the crops of a photo, by a few of them."""
+    import torch
+    from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
+
+    from lang3dxl_ns.preparation.crop_budget import choose_crops
+    from lang3dxl_ns.preparation.encoders import load_image_text_encoder
+
+    side, batch = 224, 8
+    encode: Callable[[torch.Tensor], object]
+    if clip == "builtin":
+        encoder = load_image_text_encoder(clip, "cpu")
+        side, batch, encode = encoder.crop_size, 256, encoder.encode_images
+    else:
+        config = CLIPVisionConfig(**_VISION[clip])  # type: ignore[arg-type]
+        model = CLIPVisionModelWithProjection(config).eval().requires_grad_(False)
+        encode = lambda crops: model(pixel_values=crops)  # noqa: E731
+    crops = torch.rand(batch, 3, side, side)
+    encode(crops)
+    counts = {
+        quality: choose_crops([0.05], 1 / 1600, (1600, 1200), True, side, quality).count(1200, 1600)
+        for quality in ("fast", "normal", "fine")
+    }
+
+    def each(seconds: float) -> str:
+        of_photo = (f"{q} {count:,} crops, {seconds / batch * count:.0f} s" for q, count in counts.items())
+        return f"{1e3 * seconds / batch:.2f} ms; a photo: {', '.join(of_photo)}"
+
+    return [_measured(f"encode with {clip}", f"{batch} crops", lambda: encode(crops), each)]
 
 
-def _row(r: dict[str, Any]) -> list[str]:
-    sizes = [f"{r[f'{part}_bytes'] / 1e6:.0f}" for part in ("preparation", "training", "evaluation")]
-    step = [f"{1e3 * r['step_s']:.0f}", f"{1e3 * r['data_s']:.1f}", f"{r['store_bytes'] / 1e6:.0f}"]
-    return [f"{r['preparation_s']:.0f}", *sizes, *step]
+def _run(out: Path, photos: int, gaussians: int, steps: int) -> list[Stage]:
+    """A run: preparation (none the second time), steps, words."""
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
+
+    config = _configuration(_scene(out, photos, gaussians), out, steps)
+    config.save_config()
+    trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
+    amount = f"{gaussians:,} Gaussians"
+    prepared = _measured(f"prepare {photos} photos", amount, trainer.setup, partial(_each, photos))
+    pipeline = trainer.pipeline
+
+    def train() -> None:
+        for step in range(steps):
+            trainer.train_iteration(step)
+
+    trained = _measured(f"{steps} steps", amount, train, partial(_each, steps))
+    words = _measured("words", amount, pipeline.learn_words, partial(_each, photos))
+    return [prepared, trained, words]
+
+
+def _configuration(data: Path, out: Path, steps: int) -> Lang3DXLTrainerConfig:
+    from lang3dxl_ns.methods import run_config
+
+    config = run_config(data, out / "runs", "scale", steps, "builtin", "builtin")
+    config.pipeline.datamanager.cache_dir = out / "targets"
+    config.pipeline.model.sky_gaussians = 0
+    config.set_timestamp()
+    return config
+
+
+def _each(count: int, seconds: float) -> str:
+    return f"{seconds / count:.3g} s"

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from lang3dxl_ns.baselines.rows import CLIPSEG, SEGMENTERS, Row
+from lang3dxl_ns.baselines.rows import CLIPSEG, LANGSAM, SAM3, SEGMENTERS, Row
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import host_peak, in_own_process, write_atomically
 
@@ -62,6 +62,12 @@ class RunSettings:
     """Name or folder of CLIPSeg."""
     langsam: tuple[str, str] = ("", "")
     """Names or folders of LangSAM's GroundingDINO and SAM."""
+    sam3: str = ""
+    """Name or folder of SAM 3."""
+
+    def segmenter(self, row: str) -> tuple[str, str]:
+        """Name or folder of the network that finds words in a segmenter's row, and of its SAM, if any."""
+        return {CLIPSEG: (self.clipseg, ""), LANGSAM: self.langsam, SAM3: (self.sam3, "")}[row]
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,7 @@ class ScoredRuns:
     @cached_property
     def _clip_weights(self) -> str:
         """Fingerprint of the CLIP's weights, so that another version under the same name is noticed."""
-        from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
+        from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 
         clip = self.settings.clip
         return clip if clip == "none" else find_model(clip, CLIP_OPTION).identity
@@ -232,8 +238,6 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     _reset_peak()
     start = _now()
     trainer.train()
-    if trainer.interrupted:  # an interrupted run exits normally, but has no result
-        raise KeyboardInterrupt
     seconds = _now() - start
     peak = _peak()
     figures = average([photo.metrics for photo in trainer.pipeline.evaluation.evaluate("held-out")])
@@ -289,7 +293,7 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
-        pipeline.evaluation.relevancy(camera, scorer.queries.to(pipeline.device))
+        pipeline.evaluation.relevancy(camera, scorer.queries.to(pipeline.device), scorer.yardstick)
         times["render_ms"].append(1000 * (rendered - start))
         times["answer_ms"].append(1000 * (_now() - rendered))
     return {name: median(values) for name, values in times.items()}
@@ -305,12 +309,12 @@ def _now() -> float:
 
 
 def _score_segmenter(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
-    """AP of CLIPSeg or LangSAM in the very pictures that are scored, by the same rules."""
+    """AP of a segmenter in the very pictures that are scored, by the same rules."""
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
     from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 
-    words, sam = (settings.clipseg, "") if run.row.name == CLIPSEG else settings.langsam
-    segmenter = load_text_segmenter(find_text_segmenter(words, sam), "cpu")
+    files = find_text_segmenter(*settings.segmenter(run.row.name))
+    segmenter = load_text_segmenter(files, "cpu")
     config = run_configuration(run, settings, work)
     config.pipeline.datamanager.clip = config.pipeline.datamanager.dense = "none"
     data = config.pipeline.datamanager.setup(device="cpu", test_mode="test")

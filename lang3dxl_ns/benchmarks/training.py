@@ -33,19 +33,24 @@ class TrainingBenchmark:
     """Iterations of each run."""
     scale: float = 0.25
     """Size of the training photos relative to those on disk."""
+    threads: tuple[int, ...] = ()
+    """Numbers of threads, such as 1 2 4 8, to train the colors with as well, for a table of their steps."""
 
     def main(self) -> None:
         """Runs each variant in its own process, so that its peak memory can be measured. They run one after
         the other, so on a busy machine quote the split of a step and ratios, not absolute seconds."""
         results = {}
-        for name, settings in (("joint", self), ("rgb only", replace(self, clip="none", dense="none"))):
+        colors = replace(self, clip="none", dense="none")
+        runs = {"joint": (self, 0), "rgb only": (colors, 0)}
+        runs |= {f"{count} threads": (colors, count) for count in self.threads}
+        for name, run in runs.items():
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-                results[name] = pool.submit(_train_and_evaluate, settings).result()
+                results[name] = pool.submit(_train_and_evaluate, *run).result()
         write_report(self.out, "training", markdown(self, results), results)
         print(f"Wrote {self.out / 'training.md'}")
 
 
-def _train_and_evaluate(settings: TrainingBenchmark) -> dict[str, Any]:
+def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[str, Any]:
     import resource
 
     import torch
@@ -55,7 +60,9 @@ def _train_and_evaluate(settings: TrainingBenchmark) -> dict[str, Any]:
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     name = "joint" if settings.clip != "none" else "rgb"
-    runs = settings.out / "runs"
+    if threads:
+        torch.set_num_threads(threads)
+    runs = settings.out / (f"runs-{threads}" if threads else "runs")
     config = run_config(settings.data, runs, name, settings.iterations, settings.clip, settings.dense)
     config.pipeline.datamanager.camera_res_scale_factor = settings.scale
     config.set_timestamp()
@@ -178,6 +185,23 @@ the Gaussians of the end, for one photo: the larger of operations ÷ the machine
 and bytes ÷ its bandwidth in a copy. Looks and what decodes semantics are not in it.
 
 {cost}
+{_by_threads(results)}"""
+
+
+def _by_threads(results: dict[str, dict]) -> str:
+    """A table of the steps by the number of threads; empty if none was asked for."""
+    runs = {name.split()[0]: found for name, found in results.items() if name.endswith("threads")}
+    if not runs:
+        return ""
+    seconds = {"median step": [run["seconds_per_step"] for run in runs.values()]}
+    seconds |= {p: [run["split_seconds"].get(p) for run in runs.values()] for p in PARTS}
+    rows = [[name, *(_figure(_milliseconds(value)) for value in row)] for name, row in seconds.items()]
+    return f"""
+## By threads
+
+Colors alone, milliseconds.
+
+{markdown_table(["threads", *runs], rows)}
 """
 
 

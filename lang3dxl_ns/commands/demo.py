@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import sys
@@ -13,8 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich import get_console
 from rich.markdown import Markdown
 
+from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded, read_json
 from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
@@ -45,8 +46,9 @@ class Demo:
     Ctrl-C stops at any point and keeps what is there; the same command continues.
     """
 
-    out: Path = Path("lang3dxl-demo")
-    """Folder for the scene, the run and the report."""
+    out: Path | None = None
+    """Folder for the scene, the run and the report (default: lang3dxl-demo or, if another scene is there,
+    lang3dxl-demo-2 …)."""
     seed: int = 2
     """Landmark seed; those below 1,000 are unknown to the built-in CLIP."""
     family: Literal["cathedral", "mosque", "hall", "auto"] = "auto"
@@ -67,13 +69,14 @@ class Demo:
     dense: str = "builtin"
     """Dense encoder: the same choices."""
     ns_train: str = ""
-    """Extra flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.dense-weight 0.5"."""
+    """Extra flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.sky-gaussians 0"."""
 
     def main(self) -> None:
-        out = self.out.expanduser().absolute()
+        check_numbers(self, _BOUNDS)
+        out = self._folder()
         try:
             self._run(out)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemExit):
             sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
@@ -86,10 +89,8 @@ class Demo:
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
         trainer.stages = stages
         trainer.setup()
-        if trainer.first_iteration < config.max_num_iterations:
+        if not trainer.is_finished:
             trainer.train()
-            if trainer.interrupted:
-                raise KeyboardInterrupt
         else:
             say("train: skipped, the run is finished")
         with stages.stage("evaluate"):
@@ -112,26 +113,48 @@ class Demo:
         say(f"Walk through it: lang3dxl view {run}")
         say(f'Ask it:          lang3dxl query {run} --text "windows" --out found')
 
+    def _folder(self) -> Path:
+        """The folder requested, or the first default one without another scene. Raises UserError if a
+        requested one holds another."""
+        if self.out is not None:
+            out = expanded(self.out).absolute()
+            if difference := self._difference(out):
+                raise UserError(f"{difference}: give --out another folder, or remove this one")
+            return out
+        names = ("lang3dxl-demo", *(f"lang3dxl-demo-{number}" for number in range(2, 1000)))
+        return next(out for name in names if not self._difference(out := Path(name).absolute()))
+
+    def _difference(self, out: Path) -> str | None:
+        """How the scene in a folder differs from the one requested; None if it doesn't, or is yet to come."""
+        path = out / "scene" / "scene.json"
+        if not path.exists():
+            return None
+        try:
+            found = dict(read_json(path))
+        except (OSError, ValueError, TypeError) as error:
+            return f"{path} can't be read ({error})"
+        different = (n for n, value in self._wanted.items() if found.get(n, 0) != value)
+        if (name := next(different, None)) is None:
+            return None
+        return f"{path.parent} is a scene with {name} {found.get(name, 0)}, not {self._wanted[name]}"
+
+    @property
+    def _wanted(self) -> dict[str, Any]:
+        """What tells the requested scene from others, as scene.json names it."""
+        photos, views = (24, 8) if self.quick else (48, 24)
+        wanted: dict[str, Any] = {"seed": self.seed, "wild": self.wild}
+        wanted["photos"] = photos if self.photos is None else self.photos
+        wanted["test_views"] = views if self.test_views is None else self.test_views
+        return wanted | ({} if self.family == "auto" else {"family": self.family})
+
     def _scene(self, out: Path) -> Path:
-        """The scene in `out`, generated unless it is there. Raises UserError if another one is there."""
+        """The scene in `out`, generated unless it is there."""
         from lang3dxl_ns.demo.landmark.scene_writer import write_scene
 
-        photos = self.photos or (24 if self.quick else 48)
         folder = out / "scene"
-        wanted: dict[str, Any] = {"seed": self.seed, "photos": photos, "wild": self.wild}
-        wanted["test_views"] = (8 if self.quick else 24) if self.test_views is None else self.test_views
-        if self.family != "auto":
-            wanted["family"] = self.family
-        if not (folder / "scene.json").exists():
-            return write_scene(DemoScene(out=folder, **{"family": self.family, **wanted}))
-        found = json.loads((folder / "scene.json").read_text())
-        for name, value in wanted.items():
-            if found.get(name, 0) != value:
-                raise UserError(
-                    f"{folder} is a scene with {name} {found.get(name, 0)}, and {value} was asked for: give "
-                    f"--out another folder, or remove this one"
-                )
-        return folder
+        if (folder / "scene.json").exists():
+            return folder
+        return write_scene(DemoScene(out=folder, **{"family": self.family, **self._wanted}))
 
     def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
         """The run's configuration; resumes from the checkpoint of an earlier command, if any."""
@@ -203,6 +226,8 @@ half the photo's size, as published, and not masked. Test views are novel camera
 {markdown_table(["stage", "seconds", "peak memory (MB)"], cost)}
 """
 
+
+_BOUNDS = {"seed": (0, 2**63), "photos": (4, 9999), "steps": (1, 1e9), "test_views": (0, 9999)}
 
 WHO = {"field": "", "teacher": "teacher_", "limit": "limit_", "chance": "chance_"}
 """Sources of the reported average precision, and the prefix of their figures."""

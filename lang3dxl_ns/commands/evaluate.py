@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,21 +10,13 @@ import tyro
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
-from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
-from lang3dxl_ns.evaluation.aggregate import PREFIXES, TOTALS, average, mean_average_precision, pool
+from lang3dxl_ns.common.reports import describe_machine, write_report
+from lang3dxl_ns.evaluation.aggregate import average, pool
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
+from lang3dxl_ns.evaluation.report import pooled_table, read_results, scene_table
 
 REPORT = "scores"
 """Report file name, without suffix."""
-WHOSE = {
-    "": "blurred",
-    "raw_": "unprocessed",
-    "authors_": "as published",
-    "teacher_": "2-D teacher",
-    "limit_": "limit",
-    "chance_": "chance",
-}
-"""Column headers of the report."""
 
 
 @dataclass(kw_only=True)
@@ -92,6 +81,10 @@ class EvaluateRun:
     def main(self) -> None:
         from lang3dxl_ns.plugin.open_run import open_run
 
+        if self.split == "test" and (self.ground_truth is not None or self.layout != "auto"):
+            raise UserError("--split test has labels of its own, in test_views/: leave --ground-truth off")
+        if self.ground_truth is not None:
+            GroundTruth(self.ground_truth, self.layout)  # fail now rather than after loading
         _, pipeline, _ = open_run(self.run)
         pipeline.config.evaluated_photos = self.split
         if self.ground_truth is not None:
@@ -119,7 +112,7 @@ class EvaluatePool:
             raise UserError("there is nothing to combine: name the scenes' reports after --reports")
         scenes: dict[str, dict[str, Any]] = {}
         for path in self.reports:
-            name, results = _read_results(path)
+            name, results = read_results(path)
             if name in scenes:
                 raise UserError(
                     f"{path} is a second report of the scene {name}: give one for each scene; two "
@@ -138,7 +131,7 @@ class EvaluatePool:
             f"seen in training; foreground: {p.get('foreground')}"
             for name, p in protocols.items()
         ]
-        table = "\n".join([_pooled_table(pooled), "", *notes])
+        table = "\n".join([pooled_table(pooled), "", *notes])
         write_report(self.out, REPORT, table, pooled | {"protocols": protocols})
         print(f"{table}\n\nWrote {self.out / REPORT}.md")
 
@@ -173,28 +166,6 @@ Evaluate = (
 )
 
 
-# ── reports ─────────────────────────────────────────────────────────────────────────────────────────────
-
-
-def _read_results(path: Path) -> tuple[str, dict[str, Any]]:
-    """Scene and results of a report, also in the form of `ns-eval`."""
-    try:
-        content = json.loads(path.read_text())
-        results = content["results"]
-        for figures in results["photos"].values():
-            if not all(math.isfinite(value) for value in figures.values()):
-                raise ValueError("a photo has a figure that is not a number")
-        if not isinstance(results["protocol"], dict):
-            raise ValueError("it does not say what was scored")
-        return str(content.get("scene") or content["experiment_name"]), results
-    except FileNotFoundError as error:
-        raise UserError(f"there is no {path}: name the scores.json of a report") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path} is not a report of `lang3dxl evaluate` or `ns-eval` ({error!r}): make it again"
-        ) from error
-
-
 def _scene_name(folder: Path) -> str:
     """Name of the scene, from a ground truth folder named after it, or one inside that."""
     return folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
@@ -203,73 +174,7 @@ def _scene_name(folder: Path) -> str:
 def write_scores(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu") -> None:
     """Write a scene's report, scores.json and scores.md, and print it."""
     report = {"scene": scene, "machine": describe_machine(device), "results": results}
-    table = _scene_table(scene, results)
+    table = scene_table(scene, results)
     write_report(folder, REPORT, table, report)
     print(table)
     print(f"\nWrote {folder / REPORT}.md")
-
-
-def _scene_table(scene: str, results: Mapping[str, Any]) -> str:
-    """The report in markdown: average precision by category, then totals, then the protocol."""
-    categories = sorted(name.removeprefix("ap_").removesuffix("_photos") for name in results if _counts(name))
-    whose = [prefix for prefix in PREFIXES if f"{prefix}map" in results]
-    rows = [
-        [c, results[f"ap_{c}_photos"], *(_mean_std(results, f"{prefix}ap_{c}") for prefix in whose)]
-        for c in categories
-    ]
-    rows.append(["**mAP**", "", *(f"**{results[f'{prefix}map']:.3f}**" for prefix in whose)])
-    heads = WHOSE | ({"": "unprocessed"} if results["protocol"].get("layout") == "lerf_ovs" else {})
-    words = markdown_table(["average precision", "photos", *(heads[prefix] for prefix in whose)], rows)
-    totals = [[name, f"{results[name]:.3f}"] for name in TOTALS.values() if name in results]
-    others = [[name, _mean_std(results, name)] for name in _OTHERS if name in results]
-    protocol = "\n".join(f"- {name.replace('_', ' ')}: {v}" for name, v in results["protocol"].items())
-    figures = markdown_table(["", "mean"], totals + others)
-    return f"# {scene}\n\n{words if categories else ''}\n\n{figures}\n\n{protocol}\n"
-
-
-_OTHERS = (
-    "half_psnr",
-    "half_ssim",
-    "half_lpips",
-    "psnr",
-    "cc_psnr",
-    "ssim",
-    "lpips",
-    "clip_l1",
-    "clip_psnr",
-    "clip_cosine",
-    "render_seconds",
-    "query_seconds",
-    "fit_seconds",
-    "peak_memory_mb",
-)
-
-
-def _counts(name: str) -> bool:
-    return name.startswith("ap_") and name.endswith("_photos")
-
-
-def _mean_std(results: Mapping[str, Any], name: str) -> str:
-    deviation = results.get(f"{name}_std")
-    return f"{results[name]:.3f}" + ("" if deviation is None else f" ± {deviation:.3f}")
-
-
-def _pooled_table(pooled: Mapping[str, Mapping[str, Any]]) -> str:
-    images, scenes, each = pooled["image_pooled"], pooled["scene_mean"], pooled["per_scene"]
-    categories = [name for name in images if name.startswith("ap_") and f"{name}_photos" in images]
-    rows = [
-        [
-            name.removeprefix("ap_"),
-            images[f"{name}_photos"],
-            f"{images[name]:.3f}",
-            f"{scenes[name]:.3f}",
-            *(f"{figures[name]:.3f}" if name in figures else None for figures in each.values()),
-        ]
-        for name in categories
-    ]
-    by_scene = [mean_average_precision(figures) for figures in each.values()]
-    rows.append(
-        ["**mAP**", "", f"**{images['map']:.3f}**", f"**{scenes['map']:.3f}**"]
-        + [None if value is None else f"{value:.3f}" for value in by_scene]
-    )
-    return markdown_table(["average precision", "photos", "image-pooled", "scene mean", *each], rows)

@@ -29,10 +29,12 @@ class Prepare(PreparationConfig):
     removed photos, or dense features with --dense none)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.encoders import check_encoders, option_prefix
+        from lang3dxl_ns.plugin.data_folder import check_data
+        from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
         from lang3dxl_ns.preparation.store import FeatureStore
 
         option_prefix.set("--")
+        check_data(self.data)
         if not self.clean:
             check_encoders(self.clip, self.dense)
         datamanager = open_datamanager(self, self.data, self.cache_dir)
@@ -50,7 +52,7 @@ def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | 
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
     from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-    from lang3dxl_ns.preparation.encoders import option_prefix
+    from lang3dxl_ns.preparation.model_files import option_prefix
 
     option_prefix.set("--")
     config = Lang3DXLDataManagerConfig(

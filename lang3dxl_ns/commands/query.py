@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
@@ -24,10 +24,12 @@ from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.scene_file import Provenance, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
-from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.text import Prompt, parse_prompts
 from lang3dxl_ns.query.vocabulary import read_vocabulary, whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
+
+_Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
 @dataclass(kw_only=True)
@@ -44,6 +46,8 @@ class Query:
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Text to look for; repeat the flag, or separate with `;`. Negatives: '"windows" not "arcades"'."""
+    not_: _Not = field(default_factory=list)
+    """What all texts are told apart from, such as arcades; repeat the flag for more."""
     out: Path
     """Folder for the results."""
     image: str | None = None
@@ -59,10 +63,12 @@ class Query:
     def main(self) -> None:
         if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
             raise UserError("--image, --all and --camera-path exclude each other: give one of them")
-        make_folder(self.out)  # fail now rather than after the work
+        prompts = parse_texts(self.text, self.not_)  # fail now rather than after the work
+        if not prompts:
+            raise UserError("there is no --text: say what to look for, such as --text windows")
+        make_folder(self.out)
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
-        question = scene.ask(self.text)
-        prompts = question.prompts
+        question = scene.ask(prompts)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
         views, best = [], [-1.0] * len(prompts)
         where = [""] * len(prompts)
@@ -105,11 +111,22 @@ class Query:
         return list(zip(file_names(photos), photos, asked, strict=True))
 
 
+def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:
+    """Prompts of --text, each with the negatives of --not."""
+    prompts = [prompt for text in texts for prompt in parse_prompts(text)]
+    return [replace(prompt, negatives=(*prompt.negatives, *apart_from)) for prompt in prompts]
+
+
+_LONGEST_NAME = 200
+"""Bytes; file systems allow 255, suffixes included."""
+
+
 def file_names(photos: list[str]) -> list[str]:
     """A unique file name (no suffix) for each photo: a.jpg beside a.png becomes a_jpg."""
     stems = [str(PurePosixPath(photo).with_suffix("")).replace("/", "_") for photo in photos]
     whole = [photo.replace("/", "_").replace(".", "_") for photo in photos]
     names = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, whole, strict=True)]
+    names = [name.encode()[:_LONGEST_NAME].decode("utf-8", "ignore") for name in names]
     return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
 
 
@@ -148,6 +165,8 @@ class Export:
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Text to look for (default: write everything); with --web, prompts that the page opens with."""
+    not_: _Not = field(default_factory=list)
+    """What all texts are told apart from; repeat the flag for more."""
     out: Path | None = None
     """The .ply or .spz file to write."""
     web: Path | None = None
@@ -174,10 +193,11 @@ class Export:
     def main(self) -> None:
         if sum(target is not None for target in (self.out, self.web, self.scene_file)) != 1:
             raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
+        prompts = parse_texts(self.text, self.not_)
         if self.out is not None:
             make_folder(self.out.parent)
             check_splat_name(self.out)
-            if len(self.text) > 1:
+            if len(prompts) > 1:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         if self.scene_file is not None:
@@ -185,11 +205,11 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: lang3dxl query {self.scene_file}")
         if self.web is not None:
             own = read_vocabulary(self.vocabulary) if self.vocabulary else ()
-            page = Page(scene, self.text, own, self._clip_words(scene.file.clip), self._told(), self.look)
+            page = Page(scene, prompts, own, self._clip_words(scene.file.clip), self._told(), self.look)
             size = write_page(page, self.web)
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
-            text = self.text[0] if self.text else None
+            text = prompts[0] if prompts else None
             count = scene.export(self.out, text, everything=self.all, look=self.look)
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
 

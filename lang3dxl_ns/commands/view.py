@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.query.query_config import QueryConfig
 
@@ -41,6 +42,7 @@ class View:
         from lang3dxl_ns.query.web.serve import PageServer
         from lang3dxl_ns.query.web.write_page import Page
 
+        check_address(self.host, self.port)  # fail now rather than after the work
         words = read_vocabulary(self.vocabulary) if self.vocabulary else ()
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         page = Page(scene, self.text, words, provenance=provenance_of(self.scene), live=True)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import errno
+import socket
 from collections.abc import Mapping
 
 from lang3dxl_ns.common.errors import UserError
+
+FARTHEST = 1e12
+"""Largest coordinate, world units; map coordinates are below 1e8."""
 
 
 def check_numbers(settings: object, bounds: Mapping[str, tuple[float, float]], prefix: str = "--") -> None:
@@ -19,9 +23,34 @@ def check_numbers(settings: object, bounds: Mapping[str, tuple[float, float]], p
 
 def disk_trouble(error: OSError) -> str | None:
     """Message about a file that can't be read or written; None for other errors."""
-    if error.errno not in _REMEDIES or error.filename is None:
+    if error.errno not in _REMEDIES:
         return None
+    if error.filename is None:  # a stream has no name
+        return f"the output can't be written: {error.strerror}" if error.errno == errno.ENOSPC else None
     return f"{error.filename}: {error.strerror}; {_REMEDIES[error.errno]}"
+
+
+def is_coordinate(value: object) -> bool:
+    """Whether this is a finite number of a sensible size: no NaN, truth value or text."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < FARTHEST
+
+
+def check_address(host: str, port: int | None) -> None:
+    """Raises UserError for an address that nothing can be served at: a port that is taken or none at all, a
+    host that is not a name or address of this machine. port: None: any."""
+    if port is not None and not 1 <= port <= 65535:
+        raise UserError(f"the port is {port}: give a number from 1 to 65535")
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do after a restart
+            trial.bind(address)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise UserError(f"port {port} is taken by another program: name another, or none") from error
+        raise UserError(
+            f"{host} is not an address of this machine ({error.strerror}): use 127.0.0.1, or 0.0.0.0 for all"
+        ) from error
 
 
 _NO_SPACE = "free some space and run the same command again"

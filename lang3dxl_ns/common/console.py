@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -15,16 +17,18 @@ QUIET_S = 5.0
 
 
 @contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A function to call after each of `total` items; after five seconds, shows a bar with time left."""
+def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
+    """A function to call after each of `total` items, or with their number after several; after five seconds,
+    shows a bar with the time left."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     start = time.monotonic()
-    bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    bar = Progress(*columns, speed_estimate_period=600)  # items come in lots: a short window would jump
     shown = bar.add_task(what, total=total)
 
-    def advance() -> None:
-        bar.advance(shown)
+    def advance(count: int = 1) -> None:
+        bar.advance(shown, count)
         if time.monotonic() - start > QUIET_S:
             bar.start()  # repeated calls have no effect
 
@@ -43,6 +47,13 @@ def say(*lines: str) -> None:
         get_console().print(printable(line), markup=False, highlight=False, soft_wrap=True)
 
 
+def accept_any_console() -> None:
+    """Make characters that the terminal's encoding lacks appear escaped, instead of as an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def silence_libraries() -> None:
     """Silence the known warnings and progress bars of other libraries that a user can do nothing about."""
     for message in _KNOWN_WARNINGS:
@@ -52,7 +63,7 @@ def silence_libraries() -> None:
 
 _KNOWN_WARNINGS = (
     r"`torch\.jit\.\w+` is deprecated",  # torchmetrics
-    r"`torch\.cuda\.amp\.GradScaler",  # nerfstudio's trainer
+    r"`torch\.cuda\.amp\.",  # nerfstudio's trainer and activations
     r"Detected call of `lr_scheduler\.step\(\)` before",  # nerfstudio's optimizers
     r"Converting a tensor with requires_grad=True to a scalar",  # nerfstudio's writer
 )

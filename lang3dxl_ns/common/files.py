@@ -1,15 +1,84 @@
-"""Files: atomic writes, safe folder names, lists of names."""
+"""Files: guarded reads, atomic writes, safe folder names, lists of names."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import json
+import math
 import os
 import re
 import secrets
+import stat
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, BinaryIO
 
 from lang3dxl_ns.common.errors import UserError
+
+_MOST_BYTES = 64 << 20
+"""Largest file of settings, names or figures; files of arrays have limits of their own."""
+
+
+def open_file(path: Path) -> BinaryIO:
+    """A regular file, opened for reading. Raises OSError for anything else: reading a pipe or a device may
+    never end. The check is of the opened file, so that it can't be replaced in between."""
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    file = os.fdopen(descriptor, "rb", closefd=True) if _is_regular(descriptor) else None
+    if file is None:
+        os.close(descriptor)
+        number = errno.EISDIR if path.is_dir() else errno.EINVAL
+        raise OSError(number, "it is not a regular file", str(path))
+    return file
+
+
+def _is_regular(descriptor: int) -> bool:
+    return stat.S_ISREG(os.fstat(descriptor).st_mode)
+
+
+def check_regular(path: Path) -> None:
+    """Raises OSError unless this is a regular file that can be read; for readers of other libraries."""
+    open_file(path).close()
+
+
+def read_text(path: Path, most: int = _MOST_BYTES) -> str:
+    """UTF-8 text of a regular file of at most `most` bytes. Raises OSError, or ValueError for a larger file
+    and other bytes."""
+    with open_file(path) as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"it is larger than {most >> 20} MiB")
+    return content.decode()
+
+
+def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
+    """Content of a JSON file. Raises OSError, or ValueError for anything that is not JSON."""
+    try:
+        return json.loads(read_text(path, most))
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def read_array(path: Path) -> Any:
+    """The array of a .npy file, whose header must fit the file's size. Raises OSError, or ValueError for
+    anything else: other formats, pickles, and headers that announce more than there is."""
+    import numpy as np
+
+    with open_file(path) as file:
+        try:
+            version = np.lib.format.read_magic(file)
+            readers = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }
+            shape, _, kind = readers[version](file)
+            size = math.prod(shape) * kind.itemsize
+        except Exception as error:  # numpy evaluates headers, which may fail in any way
+            raise ValueError(f"its header is no array's: {type(error).__name__}") from error
+        if kind.hasobject or size != os.fstat(file.fileno()).st_size - file.tell():
+            raise ValueError("its header does not fit its size")
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
@@ -33,6 +102,21 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         raise
 
 
+def replace_durably(partial: Path, path: Path) -> None:
+    """Move a finished file over another one; a loss of power leaves one of the two, whole."""
+    _to_disk(partial)
+    os.replace(partial, path)
+    _to_disk(path.parent)
+
+
+def _to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def make_folder(folder: Path) -> None:
     """Make a folder and its parents. Raises OSError with its name."""
     try:
@@ -40,6 +124,14 @@ def make_folder(folder: Path) -> None:
     except OSError as error:
         error.filename = str(folder)
         raise
+
+
+def expanded(path: str | Path) -> Path:
+    """The path with ~ replaced. Raises UserError for the home of an unknown user."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise UserError(f"{path}: there is no such user; write the folder's whole name") from error
 
 
 def slugs(texts: Sequence[str]) -> list[str]:
@@ -58,7 +150,7 @@ def read_names(path: Path) -> list[str]:
     Raises UserError for a file that can't be read or is empty.
     """
     try:
-        lines = path.expanduser().read_text(encoding="utf-8").splitlines()
+        lines = read_text(expanded(path)).splitlines()
     except (OSError, ValueError) as error:
         raise UserError(f"the list of photos {path} can't be read ({error})") from error
     names = [name for line in lines if (name := line.partition("#")[0].strip())]

@@ -17,3 +17,11 @@ def fitted_size(codes: Float[Tensor, "H W 3"], longer_side: int) -> tuple[int, i
 def resize_nearest(image: Float[Tensor, "H W c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:
     """Nearest-exact resizing: picks samples, since the mean of two codes is meaningless."""
     return F.interpolate(image.permute(2, 0, 1)[None], size, mode="nearest-exact")[0].permute(1, 2, 0)
+
+
+def resize(values: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
+    """Bilinear resize that averages when shrinking."""
+    if values.shape[:2] == grid:
+        return values
+    planes = values.permute(2, 0, 1)[None]
+    return F.interpolate(planes, grid, mode="bilinear", antialias=True)[0].permute(1, 2, 0)

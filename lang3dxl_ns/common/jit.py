@@ -51,8 +51,8 @@ register("numba:compile", _announcement)
 
 def in_threads(function: Callable[..., Any], parts: Sequence[tuple[Any, ...]]) -> list[Any]:
     """Call a function with each tuple of arguments, on as many threads as torch uses; results in order."""
-    threads = min(torch.get_num_threads(), len(parts))
-    if threads <= 1:
+    threads = torch.get_num_threads()
+    if min(threads, len(parts)) <= 1:
         return [function(*part) for part in parts]
     return list(_pool(threads).map(lambda part: function(*part), parts))
 
@@ -63,8 +63,9 @@ def ranges(count: int, least: int = 1) -> list[tuple[int, int]]:
     return [(first, min(first + step, count)) for first in range(0, count, step)]
 
 
-@functools.lru_cache(maxsize=1)
+@functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
+    """The threads that all kernels share; another pool only if torch is set to another number of them."""
     return ThreadPoolExecutor(threads, thread_name_prefix="kernel")
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.common.reports import host_peak
 
 _FIRST_ESTIMATE_S = 20.0
@@ -28,8 +28,7 @@ class Stages:
 
     def __init__(self, shares: Mapping[str, float], path: Path | None = None) -> None:
         self._shares, self._path = dict(shares), path
-        kept = path is not None and path.exists()
-        self._spent: dict[str, dict[str, float]] = json.loads(path.read_text()) if kept and path else {}
+        self._spent = {} if path is None else _spent(path)
         self._current: str | None = None
         self._start, self._tenths = 0.0, -1
 
@@ -76,6 +75,11 @@ class Stages:
         if self._tenths < 10:
             say(f"{self._current}: {100 * done:.0f} % done; {roughly(left)} left in all")
 
+    def weigh(self, name: str, other: str, times: float) -> None:
+        """Expect a stage to take so many times as long as another one."""
+        if name in self._shares and other in self._shares:
+            self._shares[name] = times * self._shares[other]
+
     def figures(self) -> dict[str, dict[str, float]]:
         """Seconds and peak memory (MB) by stage."""
         return {
@@ -98,6 +102,15 @@ class Stages:
             pace = sum(self._spent[s]["seconds"] for s in done) / sum(self._shares[s] for s in done)
             line += f" ({roughly(pace * sum(self._shares[s] for s in order[place:]))} left)"
         say(line)
+
+
+def _spent(path: Path) -> dict[str, dict[str, float]]:
+    """Figures of an earlier command; none if they are damaged: only an estimate needs them."""
+    try:
+        found = read_json(path)
+        return {n: {kind: float(f[kind]) for kind in ("seconds", "peak_mb")} for n, f in found.items()}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError):
+        return {}
 
 
 def roughly(seconds: float) -> str:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.hash_grid import HashGrid
+from lang3dxl_ns.components.linear import linear
 from lang3dxl_ns.rendering.gaussians import Gaussians
 
 HIDDEN = 64
@@ -95,10 +96,11 @@ class AppearanceField(nn.Module):
         self.grid = HashGrid(3, **GRIDS[config.preset], generator=generator)
         inputs = self.grid.output_dim + 3 + config.vector_dim
         # The first layer is split in two: the photo's part is the same for all Gaussians, and computed once.
-        self.from_gaussian = _linear(inputs - config.vector_dim, HIDDEN, inputs, generator)
-        self.from_photo = _linear(config.vector_dim, HIDDEN, inputs, generator, bias=False)
-        self.hidden = _linear(HIDDEN, HIDDEN, HIDDEN, generator)
-        self.output = nn.utils.skip_init(nn.Linear, HIDDEN, 4 if config.opacity_shift else 3)
+        self.from_gaussian = linear(inputs - config.vector_dim, HIDDEN, generator, fan_in=inputs)
+        self.from_photo = linear(config.vector_dim, HIDDEN, generator, bias=False, fan_in=inputs)
+        self.hidden = linear(HIDDEN, HIDDEN, generator)
+        # Its own generator, so that the one given draws the same numbers as without it.
+        self.output = linear(HIDDEN, 4 if config.opacity_shift else 3, torch.Generator().manual_seed(0))
         for parameter in self.output.parameters():
             nn.init.zeros_(parameter)
         vectors = FIRST_DEVIATION * torch.randn(len(names), config.vector_dim, generator=generator)
@@ -232,13 +234,3 @@ class AppearanceField(nn.Module):
                 getattr(self, key).data = torch.empty_like(state_dict[prefix + key])
             self._set_names([*saved, *(self.names[row] for row in new)])
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def _linear(
-    inputs: int, outputs: int, fan_in: int, generator: torch.Generator | None, bias: bool = True
-) -> nn.Linear:
-    """A linear layer with torch's default initial range for `fan_in` inputs, from the generator."""
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
-    for parameter in layer.parameters():
-        nn.init.uniform_(parameter, -(fan_in**-0.5), fan_in**-0.5, generator=generator)
-    return layer

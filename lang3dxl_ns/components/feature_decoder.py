@@ -88,6 +88,13 @@ class SemanticEncoder(nn.Module, ABC):
     learning_steps = 0
     """Number of steps of `learn_gaussians`."""
 
+    learned: str | None = None
+    """What `learn_gaussians` has to tell, in a sentence."""
+
+    def learning_seconds(self, count: int) -> float:
+        """About how long `learn_gaussians` takes for so many Gaussians on one core."""
+        return 0.0
+
     def picture(self, carried: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch 3"]:
         """The first three channels as colors in [0, 1]."""
         colors = carried[..., :3].sigmoid()

@@ -16,6 +16,7 @@ from pytorch_msssim import ssim
 from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.common.image import resize
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
 
@@ -127,14 +128,6 @@ def _weighted_mean(values: Float[Tensor, "h w c"], weight: Tensor | None) -> Flo
     weight = weight.to(values.dtype)
     total = weight.sum() * values.shape[-1]
     return (values * weight[..., None]).sum() / torch.where(total > 0, total, 1.0)
-
-
-def resize(values: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
-    """Bilinear resize that averages when shrinking."""
-    if values.shape[:2] == grid:
-        return values
-    planes = values.permute(2, 0, 1)[None]
-    return F.interpolate(planes, grid, mode="bilinear", antialias=True)[0].permute(1, 2, 0)
 
 
 def _ssim(prediction: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:

@@ -6,7 +6,7 @@ CLIP features and, through the same hidden layers, dense (DINO) features.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import torch
@@ -17,107 +17,55 @@ from torch import Tensor, nn
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, MOST_DIMENSIONS, HashGrid
+from lang3dxl_ns.components.linear import linear
 
 Preset = Literal["default", "short", "paper", "official"]
 
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """All settings of a semantic field, resolved; documented in `SemanticFieldConfig`."""
+    """All settings of a semantic field, resolved; documented in `SemanticFieldConfig`. The defaults are the
+    preset `default`."""
 
-    code_dim: int
-    code_std: float
-    bounding: Literal["sigmoid", "raw"]
-    fourier_frequencies: int
-    indexed: bool
-    levels: int
-    features_per_level: int
-    log2_table_size: int
-    min_resolution: int
-    max_resolution: int
-    coarse_to_fine: float
-    hidden_layers: int
-    hidden_width: int
-    activation: Literal["every", "last"]
-    whiten: bool
-
-
-PRESETS: dict[Preset, FieldSettings] = {
     # One lookup of 16 × 32 features replaces the method's four indexed passes of 16 × 8 in a fraction of the
     # time. The table size is a compromise between capacity for a large scene and the optimizer's memory.
-    "default": FieldSettings(
-        code_dim=3,
-        code_std=0.01,
-        bounding="sigmoid",
-        fourier_frequencies=0,
-        indexed=False,
-        levels=16,
-        features_per_level=32,
-        log2_table_size=15,
-        min_resolution=16,
-        max_resolution=512,
-        coarse_to_fine=1 / 3,
-        hidden_layers=2,
-        hidden_width=512,
-        activation="every",
-        whiten=True,
-    ),
+    code_dim: int = 3
+    code_std: float = 0.01
+    bounding: Literal["sigmoid", "raw"] = "sigmoid"
+    fourier_frequencies: int = 0
+    indexed: bool = False
+    levels: int = 16
+    features_per_level: int = 32
+    log2_table_size: int = 15
+    min_resolution: int = 16
+    max_resolution: int = 512
+    coarse_to_fine: float = 1 / 3
+    hidden_layers: int = 2
+    hidden_width: int = 512
+    activation: Literal["every", "last"] = "every"
+    whiten: bool = True
+
+
+_DEFAULT = FieldSettings()
+# As printed. The index coordinate is kept, not folded into a wider row: the table has the printed size.
+# Where the paper is silent (range, initial codes, features per level) these are safe choices.
+_PAPER = replace(
+    _DEFAULT, indexed=True, features_per_level=8, log2_table_size=8, max_resolution=2048,
+    coarse_to_fine=0.0, hidden_layers=3, activation="last", whiten=False,
+)  # fmt: skip
+PRESETS: dict[Preset, FieldSettings] = {
+    "default": _DEFAULT,
     # A hash grid alone needs thousands of steps; Fourier features and a small grid learn within hundreds.
-    "short": FieldSettings(
-        code_dim=3,
-        code_std=0.01,
-        bounding="sigmoid",
-        fourier_frequencies=4,
-        indexed=False,
-        levels=8,
-        features_per_level=4,
-        log2_table_size=12,
-        min_resolution=16,
-        max_resolution=256,
-        coarse_to_fine=0.0,
-        hidden_layers=1,
-        hidden_width=64,
-        activation="every",
-        whiten=True,
+    "short": replace(
+        _DEFAULT, fourier_frequencies=4, levels=8, features_per_level=4, log2_table_size=12,
+        max_resolution=256, coarse_to_fine=0.0, hidden_layers=1, hidden_width=64,
     ),
-    # As printed. The index coordinate is kept, not folded into a wider row: the table has the printed size.
-    # Where the paper is silent (range, initial codes, features per level) these are safe choices.
-    "paper": FieldSettings(
-        code_dim=3,
-        code_std=0.01,
-        bounding="sigmoid",
-        fourier_frequencies=0,
-        indexed=True,
-        levels=16,
-        features_per_level=8,
-        log2_table_size=8,
-        min_resolution=16,
-        max_resolution=2048,
-        coarse_to_fine=0.0,
-        hidden_layers=3,
-        hidden_width=512,
-        activation="last",
-        whiten=False,
-    ),
+    "paper": _PAPER,
     # As released by the authors.
-    "official": FieldSettings(
-        code_dim=3,
-        code_std=0.0,
-        bounding="raw",
-        fourier_frequencies=0,
-        indexed=True,
-        levels=16,
-        features_per_level=8,
-        log2_table_size=19,
-        min_resolution=16,
-        max_resolution=2048,
-        coarse_to_fine=0.0,
-        hidden_layers=2,
-        hidden_width=512,
-        activation="every",
-        whiten=False,
+    "official": replace(
+        _PAPER, code_std=0.0, bounding="raw", log2_table_size=19, hidden_layers=2, activation="every"
     ),
-}
+}  # fmt: skip
 
 
 @dataclass
@@ -175,9 +123,8 @@ class SemanticFieldConfig:
             raise UserError(
                 f"unknown semantic field preset {name!r}: choose one of auto, {', '.join(PRESETS)}"
             )
-        preset = PRESETS[name]
-        chosen = {field.name: getattr(self, field.name) for field in fields(FieldSettings)}
-        settings = FieldSettings(**{k: getattr(preset, k) if v is None else v for k, v in chosen.items()})
+        given = {field.name: getattr(self, field.name) for field in fields(FieldSettings)}
+        settings = replace(PRESETS[name], **{k: v for k, v in given.items() if v is not None})
         if settings.hidden_layers < 1:
             raise UserError(f"hidden_layers is {settings.hidden_layers}: the decoder needs at least one")
         if settings.levels == 0 and (settings.fourier_frequencies == 0 or settings.indexed):
@@ -227,7 +174,7 @@ class SemanticField(SemanticEncoder):
         grid_dim = clip_dim if s.indexed else self.grid.output_dim
         fourier_dim = s.code_dim * (1 + 2 * s.fourier_frequencies) if s.fourier_frequencies else 0
         self.layers = _hidden_layers(grid_dim + fourier_dim, s, generator)
-        self.output = _linear(s.hidden_width, clip_dim + dense_dim, generator)
+        self.output = linear(s.hidden_width, clip_dim + dense_dim, generator)
 
         self.level_weights: Tensor | None
         # All levels are open until `set_progress` is called.
@@ -323,16 +270,8 @@ def _hidden_layers(inputs: int, settings: FieldSettings, generator: torch.Genera
     layers: list[nn.Module] = []
     for depth in range(settings.hidden_layers):
         layers.append(
-            _linear(inputs if depth == 0 else settings.hidden_width, settings.hidden_width, generator)
+            linear(inputs if depth == 0 else settings.hidden_width, settings.hidden_width, generator)
         )
         if settings.activation == "every" or depth == settings.hidden_layers - 1:
             layers.append(nn.ReLU())
     return nn.Sequential(*layers)
-
-
-def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
-    """A linear layer with torch's default initial range, sampled from the given generator."""
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
-    for parameter in layer.parameters():
-        nn.init.uniform_(parameter, -(inputs**-0.5), inputs**-0.5, generator=generator)
-    return layer

@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth
 from lang3dxl_ns.evaluation.holyscenes import is_holyscenes, read_holyscenes
 from lang3dxl_ns.evaluation.lerf_ovs import is_lerf_ovs, read_lerf_ovs
@@ -35,7 +36,7 @@ class GroundTruth:
     """
 
     def __init__(self, folder: Path, layout: Layout | Literal["auto"] = "auto") -> None:
-        self.folder = Path(folder).expanduser()
+        self.folder = expanded(folder)
         if not self.folder.is_dir():
             raise UserError(f"{self.folder} is not a folder: pass the one that holds the ground truth")
         self.layout: Layout = _layout(self.folder) if layout == "auto" else layout

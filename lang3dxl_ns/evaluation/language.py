@@ -9,7 +9,7 @@ from torch import Tensor
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
-from lang3dxl_ns.query.relevancy import CANONICAL
+from lang3dxl_ns.query.relevancy import CANONICAL, TEMPERATURE, calibrated
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextConfig, TextEncoder
 
 
@@ -22,8 +22,11 @@ class LanguageScorer(MapScorer):
 
     def __init__(self, truth: GroundTruth, encode_texts: EncodeTexts) -> None:
         super().__init__(truth)
-        self.queries = TextEncoder(encode_texts).plain_queries(truth.categories)
+        text = TextEncoder(encode_texts)
+        self.queries = text.plain_queries(truth.categories)
         """Queries of the categories, in their order."""
+        self.yardstick = text.yardstick
+        """Words that calibrate relevancies: `TextEncoder.yardstick`."""
         published = TextEncoder(encode_texts, TextConfig(combine="joined", negatives=CANONICAL))
         self.published_queries = published.queries([Prompt(category) for category in truth.categories])
         """As published: a specialist word joined with common ones, against canonical phrases alone."""
@@ -35,8 +38,9 @@ class LanguageScorer(MapScorer):
     def teacher_maps(self, target: Float[Tensor, "hd wd c"], size: tuple[int, int]) -> Maps:
         """Maps of a CLIP target, whose features are first interpolated to `size`, as in Lang3D-XL."""
         features = resize_map(target.permute(2, 0, 1), size).permute(1, 2, 0)
-        queries = self.queries.to(features.device)
-        return self.named(queries.relevancy_of_cosines(queries.cosines(features)), size)
+        queries, words = self.queries.to(features.device), self.yardstick.to(features.device)
+        temperature = calibrated(TEMPERATURE, words.cosines(target.flatten(0, 1).float()))
+        return self.named(queries.relevancy_of_cosines(queries.cosines(features), temperature), size)
 
 
 def open_scorer(truth: GroundTruth, clip: str, device: torch.device | str) -> LanguageScorer:

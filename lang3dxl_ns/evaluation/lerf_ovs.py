@@ -7,8 +7,6 @@ One file per photo, `label/<scene>/<photo>.json`:
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +14,11 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
+from lang3dxl_ns.common.checks import is_coordinate
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth, check_shape
 
-_MOST_BYTES = 64 * 2**20
 _MOST_PIXELS = 200_000_000
 _SLACK = 0.02
 """Share of a side by which hand-drawn outlines may exceed the photo; they are clipped to it."""
@@ -77,9 +76,7 @@ def read_lerf_ovs(folder: Path) -> Annotations:
 def _read_labels(path: Path) -> dict[str, Outlines]:
     """A photo's labels by category. Label files come from others, so everything is validated."""
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ValueError(f"it is larger than {_MOST_BYTES >> 20} MiB")
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         info = content["info"]
         _check_name(info["name"])
         height, width = (_side(info[side]) for side in ("height", "width"))
@@ -88,7 +85,7 @@ def _read_labels(path: Path) -> dict[str, Outlines]:
         objects = [_read_object(item, height, width) for item in content["objects"]]
     except KeyError as error:
         raise UserError(f"labels {path} have no {error}: replace or remove the file") from error
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"labels {path} can't be used ({error}): fix or remove the file") from error
     by_category: dict[str, Outlines] = {}
     for category, polygon, box in objects:
@@ -128,8 +125,8 @@ def _side(value: Any) -> int:
 
 
 def _number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{value!r} is not a coordinate")
+    if not is_coordinate(value):
+        raise ValueError(f"{value!r:.40} is not a coordinate")
     return float(value)
 
 

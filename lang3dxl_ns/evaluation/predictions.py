@@ -13,12 +13,15 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import slugs
+from lang3dxl_ns.common.files import expanded, read_array, slugs
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.evaluation.annotations import PICTURES, check_shape, read_gray
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest_level
 from lang3dxl_ns.preparation.foreground import find_mask
+
+_LARGEST = 1e30
+"""Scores beyond are as good as infinite: their squares overflow float32."""
 
 
 class PredictedMaps:
@@ -29,7 +32,7 @@ class PredictedMaps:
     """
 
     def __init__(self, folder: Path, categories: Sequence[str]) -> None:
-        self.folder = Path(folder).expanduser()
+        self.folder = expanded(folder)
         if not self.folder.is_dir():
             raise UserError(f"{self.folder} is not a folder: pass the one that holds <prompt>/<photo>.npy")
         self._folders = {c: (c, slug) for c, slug in zip(categories, slugs(list(categories)), strict=True)}
@@ -63,16 +66,15 @@ class PredictedMaps:
 
 def _read_array(path: Path) -> Float[Array, "*levels h w"]:
     try:
-        score = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        score = read_array(path)
+    except (OSError, ValueError) as error:
         raise UserError(f"map {path} can't be read ({error}): write it with numpy.save") from error
-    if not isinstance(score, np.ndarray) or score.ndim not in (2, 3) or 0 in score.shape:
-        shape = getattr(score, "shape", "none")
-        raise UserError(f"map {path} has shape {shape}, not [h, w] or [levels, h, w]")
+    if score.ndim not in (2, 3) or 0 in score.shape:
+        raise UserError(f"map {path} has shape {score.shape}, not [h, w] or [levels, h, w]")
     if score.dtype.kind not in "fiub":
         raise UserError(f"map {path} holds {score.dtype}, not numbers")
     score = score.astype(np.float64)
-    if not np.isfinite(score).all():
+    if not (np.abs(score) < _LARGEST).all():
         raise UserError(f"map {path} holds NaN or infinity: fix the program that made it")
     return score
 

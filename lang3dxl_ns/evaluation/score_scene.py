@@ -12,7 +12,6 @@ from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.language import LanguageScorer
 from lang3dxl_ns.evaluation.scores import map_size
-from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.scene.photo import Photo
 
@@ -50,7 +49,8 @@ def score_scene(
                 scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
                 for queries in (scorer.queries, scorer.published_queries)
             )
-            variants = scorer.variants(raw, keep, TEMPERATURE, None if scorer.smooths else published)
+            of_published = None if scorer.smooths else published
+            variants = scorer.variants(raw, keep, scene.engine.temperature, of_published)
             truths = truths_of(truth, photo.photo(), map_size(raw))
             figures[photo.name] = scorer.scores_of(photo.name, variants, truths)
     masked = sum(photo.mask is not None for photo in photos)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,13 @@ from lang3dxl_ns.numerics.measure import Case, Row, measure
 from lang3dxl_ns.numerics.optimization import Run, runs
 
 HEADER = (
-    "case",
-    "mode",
-    "output max / rms",
-    "gradient max / rms",
-    "flipped",
-    "finite",
-    "ms",
-    "bound",
-    "verdict",
-)
+    "case", "mode", "output max / rms", "gradient max / rms", "flipped", "finite", "ms", "bound", "verdict"
+)  # fmt: skip
+OPTIMIZATION_HEADER = (
+    "rates", "steps", "loss by fifths", "largest code by fifths", "finite", "s", "verdict"
+)  # fmt: skip
+SMALLEST = 1e-18
+"""Errors below are drawn here."""
 
 
 @dataclass(kw_only=True)
@@ -108,156 +105,88 @@ def _plain(row: Row | Run) -> dict[str, Any]:
 
 
 def _markdown(rows: list[Row], optimizations: list[Run], command: str, machine: str) -> str:
-    total = len(rows) + len(optimizations)
     passed = sum(not row.misses for row in rows) + sum(not run.misses for run in optimizations)
-    components = list(dict.fromkeys(row.component for row in rows))
+    components = dict.fromkeys(row.component for row in rows)
     tables = "\n\n".join(_section([row for row in rows if row.component == name]) for name in components)
     return f"""# Numerics: error against run time on stiff and extreme cases
 
 `{command}`
 {machine}.
 
-**{passed} of {total} rows pass.** Every component runs on its hard cases. The same inputs, rounded as the
-component sees them, go through a float64 reference written for clarity (rasterizer: every
-Gaussian against every pixel; hash grid: corner by corner; downsampler: window by window; physical scale:
-80 bits). Errors are relative to the reference's largest value (max) and root mean square (rms), the worst of
-all outputs and of the gradients of all inputs for a random upstream gradient. Where the reference is not
-finite (a NaN input's own row), the component may be anything; everywhere else "finite" means that output and
-gradient are. flipped: share of pixels in which rounding moved a pair across the rasterizer's thresholds of
-1/255 and 1e-4; these count in the output's error, not in the gradient's. bf16, fp16: mixed precision
-(autocast). ms: one forward and backward. Bounds are in the order of the error columns.
-
-{_summary(rows, components)}
+**{passed} of {len(rows) + len(optimizations)} rows pass.** Every component runs on its hard cases. The same
+inputs, rounded as the component sees them, go through a float64 reference written for clarity. Errors are
+relative to the reference's largest value (max) and root mean square (rms), the worst of all outputs and of
+the gradients of all inputs for a random upstream gradient. Where the reference is not finite (a NaN input's
+own row), the component may be anything; everywhere else "finite" means that output and gradient are.
+flipped: share of pixels in which rounding moved a pair across the rasterizer's thresholds of 1/255 and 1e-4;
+these count in the output's error, not in the gradient's. bf16, fp16: mixed precision (autocast). ms: one
+forward and backward. Bounds are in the order of the error columns.
 
 ![Error against time](numerics.png)
 
 {tables}
 
-{_optimization_section(optimizations)}
-"""
-
-
-def _summary(rows: list[Row], components: Iterable[str]) -> str:
-    table = []
-    for name in components:
-        own = [row for row in rows if row.component == name]
-        single = [row for row in own if row.mode in ("float32", "float64")]
-        best = [row for row in single if row.mode == "float32"] or single
-        slopes = [row.gradient_rms for row in best if row.gradient_rms is not None]
-        table.append(
-            [
-                name,
-                len(own),
-                sum(not row.misses for row in own),
-                _figure(_median(row.output_rms for row in best)),
-                _figure(_median(slopes) if slopes else None),
-                f"{_median(row.ms for row in best):.2g}",
-            ]
-        )
-    header = ["component", "rows", "pass", "median output rms", "median gradient rms", "median ms"]
-    return markdown_table(header, table)
-
-
-def _median(values: Iterable[float]) -> float:
-    finite = sorted(value for value in values if math.isfinite(value))
-    return finite[len(finite) // 2] if finite else math.nan
-
-
-def _section(rows: list[Row]) -> str:
-    notes = dict.fromkeys(f"{row.case}: {row.note}." for row in rows if row.note)
-    listed = "".join(f"\n- {note}" for note in notes)
-    table = markdown_table(HEADER, [_cells(row) for row in rows])
-    return f"## {rows[0].component[0].upper()}{rows[0].component[1:]}\n\n{table}" + (listed and f"\n{listed}")
-
-
-def _optimization_section(optimizations: list[Run]) -> str:
-    header = ["rates", "steps", "loss by fifths", "largest code by fifths", "finite", "s", "verdict"]
-    table = [
-        [
-            run.name,
-            f"{run.steps:,}",
-            " ".join(f"{loss:.3g}" for loss in run.losses[1::2]),
-            " ".join(f"{code:.3g}" for code in run.codes[1::2]),
-            "yes" if run.finite else "**no**",
-            f"{run.seconds:.0f}",
-            "pass" if not run.misses else f"**miss**: {'; '.join(run.misses)}",
-        ]
-        for run in optimizations
-    ]
-    return f"""## Optimization of the field alone
+## Optimization of the field alone
 
 Adam with epsilon 1e-15 at constant rates, on noisy targets. Parameters and moments must stay finite; at the
 usual rates the loss must not rise again, and no code may pass 25 (at 17 the sigmoid's slope is 0 in float32).
 
-{markdown_table(header, table)}"""
+{markdown_table(OPTIMIZATION_HEADER, map(_optimization, optimizations))}
+"""
+
+
+def _section(rows: list[Row]) -> str:
+    notes = dict.fromkeys(f"\n- {row.case}: {row.note}." for row in rows if row.note)
+    name = rows[0].component
+    table = markdown_table(HEADER, map(_cells, rows))
+    return f"## {name[0].upper()}{name[1:]}\n\n{table}\n" + "".join(notes)
 
 
 def _cells(row: Row) -> list[str | None]:
     b = row.bounds
-    bound = f"{b.output_max:.0e} / {b.output_rms:.0e}"
-    has_gradient = row.gradient_max is not None
-    if has_gradient:
+    bound, slopes = f"{b.output_max:.0e} / {b.output_rms:.0e}", None
+    if row.gradient_max is not None:
         bound += f" · {b.gradient_max:.0e} / {b.gradient_rms:.0e}"
+        slopes = f"{row.gradient_max:.0e} / {row.gradient_rms:.0e}"
     return [
-        row.case,
-        row.mode,
-        f"{_figure(row.output_max)} / {_figure(row.output_rms)}",
-        f"{_figure(row.gradient_max)} / {_figure(row.gradient_rms)}" if has_gradient else None,
-        f"{row.flipped:.1%}" if row.flipped else None,
-        "yes" if row.finite else "**no**",
-        f"{row.ms:.2g}",
-        bound,
-        "pass" if not row.misses else f"**miss**: {'; '.join(row.misses)}",
-    ]
+        row.case, row.mode, f"{row.output_max:.0e} / {row.output_rms:.0e}", slopes,
+        f"{row.flipped:.1%}" if row.flipped else None, "yes" if row.finite else "**no**", f"{row.ms:.2g}",
+        bound, _verdict(row),
+    ]  # fmt: skip
 
 
-def _figure(value: float | None) -> str:
-    return "–" if value is None else "0" if value == 0 else f"{value:.0e}"
+def _optimization(run: Run) -> list[str]:
+    fifths = (" ".join(f"{value:.3g}" for value in values[1::2]) for values in (run.losses, run.codes))
+    finite = "yes" if run.finite else "**no**"
+    return [run.name, f"{run.steps:,}", *fifths, finite, f"{run.seconds:.0f}", _verdict(run)]
+
+
+def _verdict(row: Row | Run) -> str:
+    return f"**miss**: {'; '.join(row.misses)}" if row.misses else "pass"
 
 
 def _plot(rows: list[Row]) -> bytes:
-    """PNG: error against time, for outputs and gradients; colors are components, markers are modes."""
+    """PNG: error against time, for outputs and gradients; a color per component."""
+    from matplotlib import colormaps
     from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
 
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    figure = Figure(figsize=(11, 5), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     components = list(dict.fromkeys(row.component for row in rows))
-    palette = (
-        "#0b2545",
-        "#c0392b",
-        "#2471a3",
-        "#1e8449",
-        "#b9770e",
-        "#6c3483",
-        "#7f8c8d",
-        "#d98880",
-        "#117864",
-        "#f1c40f",
-        "#ff6fb5",
-        "#5dade2",
-    )
-    colors = {name: palette[i % len(palette)] for i, name in enumerate(components)}
-    markers = {"float32": "o", "float64": "s", "bf16": "^", "fp16": "v", "tf32": "D"}
-    smallest = 1e-18
-    errors: dict[str, Callable[[Row], float | None]] = {
-        "output": lambda row: row.output_rms,
-        "gradient": lambda row: row.gradient_rms,
-    }
-    for panel, (title, error) in zip(panels, errors.items(), strict=True):
-        for row in rows:
-            value = error(row)
-            if value is not None and math.isfinite(value):
-                style = {"color": colors[row.component], "marker": markers[row.mode]}
-                panel.plot(row.ms, max(value, smallest), markersize=4.5, alpha=0.7, linestyle="none", **style)
+    for panel, title in zip(panels, ("output", "gradient"), strict=True):
+        for number, component in enumerate(components):
+            own = [(r.ms, getattr(r, f"{title}_rms")) for r in rows if r.component == component]
+            drawn = [(ms, max(error, SMALLEST)) for ms, error in own if error is not None]
+            panel.scatter(
+                *zip(*drawn, strict=True) if drawn else ((), ()),
+                s=14,
+                color=colormaps["tab20"](number),
+                label=component,
+            )
         panel.set(xscale="log", yscale="log", xlabel="forward + backward, ms", title=title)
-        panel.grid(which="major", alpha=0.25)
-        panel.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("relative RMS error (0 drawn at 1e-18)")
-    used = [mode for mode in markers if any(row.mode == mode for row in rows)]
-    keys = [Line2D([], [], color=colors[name], linewidth=3, label=name) for name in components]
-    keys += [Line2D([], [], color="0.35", marker=markers[m], linestyle="none", label=m) for m in used]
-    figure.legend(handles=keys, loc="outside lower center", ncols=6, frameon=False)
+        panel.grid(alpha=0.25)
+    panels[0].set_ylabel(f"relative RMS error (0 drawn at {SMALLEST:.0e})")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=130)
     return file.getvalue()

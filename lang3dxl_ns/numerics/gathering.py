@@ -16,7 +16,7 @@ from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.gathering import gather
+from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import Camera
 
 COUNT, CHANNELS, SIZE = 40, 8, 24
@@ -71,7 +71,8 @@ def _gathering(scene: Callable[[], Maps]) -> Problem:
 
     def compute(given: Maps) -> Maps:
         fixed = {name: value.detach() for name, value in given.items()}
-        views = [(partial(_drawn, fixed), fixed["pixels"])]
+        values, foreground = fixed["pixels"][..., :-1], fixed["pixels"][..., -1]
+        views = [(partial(_drawn, fixed), Pixels([values], foreground))]
         features, mass = gather(COUNT, views, CHANNELS, fixed["means"])
         return {"features": features, "mass": mass}
 

@@ -8,12 +8,21 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.plugin.dataparser import MODEL_FOLDERS, OWN_MODEL, PhotoCollectionDataParserConfig
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 TRANSFORMS = "transforms.json"
+
+
+def check_data(data: Path | None) -> None:
+    """Raises UserError for a place that does not exist, before encoders are looked for. None passes."""
+    place = None if data is None else expanded(data)
+    if place is not None and not place.exists() and not frames_folder(place).is_dir():
+        raise UserError(f"{data} is not a folder: pass the one that holds your photos as --data, or a video")
 
 
 def parser_for(
@@ -24,13 +33,13 @@ def parser_for(
 
     Raises UserError if the photos don't make a scene.
     """
-    data = Path(parser.data).expanduser().absolute()
+    data = expanded(parser.data).absolute()
     if is_video(data) or (not data.exists() and frames_folder(data).is_dir()):
         data = parser.data = extract_frames(data) if may_reconstruct else frames_folder(data)
     named = parser.colmap_path
     folders: tuple[Path, ...] = (named, *MODEL_FOLDERS, OWN_MODEL)
     if cache_dir is not None:
-        folders = (*folders, cache_dir.expanduser().absolute() / "reconstruction/sparse/0")
+        folders = (*folders, expanded(cache_dir).absolute() / "reconstruction/sparse/0")
     known = next((f for f in folders if any((data / f).glob("images.*"))), None)
     if known is not None:
         parser.colmap_path = known
@@ -42,8 +51,6 @@ def parser_for(
     ):
         data, model = reconstruct_scene(data, cache_dir)
         parser.colmap_path = model.relative_to(data) if model.is_relative_to(data) else model
+    elif may_reconstruct and data.is_dir() and not any(data.iterdir()):
+        raise UserError(f"{data} is empty: give the folder with your photos")
     return parser
-
-
-def _has_photos(data: Path) -> bool:
-    return data.is_dir() and bool(find_photos(data).names)

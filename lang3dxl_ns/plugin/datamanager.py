@@ -30,7 +30,7 @@ from lang3dxl_ns.plugin.data_folder import parser_for
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.handover import Batch, SceneFacts
-from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
+from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
@@ -42,6 +42,7 @@ from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
+from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.scene.camera import scaled_size
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.novel_views import NovelViews, read_novel_views
@@ -55,6 +56,8 @@ class PhotosGoneError(UserError):
     """Too many photos have vanished during training to continue."""
 
 
+_WORTH_TELLING = 1e8
+"""Bytes of photos and targets from which their memory is announced."""
 MOST_GONE = 0.1
 """Share of the training photos that may vanish."""
 
@@ -81,8 +84,9 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if hasattr(config.dataparser, "load_3D_points"):
             config.dataparser.load_3D_points = True  # off by default in nerfstudio-data
         try:
+            check_transforms(config.dataparser)
             super().__init__(config, *args, **kwargs)
-        except (UserError, OSError) as reason:
+        except (UserError, FileNotFoundError) as reason:
             recorded = recorded_scene(config.run)
             if recorded is None or kwargs.get("test_mode", "val") == "val":
                 raise
@@ -111,7 +115,19 @@ class Lang3DXLDataManager(FullImageDatamanager):
             raise UserError(
                 f"a split of {self.config.dataparser.data} has no photo: add photos (a tenth is held out)"
             )
-        return PhotoDataset(outputs, self.config.camera_res_scale_factor)
+        photos, side = outputs.metadata["photos"], self.config.longer_side
+        large = sum(max(photo.width, photo.height) > side for photo in photos)
+        if large:
+            _log(
+                f"{large} of {len(photos)} photos are larger than {side:,} pixels and used at that size "
+                "(--pipeline.datamanager.longer-side)"
+            )
+        outputs.metadata["photos"] = [photo.at_most(side) for photo in photos]
+        return PhotoDataset(outputs, self.config.camera_res_scale_factor, self._working)
+
+    @cached_property
+    def _working(self) -> WorkingPhotos:
+        return WorkingPhotos(FeatureStore(self.cache_dir))
 
     def setup_train(self) -> None:
         """Before training: prepare missing targets, and give the model their statistics and the scene's
@@ -128,7 +144,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
             facts.clip_targets = partial(self.targets.clip_features, names)
             if self.targets.dense_dim:
                 facts.dense_targets = partial(self.targets.dense_features, names)
-        _log(self._memory_budget())
+        if budget := self._memory_budget():
+            _log(budget)
 
     @cached_property
     def targets(self) -> TargetReader | None:
@@ -158,6 +175,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
             FINE: c.clip != "none",
             DENSE: c.dense != "none",
             FOREGROUND: c.foreground == "text",
+            PHOTOS: True,
+            PHOTO_MASKS: True,
         }
         used[REGIONS] = self._region_source is not None
         names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
@@ -182,15 +201,18 @@ class Lang3DXLDataManager(FullImageDatamanager):
         )
         if self.targets is not None:
             plan = plan_crops(list(self.photos.values()), self._reconstruction(), config)
-            sizes = novel_pixel_sizes(views, config) if plan.pixel_sizes is not None else None
+            sizes = None
+            if plan.pixel_sizes is not None:  # per pixel of the views' files
+                sizes = novel_pixel_sizes(views, config)
+                widths = {view.name: view.width for view in views.cameras}
+                sizes = {p.name: sizes[p.name] * widths[p.name] / p.width for p in dataset.photos}
             config = config if config.targets_in_steps else replace(config, dense="none")
             prepare(dataset.photos, sizes, config, plan.scales, FeatureStore(self.cache_dir), self.device)
         return dataset
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
-        c = self.config
-        return region_source(c.regions, c.region_level, c.sam, self.data_folder, self.device)
+        return region_source(self.config, self.data_folder, self.device)
 
     @cached_property
     def needs(self) -> list[Need]:
@@ -219,7 +241,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def foreground(self, name: str) -> Bool[Tensor, "h w"] | None:
         """A photo's foreground, at training resolution; None if it is the whole photo."""
-        return self.photos[name].read_mask(self.config.camera_res_scale_factor)
+        return self._working.mask(self.photos[name], self.config.camera_res_scale_factor)
 
     @property
     def data_folder(self) -> Path:
@@ -252,12 +274,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return machine_memory() / 4 if gigabytes is None else gigabytes * 1e9
 
     def _memory_budget(self) -> str:
-        """Memory that training uses for photos, estimated from the first one's targets."""
+        """Memory for photos in training, estimated from the first one's targets; "" if it is little."""
         photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
         total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
         if self.targets is not None and self.config.targets_in_steps:
             total += len(photos) * self.targets.bytes_of(self.targets.names[0])
         held = min(total, self.cache_bytes)
+        if total < _WORTH_TELLING:
+            return ""
         return (
             f"memory: at most {held / 1e9:.2f} GB of photos and targets at a time (of "
             f"{total / 1e9:.2f} GB in {len(photos)} photos), {self.config.read_ahead} photos read ahead "
@@ -277,23 +301,24 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
         A photo found to be damaged is left out from then on, and logged.
         """
-        index = self.train_unseen_cameras.pop(0)
-        if not self.train_unseen_cameras:
-            self.train_unseen_cameras = self.sample_train_cameras()
-        try:
-            with part("data"):
-                data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
-                camera, batch = self._batch(self.train_dataset, index, data)
-        except UserError as reason:
-            _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
-            self._leave_out(index, reason)
-            # The round continues without it: a resumed run, which meets it later, has the same order.
-            rest = [i for i in self.train_unseen_cameras if i != index]
-            self.train_unseen_cameras = rest or self.sample_train_cameras()
-            return self.next_train(step)
-        camera.metadata = {"cam_idx": index}
-        self.photo_in_hand = batch["name"]
-        return camera, batch
+        while True:
+            index = self.train_unseen_cameras.pop(0)
+            if not self.train_unseen_cameras:
+                self.train_unseen_cameras = self.sample_train_cameras()
+            try:
+                with part("data"):
+                    data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
+                    camera, batch = self._batch(self.train_dataset, index, data)
+            except UserError as reason:
+                _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
+                self._leave_out(index, reason)
+                # The round continues without it: a resumed run, which meets it later, has the same order.
+                rest = [i for i in self.train_unseen_cameras if i != index]
+                self.train_unseen_cameras = rest or self.sample_train_cameras()
+                continue
+            camera.metadata = {"cam_idx": index}
+            self.photo_in_hand = batch["name"]
+            return camera, batch
 
     def _leave_out(self, index: int, reason: UserError) -> None:
         """Raises PhotosGoneError if too many have vanished."""

@@ -12,10 +12,12 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-from lang3dxl_ns.preparation.encoders import BUILTIN
+from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES, without
+from lang3dxl_ns.preparation.model_files import BUILTIN
 from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 
 
+@without(*OF_IMAGE_CACHES)
 @dataclass
 class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     """Photos and their targets. `--pipeline.datamanager.clip none` trains colors only."""
@@ -26,9 +28,9 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     cache_dir: Path | None = None
     """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
     cache_gb: float | None = None
-    """Memory for decoded photos and their targets, in gigabytes; least recently used ones are evicted.
-    Default: a quarter of the machine's memory."""
-    read_ahead: int = 4
+    """Memory for decoded photos and their targets, in gigabytes: the first that fit are kept, the others read
+    ahead of their use. Default: a quarter of the machine's memory."""
+    read_ahead: int = 16
     """Photos read ahead of the training step, in addition to that memory."""
     targets_in_steps: tyro.conf.Suppress[bool] = True
     """Whether training steps learn from the targets; settled with the encoder."""

@@ -14,13 +14,14 @@ from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
-from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.console import silence_libraries, some
 from lang3dxl_ns.common.errors import UserError, printable
-from lang3dxl_ns.common.files import read_names
+from lang3dxl_ns.common.files import expanded, read_names
+from lang3dxl_ns.plugin.inert_settings import OF_COLMAP, without
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
-from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.photo import Photo, upright_in_model
 from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
@@ -28,6 +29,7 @@ OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
 """Folder for a model of ours if sparse is taken."""
 
 
+@without(*OF_COLMAP)
 @dataclass
 class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
     """A folder with images/, a COLMAP model, and optionally masks/."""
@@ -63,7 +65,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         self._left_out: dict[str, UserError] = {}
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        data = self.config.data = Path(self.config.data).expanduser().absolute()
+        data = self.config.data = expanded(self.config.data).absolute()
         if self.config.downscale_factor != 1:  # nerfstudio would hand the photos' names to a shell
             raise UserError(
                 f"--downscale-factor is {self.config.downscale_factor}: leave it at 1, resize photos with "
@@ -88,6 +90,11 @@ class PhotoCollectionDataParser(ColmapDataParser):
         finally:
             self.config.masks_path, self.config.auto_scale_poses = masks, scaled
         outputs.metadata["photos"] = [self.photos[path] for path in outputs.image_filenames]
+        if split == "train" and (held_out := len(self.photos) - len(outputs.image_filenames)):
+            CONSOLE.log(
+                f"{held_out} of {len(self.photos)} photos are held out of training, for evaluation "
+                "(`lang3dxl-colmap --eval-mode all` after all other options trains on all)"
+            )
         # From here on the transform again applies to the model's own coordinates.
         transform = outputs.dataparser_transform.double()
         transform[:, 3] -= transform[:, :3] @ torch.from_numpy(self._origin)
@@ -194,12 +201,14 @@ class PhotoCollectionDataParser(ColmapDataParser):
         """The model's usable photos; logs which are left out, and why."""
         reconstruction = read_reconstruction(self.config.data / self.config.colmap_path)
         left_out: dict[str, UserError] = {}
+        kept: dict[str, TrackedPhoto] = {}
         for name, tracked in reconstruction.photos.items():
             path = self._image_path(name)
             try:
                 if not inside(self._images_folder, name, self.config.follow_links).is_file():
                     raise UserError(f"there is no {path}")
-                self.photos[path] = Photo.from_model(tracked, path, self._mask_path(name))
+                kept[name] = upright_in_model(tracked, path)
+                self.photos[path] = Photo.from_model(kept[name], path, self._mask_path(name))
             except UserError as reason:
                 left_out[name] = reason
         self._left_out = left_out
@@ -218,7 +227,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
             CONSOLE.log(f"[yellow]{len(left_out)} photos of the model are left out:[/yellow]")
             for name, why in left_out.items():
                 CONSOLE.log(f"  {escape(printable(f'{name}: {why}'))}")
-        kept = {name: g for name, g in reconstruction.photos.items() if name not in left_out}
+        kept = {name: tracked for name, tracked in kept.items() if name not in left_out}
         self.reconstruction = replace(reconstruction, photos=kept)
 
     def _mask_path(self, name: str) -> Path | None:
@@ -267,6 +276,8 @@ def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Pa
     """The first of the folders (relative to `data`) that exists and holds files; otherwise the first."""
     return next((c for c in candidates if any(p.is_file() for p in (data / c).glob(contents))), candidates[0])
 
+
+silence_libraries()  # nerfstudio imports this module before those that warn
 
 photo_collection = DataParserSpecification(
     config=PhotoCollectionDataParserConfig(),

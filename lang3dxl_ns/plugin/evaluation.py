@@ -32,7 +32,7 @@ from lang3dxl_ns.plugin.label_limit import label_limit
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
-from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
+from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.scene.photo import Photo
 
 Split = Literal["held-out", "seen", "test"]
@@ -173,9 +173,10 @@ class Evaluation:
         synchronize()
         seconds = perf_counter() - start
         metrics, images = self._model.get_image_metrics_and_images(outputs, batch)
+        metrics = {"cc_psnr": self._model.corrected_psnr(outputs, batch)} | metrics
         metrics |= self._model.feature_metrics(camera, batch)
         metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
-        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, "mask" in batch)
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, photo.mask_path is not None)
         if score is not None:
             score(camera, evaluated, batch, photo)
         return evaluated
@@ -192,14 +193,16 @@ class Evaluation:
         size = scorer.truth.scoring_size(photo.height, photo.width)
         keep = batch["mask"][..., 0] if "mask" in batch else None
         start = perf_counter()
-        raw = scorer.named(self.relevancy(camera, scorer.queries.to(self._model.device)), size)
+        asked = scorer.queries.to(self._model.device)
+        raw = scorer.named(self.relevancy(camera, asked, scorer.yardstick), size)
         synchronize()
         evaluated.metrics["query_seconds"] = perf_counter() - start
         published = None
         if not scorer.smooths:
             queries = scorer.published_queries.to(self._model.device)
-            published = scorer.named(self.relevancy(camera, queries), size)
-        variants = scorer.variants(raw, keep, TEMPERATURE, published)
+            published = scorer.named(self.relevancy(camera, queries, scorer.yardstick), size)
+        assert self._engine is not None
+        variants = scorer.variants(raw, keep, self._engine.temperature, published)
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
         evaluated.maps = inside(raw, keep)
         truths = truths_of(scorer.truth, photo, map_size(raw))
@@ -207,13 +210,15 @@ class Evaluation:
         evaluated.metrics |= bounds(inside(resized(limit(camera), size), keep), truths)
 
     @torch.no_grad()
-    def relevancy(self, camera: Cameras, queries: Queries) -> Float[Tensor, "q h w"]:
-        """Relevancy of every pixel to every prompt, of the present model."""
+    def relevancy(self, camera: Cameras, queries: Queries, yardstick: Queries) -> Float[Tensor, "q h w"]:
+        """Relevancy of every pixel to every prompt, of the present model, calibrated by the words of a
+        yardstick."""
         model = self._model
         if self._engine is None:
             if model.semantic_field is None or model.carried is None:
                 raise UserError(NOT_FINISHED)
-            self._engine = make_engine(model.semantic_field, model.carried.detach())
+            engine = make_engine(model.semantic_field, model.carried.detach())
+            self._engine = engine.calibrated(yardstick.to(model.device))
         rendering = model.seen(camera, channels=self._engine.channels(queries))
         assert rendering.channels is not None
         return self._engine.maps(rendering.channels, queries)

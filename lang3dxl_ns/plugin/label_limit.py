@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lang3dxl_ns.evaluation.scores import Maps
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.rendering.gathering import gather
+from lang3dxl_ns.rendering.gathering import Pixels, gather
 
 Masks = Mapping[str, Bool[Array, "h w"]]
 
@@ -32,7 +32,7 @@ def label_limit(
     def probes():
         for camera, masks in views:
             size = int(camera.height.item()), int(camera.width.item())
-            yield partial(model.composite, camera), _labels(masks, categories, size)
+            yield partial(model.composite, camera), Pixels.of([_labels(masks, categories, size)], size)
 
     lifted, _ = gather(model.num_points, probes(), 2 * len(categories), model.means.detach())
     labels, labeled = lifted.chunk(2, dim=1)
@@ -46,11 +46,11 @@ def label_limit(
 
 
 def _labels(masks: Masks, categories: list[str], size: tuple[int, int]) -> Float[Tensor, "h w channels"]:
-    """A channel per category with its label, one per category that is 1 if it is labeled here, and a 1."""
+    """A channel per category with its label, and one per category that is 1 if it is labeled here."""
     labels, labeled = torch.zeros(2, len(categories), *size)
     for index, category in enumerate(categories):
         if category in masks:
             mask = torch.from_numpy(np.asarray(masks[category])).float()
             labels[index] = F.adaptive_avg_pool2d(mask[None], size)[0]
             labeled[index] = 1
-    return torch.cat([labels, labeled, torch.ones(1, *size)]).permute(1, 2, 0)
+    return torch.cat([labels, labeled]).permute(1, 2, 0)

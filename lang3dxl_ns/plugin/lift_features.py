@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from copy import deepcopy
 from functools import partial
 
 import torch
@@ -13,11 +14,14 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
-from lang3dxl_ns.components.losses import resize
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.rendering.gathering import gather
+from lang3dxl_ns.rendering.gathering import Pixels, gather
+
+LONGER_SIDE = 1_600
+"""Pixels of the longer side at which larger photos are gathered: a CLIP crop covers hundreds of pixels, and
+time and memory grow with their number."""
 
 
 def learn_from_photos(
@@ -45,14 +49,14 @@ def learn_from_photos(
 
     def views():
         for camera, batch in photos:
-            size = batch["image"].shape[:2]
-            mask = batch["mask"][..., 0] if "mask" in batch else None
+            camera = working_camera(camera)
             clip = batch["clip_target"]
-            clip = clip if basis is None else basis.to(clip).coordinates(clip)
-            dense = None
+            maps = [clip if basis is None else basis.to(clip).coordinates(clip)]
             if fine_basis is not None:
-                dense = fine_basis.to(clip).coordinates(_unit(batch["dense_target"]))
-            yield partial(model.composite, camera), pixel_features(clip, dense, mask, size)
+                maps.append(fine_basis.to(clip).coordinates(_unit(batch["dense_target"])))
+            size = int(camera.height.item()), int(camera.width.item())
+            mask = batch["mask"][..., 0] if "mask" in batch else None
+            yield partial(model.composite, camera), Pixels.of(maps, size, mask)
 
     features, mass = gather(model.num_points, views(), channels, model.means.detach())
     if fine_basis is not None:
@@ -62,21 +66,14 @@ def learn_from_photos(
     model.gauss_params["codes"] = Parameter(codes.to(model.device), requires_grad=False)
 
 
+def working_camera(camera: Cameras) -> Cameras:
+    """The camera, with an image plane of at most `LONGER_SIDE` pixels."""
+    longer = int(torch.maximum(camera.width, camera.height).max())
+    if longer > LONGER_SIDE:
+        camera = deepcopy(camera)
+        camera.rescale_output_resolution(LONGER_SIDE / longer)
+    return camera
+
+
 def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:
     return F.normalize(dense.float(), dim=-1)
-
-
-def pixel_features(
-    clip: Float[Tensor, "hd wd c"],
-    dense: Float[Tensor, "t t d"] | None,
-    mask: Tensor | None,
-    size: tuple[int, int],
-) -> Float[Tensor, "h w out"]:
-    """A photo's targets at every pixel (bilinear), and a last channel of 1; all 0 outside the mask [H, W],
-    and where a target isn't finite."""
-    maps = [resize(target, size) for target in (clip, dense) if target is not None]
-    pixels = torch.cat([*maps, torch.ones_like(maps[0][..., :1])], dim=-1)
-    counts = pixels.isfinite().all(-1, keepdim=True)
-    if mask is not None:
-        counts &= resize(mask[..., None].to(pixels), size) >= 0.5
-    return torch.where(counts, pixels, 0.0)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import check_regular
 from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
@@ -150,6 +151,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Content of a checkpoint of any nerfstudio run, on the CPU. Raises UserError for another file."""
     try:
+        check_regular(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
     except NOT_A_CHECKPOINT as error:
         raise _no_checkpoint(path, error) from error
@@ -157,8 +159,12 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict) or not all(isinstance(state.get(k), v) for k, v in shape.items()):
         raise _no_checkpoint(path, "it has no pipeline and step")
     for name, value in state["pipeline"].items():
+        if isinstance(value, Tensor) and value.layout != torch.strided:
+            raise _no_checkpoint(path, f"{name} is a sparse tensor")
         if isinstance(value, Tensor) and value.nbytes > value.untyped_storage().nbytes():
             raise _no_checkpoint(path, f"{name} is larger than what is stored of it")
+        if name.endswith(".means") and isinstance(value, Tensor) and not value.isfinite().any():
+            raise _no_checkpoint(path, "no Gaussian has a position that is a number")
     return state
 
 
@@ -176,9 +182,10 @@ def check_checkpoint(place: Path) -> None:
     Raises UserError if it is damaged. A folder without checkpoints is fine: runs start that way.
     """
     checkpoints = sorted(place.glob("step-*.ckpt")) if place.is_dir() else [place]
-    if not checkpoints or not checkpoints[-1].is_file():
+    if not checkpoints or not checkpoints[-1].exists():
         return
     try:
+        check_regular(checkpoints[-1])
         with zipfile.ZipFile(checkpoints[-1]) as archive:
             packed = any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist())
             damaged = "packed, as torch writes none" if packed else archive.testzip()

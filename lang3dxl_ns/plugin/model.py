@@ -23,6 +23,7 @@ from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.components.appearance import AppearanceField
+from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.sky import OPACITY, Sky
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
@@ -254,16 +255,20 @@ class Lang3DXLModel(RenderingModel):
     def get_image_metrics_and_images(  # type: ignore[override]
         self, outputs: dict, batch: Batch
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Held-out photo: PSNR (`cc_psnr`: with matched colors), SSIM, and LPIPS if its weights are
-        available."""
+        """Held-out photo: PSNR, SSIM, and LPIPS if its weights are available."""
         target, predicted = self.get_gt_img(batch["image"]), outputs["rgb"]
-        # Matched on the CPU, whose solver also handles pictures of a single color.
-        corrected = color_correct(predicted.cpu(), target.cpu())
-        metrics = {"cc_psnr": float(psnr(corrected, target.cpu()))} | self.image_metrics(predicted, target)
+        metrics = self.image_metrics(predicted, target)
         images = {"img": torch.cat([target, predicted], dim=1)}
         if "bottleneck" in outputs:
             images["bottleneck"] = outputs["bottleneck"]
         return metrics, images
+
+    @torch.no_grad()
+    def corrected_psnr(self, outputs: dict, batch: Batch) -> float:
+        """PSNR with matched colors. It takes seconds for a large photo, so `ns-eval` alone measures it."""
+        # Matched on the CPU, whose solver also handles pictures of a single color.
+        target, predicted = self.get_gt_img(batch["image"]).cpu(), outputs["rgb"].cpu()
+        return float(psnr(color_correct(predicted, target), target))
 
     @torch.no_grad()
     def image_metrics(
@@ -366,6 +371,8 @@ class Lang3DXLModel(RenderingModel):
         if self.semantic_field is None:
             self._add_semantics(*saved.values())
         assert self.semantic_field is not None
+        if isinstance(self.semantic_field, CompressedField) and "gauss_params.codes" in state:
+            self.semantic_field.fit_codes(state["gauss_params.codes"])
         if self.semantic_field.needs_lifting and "gauss_params.codes" in state:
             self.gauss_params["codes"] = Parameter(state["gauss_params.codes"].clone(), requires_grad=False)
         self.to(self.device)

@@ -11,6 +11,7 @@ from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.plugin.densification import Densification
+from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO, without
 from lang3dxl_ns.plugin.optimizers import run_length_weight
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
 
@@ -18,6 +19,7 @@ SHORT_FIELD_RUN = 5_000
 """Runs with fewer iterations use the field's `short` preset, if they train it with the scene."""
 
 
+@without(*OF_SPLATFACTO)
 @dataclass
 class Lang3DXLModelConfig(SplatfactoModelConfig):
     """Splatfacto's settings, with the method's schedule and the semantic components."""

@@ -1,20 +1,119 @@
-"""Scenes read by nerfstudio's own dataparsers (transforms.json …): photos, and a model without tracks."""
+"""Scenes read by nerfstudio's own dataparsers: check of a transforms.json, photos, a model without tracks."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from nerfstudio.cameras.cameras import CameraType
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+from lang3dxl_ns.common.checks import is_coordinate
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import check_regular, expanded, read_json
 from lang3dxl_ns.plugin.cameras import lens_of
 from lang3dxl_ns.preparation.physical_scale import points_in_view
+from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
+from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo import Photo
+
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4")
+_PATHS = ("file_path", "mask_path", "depth_file_path")
+_NAMES = ("train_filenames", "val_filenames", "test_filenames")
+
+
+def check_transforms(dataparser: DataParserConfig) -> None:
+    """Check the transforms.json of a scene as COLMAP models are checked, before nerfstudio reads it.
+
+    Raises UserError for a file that is not JSON or lists no photo, an impossible lens or pose, an unknown
+    camera model, and a path that leads out of the scene's folder, also through a link inside it. (A folder in
+    the scene's may be a link itself, as images/ may be.) Other dataparsers pass.
+    """
+    if not isinstance(dataparser, NerfstudioDataParserConfig):
+        return
+    data = expanded(dataparser.data)
+    path = data if data.suffix == ".json" else data / "transforms.json"
+    try:
+        content = read_json(path, _MOST_BYTES)
+        _check_scene(content, path.parent)
+        if "ply_file_path" not in content and not (path.parent / "colmap").exists():
+            say(
+                f"{path} names no points (ply_file_path): training starts from random ones, which costs "
+                "several dB; without this file, the photos are reconstructed with points"
+            )
+    except FileNotFoundError as error:
+        raise UserError(f"there is no {path}: give its folder as --data, or the file itself") from error
+    except KeyError as error:
+        raise UserError(f"{path} can't be used: a photo has no {error}; make the file again") from error
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} can't be used: {error}; correct it, or make it again") from error
+
+
+_MOST_BYTES = 1 << 30
+
+
+def _check_scene(content: Any, folder: Path) -> None:
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list) or not content["frames"]:
+        raise ValueError("it lists no photo under frames")
+    model = content.get("camera_model", "OPENCV")
+    if not isinstance(model, str) or model not in CAMERA_MODEL_TO_TYPE:
+        raise ValueError(f"the camera model {str(model)[:40]!r} is unknown")
+    for frame in content["frames"]:
+        if not isinstance(frame, dict):
+            raise ValueError("a photo is not described by names and values")
+        name = str(frame["file_path"])[:80]
+        try:
+            _check_frame({**content, **frame}, folder)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"photo {name}: {error}") from error
+    for path in (content.get("ply_file_path"), *(n for key in _NAMES for n in content.get(key, ()))):
+        if path is not None:
+            _check_path(path, folder)
+    if "applied_transform" in content:
+        check_pose(content["applied_transform"])
+    scale = content.get("applied_scale", 1.0)
+    if not (is_coordinate(scale) and scale > 0):
+        raise ValueError(f"applied_scale is {str(scale)[:40]}")
+
+
+def _check_frame(frame: dict[str, Any], folder: Path) -> None:
+    for key in _PATHS:
+        if key in frame:
+            _check_path(frame[key], folder)
+    width, height, *focal = (frame[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"))
+    if not (is_coordinate(width) and is_coordinate(height)):
+        raise ValueError("its size is not a number")
+    distortion = tuple(frame[key] for key in _DISTORTION if key in frame)
+    distortion += tuple(frame.get("distortion_params", ()))
+    if not all(map(is_coordinate, distortion)):
+        raise ValueError("its lens has a distortion that is not a number")
+    Lens(int(width), int(height), *focal).check()
+    check_pose(frame["transform_matrix"])
+
+
+def _check_path(name: object, folder: Path) -> None:
+    """As `inside`; but folders of the scene may be links, as they often are for large photos."""
+    if not isinstance(name, str):
+        raise ValueError(f"{str(name)[:40]!r} is not a path")
+    path = folder / name
+    if Path(name).is_absolute():
+        if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder.absolute())):
+            raise ValueError(f"{name} lies outside {folder}: copy it there, and name it relative to it")
+        name = os.path.relpath(path, folder.absolute())
+    try:
+        inside(folder, name, follow_links=True)
+        top, *below = Path(name).parts
+        inside(folder / top if below else folder, os.path.join(*below) if below else top)
+    except UserError as error:
+        raise ValueError(str(error)) from error
+    if path.exists():
+        check_regular(path)
 
 
 def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:

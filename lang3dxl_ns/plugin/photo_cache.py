@@ -1,9 +1,8 @@
-"""Cache of decoded photos and their targets, bounded in memory, with read-ahead."""
+"""Cache of decoded photos and their targets, bounded in memory, with several readers ahead of training."""
 
 from __future__ import annotations
 
 import time
-from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -18,57 +17,58 @@ PATIENCE_S = (1.0, 5.0, 15.0)
 
 
 class PhotoCache:
-    """Keeps decoded photos up to a number of bytes, plus a few read ahead in a thread."""
+    """Keeps the first decoded photos that fit, and reads the others ahead in the order of their use.
 
-    def __init__(self, read: Callable[[int], dict[str, Any]], max_bytes: float):
+    Photos come in shuffled rounds. Keeping the latest ones would hit hardly ever, since each round uses every
+    photo once; those kept for good hit by their share.
+
+    Args:
+        read: the data of a photo by its index; called in several threads.
+        max_bytes: memory of the photos kept.
+        readers: threads.
+    """
+
+    def __init__(self, read: Callable[[int], dict[str, Any]], max_bytes: float, readers: int = 4):
         self._read = read
-        self._max_bytes = max_bytes
-        self._entries: OrderedDict[int, Future[dict[str, Any]]] = OrderedDict()
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="photo-reader")
+        self._free = max_bytes
+        self._kept: dict[int, dict[str, Any]] = {}
+        self._ahead: dict[int, Future[dict[str, Any]]] = {}
+        self._pool = ThreadPoolExecutor(readers, thread_name_prefix="photo-reader")
 
     def get(self, index: int, upcoming: list[int]) -> dict[str, Any]:
         """The photo at `index`, with retries if its file has vanished; starts reading the `upcoming`."""
         for i in (index, *upcoming):
-            if i not in self._entries:
-                self._entries[i] = self._pool.submit(self._read, i)
-            self._entries.move_to_end(i)
-        data = self._patiently(index)
-        self._make_room(keep={index, *upcoming})
+            if i not in self._kept and i not in self._ahead:
+                self._ahead[i] = self._pool.submit(self._read, i)
+        data = self._kept[index] if index in self._kept else self._patiently(index)
+        for i in self._ahead.keys() - set(upcoming):
+            self._ahead.pop(i).cancel()
+        if index not in self._kept and (size := _bytes(data)) <= self._free:
+            self._kept[index], self._free = data, self._free - size
         return dict(data)
 
     def _patiently(self, index: int) -> dict[str, Any]:
         """A photo's data, with retries if its files have vanished."""
         for seconds in PATIENCE_S:
             try:
-                return self._entries[index].result()
+                return self._ahead[index].result()
             except UserError as reason:
                 if not has_vanished(reason):
                     raise
                 say(f"{reason}; retrying in {seconds:.0f} s")
             time.sleep(seconds)
-            self._entries[index] = self._pool.submit(self._read, index)
-        return self._entries[index].result()
+            self._ahead[index] = self._pool.submit(self._read, index)
+        return self._ahead[index].result()
 
     @property
     def bytes(self) -> int:
-        """Memory of the decoded photos."""
-        return sum(_bytes(future) for future in self._entries.values() if future.done())
-
-    def _make_room(self, keep: set[int]) -> None:
-        excess = self.bytes - self._max_bytes
-        for i in [i for i in self._entries if i not in keep]:
-            if excess <= 0:
-                return
-            future = self._entries.pop(i)
-            if not future.cancel():
-                excess -= _bytes(future)
+        """Memory of the decoded photos, those read ahead included."""
+        done = (f.result() for f in self._ahead.values() if f.done() and not f.exception())
+        return sum(map(_bytes, (*self._kept.values(), *done)))
 
 
-def _bytes(future: Future[dict[str, Any]]) -> int:
-    """Memory of a decoded photo; 0 for one that could not be read (`get` raises the reason)."""
-    if future.exception():
-        return 0
-    return sum(value.nbytes for value in future.result().values() if isinstance(value, Tensor))
+def _bytes(data: dict[str, Any]) -> int:
+    return sum(value.nbytes for value in data.values() if isinstance(value, Tensor))
 
 
 def has_vanished(reason: UserError) -> bool:

@@ -1,4 +1,4 @@
-"""Dataset of photos: read, undistorted and resized on demand."""
+"""Dataset of photos: read upright, undistorted and resized on demand."""
 
 from __future__ import annotations
 
@@ -8,15 +8,21 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
+from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.photo import Photo
 
 
 class PhotoDataset(InputDataset):
-    """nerfstudio's dataset over `Photo`s: read, undistorted and resized on demand, pinhole cameras."""
+    """nerfstudio's dataset over `Photo`s: upright, undistorted and resized on demand, pinhole cameras.
 
-    def __init__(self, outputs: DataparserOutputs, scale: float):
+    Args:
+        scale: of the pictures read, relative to the photos.
+        working: keeps photos at their size.
+    """
+
+    def __init__(self, outputs: DataparserOutputs, scale: float, working: WorkingPhotos):
         super().__init__(outputs)
-        self.scale = scale
+        self.scale, self.working = scale, working
         self.photos: list[Photo] = outputs.metadata["photos"]
         lenses = [photo.lens.scaled(scale) for photo in self.photos]
         self.cameras = to_nerfstudio(lenses, outputs.cameras.camera_to_worlds)
@@ -24,8 +30,8 @@ class PhotoDataset(InputDataset):
     def read(self, index: int) -> dict[str, Tensor]:
         """`image` [h, w, 3] uint8 and, if the photo has one, `mask` [h, w, 1] bool."""
         photo = self.photos[index]
-        data = {"image": photo.read_uint8(self.scale)}
-        mask = photo.read_mask(self.scale)
+        data = {"image": self.working.read(photo, self.scale)}
+        mask = self.working.mask(photo, self.scale)
         if mask is not None:
             data["mask"] = mask[..., None]
         return data
@@ -37,4 +43,4 @@ class PhotoDataset(InputDataset):
         return {"image_idx": image_idx, **data}
 
     def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
-        return self.photos[image_idx].read(self.scale)
+        return self.read(image_idx)["image"].float() / 255

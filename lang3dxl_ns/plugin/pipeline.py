@@ -155,12 +155,16 @@ class Lang3DXLPipeline(VanillaPipeline):
         training = self.model.training
         self.model.train()
         photos = self.datamanager.train_photos()
-        with progress_bar() as bar:
-            total = len(self.datamanager.train_dataset)
-            gathering = bar.track(photos, total=total, description="gathering features")
-            learning = bar.add_task("learning codes", total=encoder.learning_steps or None)
-            learn_from_photos(self.model, gathering, lambda: bar.advance(learning))
-        self.model.train(training)
+        try:
+            with progress_bar() as bar:
+                total = len(self.datamanager.train_dataset)
+                gathering = bar.track(photos, total=total, description="gathering features")
+                learning = bar.add_task("learning codes", total=encoder.learning_steps or None)
+                learn_from_photos(self.model, gathering, lambda: bar.advance(learning))
+        finally:
+            self.model.train(training)
+        if encoder.learned is not None:
+            CONSOLE.log(escape(encoder.learned))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""

@@ -31,7 +31,7 @@ class RecordedSceneDataParser(DataParser):
         scene = SceneFile.read(self.config.run / SCENE_FILE)
         chosen = [photo for photo in scene.photos if (photo.split == "train") == (split == "train")]
         photos = [photo.photo(Path(scene.data)) for photo in chosen]
-        poses = torch.tensor([photo.camera_to_world for photo in chosen])
+        poses = torch.tensor([photo.camera_to_world for photo in chosen], dtype=torch.float32)
         cameras = to_nerfstudio([photo.lens for photo in photos], poses)
         return DataparserOutputs(
             image_filenames=[photo.path for photo in photos],
@@ -43,7 +43,7 @@ class RecordedSceneDataParser(DataParser):
                 "points3D_xyz": torch.eye(4)[:, :3],
                 "points3D_rgb": torch.zeros(4, 3),
             },
-            dataparser_transform=torch.tensor(scene.transform),
+            dataparser_transform=torch.tensor(scene.transform, dtype=torch.float32),
             dataparser_scale=scene.scale,
         )
 

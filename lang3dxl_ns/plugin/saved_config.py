@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
+from functools import cache
 from importlib.metadata import entry_points
-from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_text
 
 if TYPE_CHECKING:  # with nerfstudio's trainer, which takes two seconds to load and which queries don't need
     from nerfstudio.engine.trainer import TrainerConfig
@@ -41,17 +45,21 @@ def read_config(path: Path) -> TrainerConfig:
 
 def read_model_config(path: Path) -> tuple[Any, Path]:
     """The model's settings of a run, and the folder of its checkpoints, relative to the run's: as
-    `read_config`, but without loading what the other settings belong to."""
-    model, checkpoints = _read(path, [("pipeline", "model"), ("relative_model_dir",)])
+    `read_config`, but without loading what the other settings belong to. Settings that an earlier version
+    did not have take their defaults: the checkpoint beside the file tells whether they fit."""
+    model, checkpoints = _read(path, [("pipeline", "model"), ("relative_model_dir",)], complete=True)
     if not is_dataclass(model) or not isinstance(checkpoints, Path):
         raise _no_config(path)
     return model, checkpoints
 
 
-def _read(path: Path, places: Sequence[Sequence[str]]) -> list[Any]:
-    """The settings at these places of a file, each named from the outermost in; None where there are none."""
+def _read(path: Path, places: Sequence[Sequence[str]], complete: bool = False) -> list[Any]:
+    """The settings at these places of a file, each named from the outermost in; None where there are none.
+
+    complete: give missing settings their defaults.
+    """
     try:
-        found = _construct(path.read_text(), places)
+        found = _construct(read_text(path), places)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
         raise UserError(f"{path} is not a file: pass the config.yml of a run") from error
     except (
@@ -62,6 +70,9 @@ def _read(path: Path, places: Sequence[Sequence[str]]) -> list[Any]:
             f"{path} can't be read ({error}): it is damaged, or from a version whose settings are no longer "
             "known; restore it, or train anew"
         ) from error
+    for settings in found if complete else ():
+        if is_dataclass(settings):
+            _complete(settings)
     odd = (line for settings in found if is_dataclass(settings) for line in _differences(settings))
     if first := next(odd, None):
         raise UserError(
@@ -96,6 +107,7 @@ def _no_config(path: Path) -> UserError:
 def _differences(settings: Any, place: str = "") -> Iterator[str]:
     """Settings that a file lacks or should not have, by their dotted names."""
     known = {field.name for field in fields(settings)}
+    hints = _hints(type(settings))  # type: ignore[arg-type]
     yield from (f"lacks the setting {place}{name}" for name in sorted(known - set(vars(settings))))
     yield from (f"has the unknown setting {place}{name}" for name in sorted(set(vars(settings)) - known))
     for name in sorted(known):
@@ -104,6 +116,18 @@ def _differences(settings: Any, place: str = "") -> Iterator[str]:
             yield f"would start {place}{name} {value!r}"
         if is_dataclass(value) and not isinstance(value, type):
             yield from _differences(value, f"{place}{name}.")
+        elif name in hints and not _fits(value, hints[name]) and _fits(_default(settings, name), hints[name]):
+            yield f"sets {place}{name} to {str(value)[:40]!r}, of another kind than this setting"
+
+
+def _complete(settings: Any) -> None:
+    """Give the settings that a file lacks their defaults."""
+    for field in fields(settings):
+        if field.name not in vars(settings):
+            setattr(settings, field.name, _default(settings, field.name))
+        value = getattr(settings, field.name)
+        if is_dataclass(value) and not isinstance(value, type):
+            _complete(value)
 
 
 def _default(settings: Any, name: str) -> Any:
@@ -111,36 +135,69 @@ def _default(settings: Any, name: str) -> Any:
     return known.default if known.default_factory is MISSING else known.default_factory()
 
 
-def check_command_line(arguments: Sequence[str]) -> None:
-    """Exit from an `ns-…` command whose `--load-config` file asks for more than settings.
+@cache
+def _hints(settings: type) -> dict[str, Any]:
+    try:
+        return get_type_hints(settings)
+    except NameError:  # a type that another package imports for its type checker alone
+        return {}
 
-    nerfstudio calls whatever such a file names, for any method. It imports the methods first, this one among
-    them, which is the earliest moment a plugin can check. The YAML nodes are inspected, not constructed.
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of a setting's type, where that is a plain one."""
+    kind, parts = get_origin(hint), get_args(hint)
+    if kind is Literal:
+        return value in parts
+    if kind in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if kind is Annotated:
+        return _fits(value, parts[0])
+    if kind is tuple and isinstance(value, tuple) and ... not in parts:
+        return len(value) == len(parts) and all(map(_fits, value, parts))
+    if hint is float:
+        return type(value) in (int, float) and not math.isnan(value)
+    if hint is int:
+        return type(value) is int
+    kind = kind or hint
+    return isinstance(value, kind) if isinstance(kind, type) and kind is not type else True
+
+
+def check_command_line(arguments: Sequence[str]) -> None:
+    """Exit from an `ns-…` command whose `--load-config` file is a run of this method's and asks for more than
+    settings, or can't be looked at before nerfstudio reads it: a pipe, or a device.
+
+    nerfstudio calls whatever such a file names. It imports the methods first, this one among them, which is
+    the earliest moment a plugin can check. The YAML nodes are inspected, not constructed. Files that do not
+    name this package are left to nerfstudio.
     """
-    for path in _load_configs(arguments):
+    for path in load_configs(arguments):
         if os.environ.get(TRUST_VARIABLE) != "1" and (why := _file_asks_for(path)):
             sys.exit(
-                f"Error: {path} asks to {why}, which settings never need: nothing in it was run. If you "
-                f"trust its author, set {TRUST_VARIABLE}=1"
+                f"Error: {path} {why}: nothing in it was run. If you trust its author, set {TRUST_VARIABLE}=1"
             )
 
 
-def _load_configs(arguments: Sequence[str]) -> Iterator[Path]:
+def load_configs(arguments: Sequence[str]) -> Iterator[Path]:
+    """Files that the arguments of a command name with --load-config."""
     for i, argument in enumerate(arguments):
         option, equals, value = argument.partition("=")
         if option.replace("_", "-") == "--load-config":
             path = Path(value if equals else "".join(arguments[i + 1 : i + 2]))
-            if path.is_file():
+            if path.exists() and not path.is_dir():
                 yield path
 
 
 def _file_asks_for(path: Path) -> str | None:
     try:
-        return _asks_for(yaml.compose(path.read_text(), Loader=yaml.Loader))
-    except (yaml.YAMLError, OSError, ValueError):
+        text = read_text(path)
+        why = _asks_for(yaml.compose(text, Loader=yaml.Loader)) if "lang3dxl" in text.lower() else None
+        return why and f"asks to {why}, which settings never need"
+    except yaml.YAMLError:
         return None  # the command can't read it either
+    except (OSError, ValueError) as error:
+        return f"can't be checked before it is used ({error})"
     except RecursionError:  # the command, called from fewer functions, might
-        return "nest more deeply than settings do"
+        return "asks to nest more deeply than settings do"
 
 
 def _asks_for(root: yaml.Node | None) -> str | None:
@@ -231,4 +288,7 @@ class _SettingsLoader(yaml.UnsafeLoader):
         kind = self.find_python_name(suffix, node.start_mark)
         if not (is_dataclass(kind) and newobj) and not issubclass(kind, PurePath | Enum):
             raise yaml.constructor.ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+        if issubclass(kind, PurePath):  # of whichever system the run was made on
+            written = PureWindowsPath if issubclass(kind, PureWindowsPath) else PurePosixPath
+            return Path(written(*args).as_posix())
         return super().make_python_instance(suffix, node, args, kwds, newobj)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -16,13 +18,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns import __version__
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
@@ -36,7 +41,7 @@ from lang3dxl_ns.plugin.load_scene import (
 )
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
-from lang3dxl_ns.plugin.sizes import plan, sizes_of
+from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.plugin.step_guard import StepGuard
 from lang3dxl_ns.preparation.needs import write_needs
 from lang3dxl_ns.query.run_file import SCENE_FILE
@@ -49,6 +54,36 @@ if TYPE_CHECKING:
 RENDERINGS_PER_STEP = {False: 3.0, True: 6.0}
 """Time of an iteration in renderings of its photo, by whether semantics are trained with the scene: measured
 2.1 to 2.7 on a landmark and `castle`, and 3.5 to 8.4 for `feature3dgs` and `paper`, on a busy CPU."""
+RENDERINGS_PER_PHOTO = 30.0
+"""Time to read a photo's features onto the Gaussians, in renderings of it: measured 30 on one core for 160
+channels, 18,000 Gaussians, 240×180 pixels."""
+
+
+class _Stopped(BaseException):
+    """A signal arrived while words were learned."""
+
+
+@contextmanager
+def _disk_kept_out_of_training() -> Iterator[None]:
+    """Let training continue where its log (tensorboard's events) can't be written, as on a full disk.
+
+    tensorboard's own thread keeps such an error, and raises it in the step that adds to the log.
+    """
+    write = writer.write_out_storage
+
+    def guarded() -> None:
+        try:
+            write()
+        except OSError as error:
+            writer.EVENT_WRITERS[:] = [w for w in writer.EVENT_WRITERS if isinstance(w, writer.LocalWriter)]
+            CONSOLE.log(escape(f"The log can't be written ({error}). Training continues without it."))
+            write()
+
+    writer.write_out_storage = guarded
+    try:
+        yield
+    finally:
+        writer.write_out_storage = write
 
 
 class Lang3DXLTrainer(Trainer):
@@ -60,8 +95,11 @@ class Lang3DXLTrainer(Trainer):
     optimizers: GuardedOptimizers
     stages: Stages
     """Announced while they run: `prepare`, `train`, `words`. A longer command puts a list of its own here."""
-    interrupted = False
-    """Whether training was interrupted."""
+    interrupted: signal.Signals | None = None
+    """The signal that stopped the run, if one did."""
+    words_are_learned = False
+    """Whether the words of the run's end are learned; the viewer's of a run that goes on don't count."""
+    _is_learning_words = False
     _last_iteration = -1
     _is_ending = False
     _run_state: dict[str, Any] | None = None
@@ -83,8 +121,12 @@ class Lang3DXLTrainer(Trainer):
         of the scene into the run's folder, so that it can be queried without the photos."""
         # nerfstudio turns this on, and photos of many sizes would then be tuned for in nearly every step.
         torch.backends.cudnn.benchmark = False
-        with self.stages.stage("prepare"):
-            self._set_up(test_mode)
+        try:
+            with self.stages.stage("prepare"):
+                self._set_up(test_mode)
+        except UserError:
+            self._forget_folder()
+            raise
 
     def _set_up(self, test_mode: Literal["test", "val", "inference"]) -> None:
         data, self.config.data = self.config.data, None  # otherwise the viewer would write camera paths there
@@ -103,13 +145,20 @@ class Lang3DXLTrainer(Trainer):
         if self._run_state is not None:
             restore_run_state(self.pipeline, self._run_state)
 
+    def _forget_folder(self) -> None:
+        """Remove the folder of a run that could not begin, if it holds nothing but its settings, and the
+        folders above that this leaves empty."""
+        with suppress(OSError):
+            if {path.name for path in self.base_dir.iterdir()} <= {"config.yml"}:
+                (self.base_dir / "config.yml").unlink(missing_ok=True)
+                for folder in (self.base_dir, *self.base_dir.parents[:3]):
+                    folder.rmdir()  # an error ends this at the first that holds something
+
     def _limit_gaussians(self) -> None:
         """Set the cap of densification from the device's memory, and log what training will take."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
-        pixels, device = int((cameras.width * cameras.height).max()), torch.device(self.device)
-        sizes = sizes_of(model, pixels, device.type == "cuda")
-        now, wanted = model.num_points, self.config.pipeline.model.max_gaussians
-        model.strategy.most, message = plan(sizes, device, now, wanted)
+        pixels, wanted = int((cameras.width * cameras.height).max()), self.config.pipeline.model.max_gaussians
+        model.strategy.most, message = plan(model, pixels, torch.device(self.device), wanted)
         CONSOLE.log(escape(message))
 
     def _load_checkpoint(self) -> None:
@@ -134,6 +183,7 @@ class Lang3DXLTrainer(Trainer):
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
             ) from error
         self._run_state = state.get("run")  # absent from checkpoints of earlier versions
+        self.words_are_learned = state.get("words", "codes" in self.pipeline.model.gauss_params)
         CONSOLE.log(f"Loaded {path}")
 
     def _checkpoint_to_load(self) -> Path | None:
@@ -171,22 +221,36 @@ class Lang3DXLTrainer(Trainer):
         self.pipeline.model.strategy.loss_scale = scale
         return sound
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether the loaded checkpoint has all iterations, and the words if they are learned after them."""
+        words = self.words_are_learned or not self.pipeline.has_words_to_learn
+        return self._start_step >= self.config.max_num_iterations and words
+
     def train(self) -> None:
-        """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run)."""
+        """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run), then
+        learn words; a run that was stopped between the two learns words only.
+
+        Raises SystemExit after a signal stopped the run: 130 for Ctrl-C, 143 for SIGTERM.
+        """
         total = self.config.max_num_iterations
-        if self._start_step >= total:
+        if self.is_finished:
             raise UserError(
                 f"the checkpoint in {self.config.load_dir or self.config.load_checkpoint} already has "
                 f"{self._start_step} iterations, and the run has {total}: "
                 f"pass --max-num-iterations with a larger number"
             )
         if self._start_step:
-            CONSOLE.log(f"Resuming at iteration {self._start_step} of {total}")
-        self.config.max_num_iterations = total - self._start_step
+            CONSOLE.log(f"Resuming at iteration {min(self._start_step, total)} of {total}")
+        self.config.max_num_iterations = max(total - self._start_step, 0)
+        self._last_iteration = self._start_step - 1
+        self.step = max(self._last_iteration, 0)
+        if self._start_step < total:
+            self.words_are_learned = False  # those of the checkpoint will be out of date
         try:
             self._announce_time()
             self.stages.begin("train")
-            with self._stoppable():
+            with self._stoppable(), _disk_kept_out_of_training():
                 super().train()
         except PhotosGoneError as error:
             raise UserError(f"{error}. {self._stop_early()}") from error
@@ -199,11 +263,13 @@ class Lang3DXLTrainer(Trainer):
             self.config.max_num_iterations = total
             if summary := self.guard.summary():
                 CONSOLE.log(escape(summary))
+        if self.interrupted is not None:
+            sys.exit(128 + self.interrupted)
 
     @torch.no_grad()
     def _announce_time(self) -> None:
-        """Log about how long training will take with the present Gaussians, by rendering a photo's view: the
-        second time, since the first may compile kernels."""
+        """Log about how long training and learning words will take with the present Gaussians, by rendering a
+        photo's view: the second time, since the first may compile kernels."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         middle = int((cameras.width * cameras.height).flatten().argsort()[len(cameras) // 2])
         with self.train_lock:  # the viewer may render too
@@ -214,9 +280,15 @@ class Lang3DXLTrainer(Trainer):
                 synchronize()
             rendering = perf_counter() - start
             model.train()
-        count = self.config.max_num_iterations
+        count, encoder = self.config.max_num_iterations, model.semantic_field
         seconds = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings]
-        CONSOLE.log(f"training: {roughly(seconds)} for {count:,} iterations, more if Gaussians multiply")
+        line, words = f"training: {roughly(seconds)} for {count:,} iterations", 0.0
+        if encoder is not None and self.pipeline.has_words_to_learn:
+            words = rendering * len(cameras) * RENDERINGS_PER_PHOTO
+            words += encoder.learning_seconds(model.num_points)
+            line += f", then {roughly(words)} to learn words"
+        self.stages.weigh("words", "train", words / seconds if seconds else 1.0)
+        CONSOLE.log(f"{line}, more if Gaussians multiply")
 
     def train_iteration(self, step: int):
         result = super().train_iteration(step)
@@ -226,12 +298,18 @@ class Lang3DXLTrainer(Trainer):
 
     @contextmanager
     def _stoppable(self) -> Iterator[None]:
-        """Let Ctrl-C or SIGTERM end training after the current iteration, with a checkpoint; a second one
-        ends it at once."""
+        """Let Ctrl-C or SIGTERM end training after the current iteration, with a checkpoint, and learning
+        words, before which there is one, at once; a second one ends anything at once."""
+
+        def restore(number: signal.Signals) -> None:
+            # None: a handler that Python did not install, and can't.
+            signal.signal(number, signal.SIG_DFL if previous[number] is None else previous[number])
 
         def stop(number: int, _frame: FrameType | None) -> None:
-            self.interrupted = self.stop_training = True
-            signal.signal(number, previous[signal.Signals(number)])
+            self.interrupted, self.stop_training = signal.Signals(number), True
+            restore(self.interrupted)
+            if self._is_learning_words:
+                raise _Stopped
 
         if threading.current_thread() is not threading.main_thread():  # only it may handle signals
             yield
@@ -242,13 +320,13 @@ class Lang3DXLTrainer(Trainer):
         try:
             yield
         finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+            for number in previous:
+                restore(number)
 
     def _stop_early(self) -> str:
         """Save a checkpoint when training can't continue; returns a message about it."""
         self._is_ending = True
-        if self._last_iteration < 0:
+        if self._last_iteration < self._start_step:
             return "Nothing was learned yet"
         self.save_checkpoint(self._last_iteration)
         return (
@@ -260,6 +338,7 @@ class Lang3DXLTrainer(Trainer):
         """What happened and what helps. The interrupted step may have left half-made tensors, so the latest
         checkpoint stays as it is."""
         count = self.pipeline.model.num_points
+        when = "while learning words" if self._is_ending else f"at iteration {self.step}"
         saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
         kept = (
             f"{saved[-1]} is kept: --load-dir {self.checkpoint_dir} resumes there"
@@ -267,39 +346,56 @@ class Lang3DXLTrainer(Trainer):
             else "none is saved yet"
         )
         return (
-            f"out of memory at iteration {self.step} with {count:,} Gaussians. Three settings help: "
+            f"out of memory {when} with {count:,} Gaussians. Three settings help: "
             f"--pipeline.model.max-gaussians {count // 2}, --pipeline.datamanager.camera-res-scale-factor "
             f"0.5, --pipeline.model.view-dependence off. The latest checkpoint: {kept}"
         )
 
     def _after_train(self) -> None:
-        """Finish and save; after an interruption print how to resume, and don't wait in the viewer."""
+        """Save, learn words, save again; after an interruption print how to resume, and don't wait in the
+        viewer."""
         self._is_ending = True
         self.stages.end()
-        if not self.interrupted and self.pipeline.has_words_to_learn:
-            with self.stages.stage("words"):
-                self.pipeline.learn_words()
         if self.interrupted:
-            self.step = max(self._last_iteration, self._start_step)  # not the one that was about to begin
+            self.step = max(self._last_iteration, 0)  # not the one that was about to begin
+        elif self.pipeline.has_words_to_learn:
+            self.save_checkpoint(self.step)
+            self._learn_words()
+        if self.interrupted:
             self.config.viewer.quit_on_train_completion = True
             CONSOLE.print(
                 f"Stopped after {self.step + 1} iterations. To resume: the same command with "
                 f"--load-dir {self.checkpoint_dir}",
                 soft_wrap=True,
             )
-        else:
-            self.write_scene()
-        super()._after_train()
+        super()._after_train()  # saves first
 
-    def write_scene(self) -> Path:
+    def write_scene(self) -> None:
         """Write the trained scene as one file into the run's folder, to ask and to share."""
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
         how = f"{self.config.method_name}, {config.encoder.name}, {self.config.max_num_iterations} iterations"
         scene = self.pipeline.model.scene(self.pipeline.scene_file)
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
-        write_scene(path, scene, told)
-        return path
+        size = write_scene(path, scene, told)
+        say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)", *self._next_steps())
+
+    def _learn_words(self) -> None:
+        # Locked, since the viewer may be learning words too, for a question of a moment ago.
+        with suppress(_Stopped), self.stages.stage("words"), self.train_lock:
+            try:
+                self._is_learning_words = True
+                if not self.interrupted:
+                    self.pipeline.learn_words()
+                    self.words_are_learned = True
+            finally:
+                self._is_learning_words = False
+
+    def _next_steps(self) -> Iterator[str]:
+        run = shlex.quote(os.path.relpath(self.base_dir))
+        yield f"Walk through it: lang3dxl view {run}"
+        if self.pipeline.model.semantic_field is not None:
+            yield f"Ask it:          lang3dxl query {run} --text windows --out found"
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -312,7 +408,7 @@ class Lang3DXLTrainer(Trainer):
         try:
             self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
             self._write_checkpoint(step, partial)
-            os.replace(partial, path)
+            replace_durably(partial, path)
         except (OSError, RuntimeError) as error:  # torch raises the latter for a full disk
             with suppress(OSError):
                 partial.unlink(missing_ok=True)
@@ -329,6 +425,9 @@ class Lang3DXLTrainer(Trainer):
             for other in self.checkpoint_dir.glob("*.ckpt"):
                 if other != path:
                     other.unlink()
+        done = self.words_are_learned or not self.pipeline.has_words_to_learn
+        if self._is_ending and not self.interrupted and done:
+            self.write_scene()
 
     def _write_checkpoint(self, step: int, path: Path) -> None:
         torch.save(
@@ -339,6 +438,7 @@ class Lang3DXLTrainer(Trainer):
                 "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
                 "scalers": self.grad_scaler.state_dict(),
                 "run": run_state(self.pipeline),
+                "words": self.words_are_learned,
             },
             path,
         )

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
 
-from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.checks import check_address, check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import unused_gpu, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.reports import synchronize
+from lang3dxl_ns.common.stages import roughly
+from lang3dxl_ns.plugin.data_folder import check_data
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.load_scene import check_checkpoint
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
-from lang3dxl_ns.plugin.saved_config import read_config
-from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
-from lang3dxl_ns.preparation.encoders import check_encoders
+from lang3dxl_ns.plugin.saved_config import load_configs, read_config
+from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
+from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
-from lang3dxl_ns.rendering import gsplat_build
+from lang3dxl_ns.query.run_file import SCENE_FILE
+from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
+from lang3dxl_ns.scene.camera import Camera
+
+LONG_RUN_S = 3_600.0
+"""Seconds of training that are not begun on a warning."""
 
 
 @dataclass
@@ -41,6 +53,15 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         if self.timestamp != "{timestamp}":
             self.pipeline.datamanager.run = self.get_base_dir()
 
+    def get_base_dir(self) -> Path:
+        """The run's folder: where nerfstudio's `ns-eval --load-config` and others found config.yml, which may
+        be a copy of the run, or where the settings say."""
+        if self.timestamp != "{timestamp}" and not Path(sys.argv[0]).stem.startswith("ns-train"):
+            for path in load_configs(sys.argv[1:]):
+                if path.is_file() and path.with_name(SCENE_FILE).is_file():
+                    return path.parent.absolute()
+        return super().get_base_dir()
+
     def print_to_terminal(self) -> None:
         """Say where the settings are; LANG3DXL_VERBOSE=1 prints all of them, as other methods do."""
         if os.environ.get("LANG3DXL_VERBOSE") == "1":
@@ -57,7 +78,12 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             check_numbers(self.pipeline.model, {"max_gaussians": (0, 1e9)}, "--pipeline.model.")
         check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
         self.pipeline.datamanager.check()
+        check_data(self.pipeline.datamanager.data or self.data)
+        if self.is_viewer_enabled():
+            check_address(self.viewer.websocket_host, self.viewer.websocket_port)
         fresh = self.timestamp == "{timestamp}"
+        if fresh:  # a run's config.yml has what these settings came to
+            check_inert(self)
         super().set_timestamp()
         self.fit_to_run()
         data = self.pipeline.datamanager
@@ -72,10 +98,20 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             raise UserError(f"torch can't use a GPU here: {unused_gpu() or 'there is none'}")
         warn_of_unused_gpu()
         rasterizer = self.pipeline.model.rasterizer
-        if self.machine.device_type == "cuda" and rasterizer == "auto":
-            gsplat_build.ready()
-        elif self.machine.device_type == "cuda" and rasterizer == "gsplat":
+        if self.machine.device_type == "cuda" and rasterizer == "gsplat":
             gsplat_build.make_ready()
+        elif self.machine.device_type == "cuda" and rasterizer == "auto" and not gsplat_build.ready():
+            self._refuse_hours_of_torch()
+
+    def _refuse_hours_of_torch(self) -> None:
+        """Raises UserError if this GPU would take hours without gsplat, judged by one rendering."""
+        seconds = RENDERINGS_PER_STEP[False] * self.max_num_iterations * _torch_rendering_seconds()
+        if seconds > LONG_RUN_S:
+            raise UserError(
+                f"without gsplat (the warning above says what is missing) {self.max_num_iterations:,} "
+                f"iterations would take {roughly(seconds)} or more on this GPU: install what is missing, or "
+                "pass --pipeline.model.rasterizer torch to train with the slow rasterizer all the same"
+            )
 
     def _claim_folder(self) -> None:
         """Create a unique folder, even if two runs start in the same second."""
@@ -126,7 +162,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)
         if isinstance(datamanager.dataparser, PhotoCollectionDataParserConfig):
             datamanager.dataparser.held_out = _absolute(datamanager.dataparser.held_out)
-        self.output_dir = Path(self.output_dir).expanduser().absolute()
+        self.output_dir = expanded(self.output_dir).absolute()
 
     def _follow(self, run: Path) -> None:
         """A resumed run keeps what `auto` resolved to when it began."""
@@ -151,5 +187,22 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         settle(mine, earlier, "camera_optimization", "camera optimizer")
 
 
+def _torch_rendering_seconds(count: int = 50_000, size: tuple[int, int] = (1000, 700)) -> float:
+    """Seconds of a rendering of random Gaussians by torch on the GPU; the second one, warm."""
+    draw = torch.Generator().manual_seed(0)
+    means = torch.rand(count, 3, generator=draw) * 4 - torch.tensor([2.0, 2.0, -3.0])
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    parts = means, quats, torch.full((count, 3), 0.02), torch.full((count,), 0.5)
+    gaussians = Gaussians(*(part.to("cuda") for part in parts))
+    lens = torch.tensor([[900.0, 0.0, size[0] / 2], [0.0, 900.0, size[1] / 2], [0.0, 0.0, 1.0]])
+    camera, seconds = Camera(torch.eye(4), lens, *size), 0.0
+    for _ in range(2):
+        start = perf_counter()
+        rasterize(gaussians, camera, torch.ones(count, 3, device="cuda"), backend="torch")
+        synchronize()
+        seconds = perf_counter() - start
+    return seconds
+
+
 def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else Path(path).expanduser().absolute()
+    return None if path is None else expanded(path).absolute()

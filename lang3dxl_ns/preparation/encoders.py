@@ -1,19 +1,13 @@
-"""Frozen encoders that make the targets: CLIP for crops and texts, a vision transformer for dense maps.
-
-Models are read from a local folder or, by name, through the Hugging Face cache. Code that comes with a model
-is never run, and weights are read as plain tensors.
-"""
+"""Frozen encoders that make the targets: image-text encoders, and vision transformers for dense maps."""
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 from collections.abc import Sequence
-from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -21,89 +15,41 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.families import FAMILIES, Family, input_side, vision_inputs
 from lang3dxl_ns.preparation.light import in_known_light
+from lang3dxl_ns.preparation.model_files import (
+    BUILTIN,
+    CLIP_OPTION,
+    DENSE_OPTION,
+    ModelFiles,
+    find_model,
+    has_files,
+    load_weights,
+    model_type,
+    read_config,
+    spoken,
+)
 
-CLIP_OPTION = "--pipeline.datamanager.clip"
-DENSE_OPTION = "--pipeline.datamanager.dense"
-
-BUILTIN = "builtin"
-"""Name of the small encoders that ship with this package."""
-_PREFIX = "--pipeline.datamanager."
-option_prefix: ContextVar[str] = ContextVar("option_prefix", default=_PREFIX)
-"""Prefix of the options in the current command: `lang3dxl prepare` has none."""
-_DEMO = Path(__file__).parents[1] / "demo"
-_BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
-_WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-
-
-@dataclass(frozen=True)
-class ModelFiles:
-    """A model's local folder and a fingerprint of its contents."""
-
-    name: str
-    folder: Path
-    identity: str
-    """Of configuration and weights, not of the name: targets stay valid if the model is moved."""
-    option: str
-    """The option that chose the model, for messages."""
-
-
-def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
-    """A model's files: a local folder, a Hugging Face name (downloaded once), or "builtin", the CLIP
-    or dense encoder that ships with this package, depending on the option.
-
-    Raises UserError if there is no such folder, the model can't be downloaded, or files are missing.
-    """
-    name = str(name_or_dir)
-    local = Path(name).expanduser()
-    if name == BUILTIN:
-        folder = _BUILTIN_FOLDERS[option]
-    else:
-        folder = local if local.is_dir() else _download(name, option)
-    return ModelFiles(name, folder, _fingerprint(folder, option), option)
-
-
-class _NotDownloaded(UserError):
-    """A model is neither on disk nor can it be downloaded."""
-
-
-def check_encoders(clip: str, dense: str) -> None:
-    """Find both encoders, downloading missing ones; "none" and "auto" are skipped. Raises a single UserError
-    that names all unavailable ones and the remedy."""
-    wanted = {CLIP_OPTION: clip, DENSE_OPTION: dense}
-    missing: dict[str, str] = {}
-    for option, name in wanted.items():
-        try:
-            if name not in ("none", "auto"):
-                find_model(name, option)
-        except _NotDownloaded:
-            missing[option] = name
-    if missing:
-        folders = {option: f"DIR/{name.split('/')[-1]}" for option, name in missing.items()}
-        fetch = "; ".join(f"hf download {missing[o]} --local-dir {folders[o]}" for o in missing)
-        use = " ".join(f"{spoken(option)} {folder}" for option, folder in folders.items())
-        small = f"use the small encoders that come with this package: {spoken(CLIP_OPTION)} {BUILTIN}"
-        without = f"do without dense features, which makes words less sharp: {spoken(DENSE_OPTION)} none"
-        way_out = small if CLIP_OPTION in missing else without
-        raise UserError(
-            f"{' and '.join(missing.values())}: neither folders here nor in the Hugging Face cache, and "
-            f"the download fails. Either {way_out}. Or, on a machine with Internet: {fetch}; copy DIR here, "
-            f"and use {use}"
-        )
-
-
-def spoken(option: str) -> str:
-    """An option as spelled in the current command."""
-    return option.replace(_PREFIX, option_prefix.get())
+_NORMALIZE_THEMSELVES = ("radio",)
+"""Vision transformers that take pictures in 0…1."""
+_VOCABULARIES = (
+    ("tokenizer.json",),
+    ("vocab.json", "merges.txt"),
+    ("spiece.model",),
+    ("sentencepiece.bpe.model",),
+    ("tokenizer.model",),
+)
+"""Files of which a tokenizer needs one set."""
 
 
 class ImageTextEncoder:
-    """CLIP: images and texts in one space. Embeddings are projected, float32 and *not* normalized.
+    """Images and texts in one space: CLIP, SigLIP, TIPSv2 … Embeddings are projected, float32 and *not*
+    normalized.
 
-    `dim`: channels; `crop_size`: side of the vision tower's input in pixels; `identity`: of the weights;
-    `brightness`: mean value of the photos that it has learned from, if it depends on that, else None.
-    """
+    `dim`: channels; `crop_size`: side in pixels of the pictures that the vision tower was trained on;
+    `patch_size`: side of its patches; `identity`: of the weights; `brightness`: mean value of the photos that
+    it has learned from, if it depends on that, else None."""
 
     def __init__(
         self,
@@ -113,14 +59,18 @@ class ImageTextEncoder:
         std: Sequence[float],
         identity: str,
         brightness: float | None = None,
+        resample: Literal["bilinear", "bicubic"] = "bicubic",
     ) -> None:
-        self.dim: int = model.config.projection_dim
-        self.crop_size: int = model.config.vision_config.image_size
+        vision, text = model.config.vision_config, model.config.text_config
+        self.crop_size, self.patch_size = input_side(vision), int(vision.patch_size)
         self.identity, self.brightness = identity, brightness
-        self._model, self._tokenizer = model, tokenizer
+        self._family: Family = FAMILIES[model.config.model_type]
+        self._model, self._tokenizer, self._resample = model, tokenizer, resample
         self._device = next(model.parameters()).device
         self._mean, self._std = _channels(mean, self._device), _channels(std, self._device)
-        self._context: int = model.config.text_config.max_position_embeddings
+        positions = text.max_position_embeddings - self._family.first_position
+        self._context = min(positions, tokenizer.model_max_length)
+        self.dim: int = self.encode_texts(["object"]).shape[-1]
 
     def in_known_light(self, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
         """A photo as its crops should be cut from: in the light that the encoder knows."""
@@ -130,20 +80,71 @@ class ImageTextEncoder:
     @torch.no_grad()
     def encode_images(self, crops: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n c"]:
         """Embeddings of square crops, RGB in 0…1, on the encoder's device; other sizes are resized first."""
-        crops = _resize(crops.to(self._device, torch.float32), self.crop_size)
+        crops = _resize(crops.to(self._device, torch.float32), self.crop_size, self._resample)
         with _precision_of_images(self._device):
-            output = self._model.get_image_features(pixel_values=(crops - self._mean) / self._std)
+            inputs = vision_inputs(self._model, (crops - self._mean) / self._std)
+            output = self._model.get_image_features(**inputs)
         return output.pooler_output.float()
+
+    @torch.no_grad()
+    def encode_patches(self, windows: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n rows columns c"]:
+        """Features of patches that can be compared with texts, of windows whose sides are whole patches. RGB
+        in 0…1; on the encoder's device."""
+        rows, columns = (side // self.patch_size for side in windows.shape[-2:])
+        windows = windows.to(self._device, torch.float32)
+        with _precision_of_images(self._device):
+            patches = self._family.patches(self._model, (windows - self._mean) / self._std)
+        return patches.float().unflatten(1, (rows, columns))
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Float[Tensor, "n c"]:
         """Embeddings of texts, on the encoder's device; truncated to the model's context."""
+        fixed = self._family.fixed_length
         tokens = self._tokenizer(
-            texts, padding=True, truncation=True, max_length=self._context, return_tensors="pt"
+            [text.lower() for text in texts] if fixed else texts,
+            padding="max_length" if fixed else True,
+            truncation=True,
+            max_length=self._context,
+            return_tensors="pt",
         ).to(self._device)
         with _half_precision_on_cuda(self._device):
-            output = self._model.get_text_features(**tokens)
+            output = self._model.get_text_features(
+                **{name: tokens[name] for name in self._family.text_inputs}
+            )
         return output.pooler_output.float()
+
+
+@dataclass(frozen=True)
+class PatchReading:
+    """How an encoder makes a map of a photo, known from its configuration alone."""
+
+    recipe: str
+    tokens: int
+    """Patches per side of its own input."""
+    patch_size: int
+
+
+def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
+    """How an encoder (a name or folder) makes maps, if it is to make them; None if it reads crops.
+
+    Raises UserError like `load_image_text_encoder`.
+    """
+    files = find_model(clip, CLIP_OPTION)
+    family = _family(files)
+    if (family.features if features == "auto" else features) == "crops":
+        return None
+    vision = read_config(files).vision_config
+    return PatchReading(family.recipe, input_side(vision) // vision.patch_size, vision.patch_size)
+
+
+def _family(files: ModelFiles) -> Family:
+    kind = model_type(files)
+    if kind not in FAMILIES:
+        raise UserError(
+            f"{files.name} is a {kind} model: {spoken(files.option)} needs an image-text encoder in Hugging "
+            f"Face format ({', '.join(FAMILIES)}), such as openai/clip-vit-base-patch32"
+        )
+    return FAMILIES[kind]
 
 
 class DenseEncoder:
@@ -156,10 +157,9 @@ class DenseEncoder:
         self._model = model
         self._side = tokens * model.config.patch_size
         self._device = next(model.parameters()).device
-        self._mean, self._std = (
-            _channels(_IMAGENET_MEAN, self._device),
-            _channels(_IMAGENET_STD, self._device),
-        )
+        own = model.config.model_type in _NORMALIZE_THEMSELVES
+        self._mean = _channels((0.0, 0.0, 0.0) if own else _IMAGENET_MEAN, self._device)
+        self._std = _channels((1.0, 1.0, 1.0) if own else _IMAGENET_STD, self._device)
         # a plain ViT rejects other image sizes by default; DINOv2 always interpolates, without the argument
         interpolates = "interpolate_pos_encoding" in inspect.signature(model.forward).parameters
         self._arguments = {"interpolate_pos_encoding": True} if interpolates else {}
@@ -179,41 +179,61 @@ class DenseEncoder:
 
 
 def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str) -> ImageTextEncoder:
-    """CLIP in Hugging Face format, from a folder, by name, or "builtin".
+    """An image-text encoder in Hugging Face format, from a folder, by name, or "builtin".
 
-    Raises UserError if it can't be found or downloaded, isn't a CLIP, or is incomplete.
+    Raises UserError if it can't be found or downloaded, is of no known family, or is incomplete.
     """
-    from transformers import CLIPImageProcessor, CLIPModel, CLIPTokenizer
+    from transformers import AutoModel
 
     files = find_model(name_or_dir, CLIP_OPTION)
     if files.name == BUILTIN:
         _say_what_builtin_knows()
-    kind = model_type(files)
-    if kind != "clip":
-        raise UserError(
-            f"{files.name} is a {kind} model: {spoken(files.option)} needs a CLIP in Hugging Face format, "
-            "such as openai/clip-vit-base-patch32"
-        )
-    model = load_weights(CLIPModel, files, device)
-    if not _has(files.folder, "tokenizer.json") and not _has(files.folder, "vocab.json", "merges.txt"):
-        # transformers would silently make a tokenizer without words
-        raise UserError(
-            f"{files.folder} has no tokenizer (tokenizer.json, or vocab.json and merges.txt): "
-            "copy these files from the model that this one was fine-tuned from"
-        )
-    tokenizer = CLIPTokenizer.from_pretrained(files.folder, local_files_only=True)
-    if _has(files.folder, "preprocessor_config.json") or _has(files.folder, "processor_config.json"):
-        processor = CLIPImageProcessor.from_pretrained(files.folder, local_files_only=True)
-    else:
-        processor = CLIPImageProcessor()  # fine-tuned weights are often saved alone; CLIP's own statistics
+    _family(files)
+    model = load_weights(AutoModel, files, device)
+    processor = _image_processor(files)
+    normalizes = getattr(processor, "do_normalize", True)
     return ImageTextEncoder(
         model,
-        tokenizer,
-        processor.image_mean,
-        processor.image_std,
+        _tokenizer(files),
+        processor.image_mean if normalizes else (0.0, 0.0, 0.0),
+        processor.image_std if normalizes else (1.0, 1.0, 1.0),
         files.identity,
         getattr(processor, "brightness", None),  # a key of our own, in the built-in CLIP's folder
+        "bilinear" if int(processor.resample) == 2 else "bicubic",
     )
+
+
+def _tokenizer(files: ModelFiles) -> Any:
+    """A model's tokenizer. Raises UserError if its files are missing or can't be read."""
+    from transformers import AutoTokenizer
+
+    if not any(has_files(files.folder, *names) for names in _VOCABULARIES):
+        # transformers would silently make a tokenizer without words
+        raise UserError(
+            f"{files.folder} has no tokenizer ({', '.join(' and '.join(names) for names in _VOCABULARIES)}): "
+            "copy these files from the model that this one was fine-tuned from"
+        )
+    try:
+        return AutoTokenizer.from_pretrained(files.folder, local_files_only=True, trust_remote_code=False)
+    except (OSError, ValueError, TypeError, KeyError, ImportError, AttributeError) as error:
+        raise UserError(
+            f"the tokenizer in {files.folder} can't be read ({error}): those of SigLIP and TIPSv2 need "
+            "`pip install sentencepiece protobuf`; otherwise download the model again"
+        ) from error
+
+
+def _image_processor(files: ModelFiles) -> Any:
+    """The settings of a model's image preprocessing."""
+    from transformers import AutoImageProcessor, CLIPImageProcessor
+
+    if not any(has_files(files.folder, f"{kind}_config.json") for kind in ("preprocessor", "processor")):
+        if model_type(files) == "clip":
+            return CLIPImageProcessor()  # fine-tuned weights are often saved alone; CLIP's own statistics
+        raise UserError(
+            f"{files.folder} has no preprocessor_config.json: copy it from the model that this one was "
+            "fine-tuned from"
+        )
+    return AutoImageProcessor.from_pretrained(files.folder, local_files_only=True, trust_remote_code=False)
 
 
 def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, tokens: int = 64) -> DenseEncoder:
@@ -245,107 +265,17 @@ def _say_what_builtin_knows() -> None:
     )
 
 
-def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
-    """The model, frozen and in float32. Missing weights are an error, not random numbers."""
-    from safetensors import SafetensorError
-    from transformers.utils import logging
-
-    logging.disable_progress_bar()  # a second's work, and it would draw over ours
-    try:
-        model, report = model_class.from_pretrained(
-            files.folder,
-            local_files_only=True,
-            trust_remote_code=False,
-            dtype=torch.float32,
-            output_loading_info=True,
-        )
-    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
-        raise UserError(
-            f"{files.name}: the model in {files.folder} can't be loaded ({error}): download it again, or "
-            f"give {spoken(files.option)} another folder"
-        ) from error
-    missing = sorted(name for name in report["missing_keys"] if "pooler" not in name)  # poolers are not used
-    if missing:
-        raise UserError(
-            f"{files.name}: the weights in {files.folder} lack {len(missing)} tensors, the first being "
-            f"{missing[0]}: give {spoken(files.option)} a complete model"
-        )
-    return model.to(device).eval().requires_grad_(False)
-
-
-def model_type(files: ModelFiles) -> str:
-    """The model type in its configuration ("clip"). Raises UserError if there is none."""
-    from transformers import AutoConfig
-
-    try:
-        return AutoConfig.from_pretrained(files.folder, trust_remote_code=False).model_type
-    except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"{files.folder / 'config.json'} is not a model's configuration: {error}") from error
-
-
-def _download(name: str, option: str) -> Path:
-    """The folder of a model in the Hugging Face cache, downloaded on first use."""
-    from huggingface_hub import snapshot_download
-
-    try:
-        for weights in _WEIGHTS:
-            folder = Path(snapshot_download(name, allow_patterns=["*.json", "*.txt", weights]))
-            if _weight_files(folder):
-                return folder
-    except (OSError, ValueError) as error:  # no network, no such model, not a name
-        raise _NotDownloaded(
-            f"the model {name} is neither a folder here nor in the Hugging Face cache, and it can't be "
-            f"downloaded ({type(error).__name__}). On a machine with Internet: "
-            f"hf download {name} --local-dir DIR; then {spoken(option)} DIR"
-        ) from error
-    raise UserError(f"the model {name} has no PyTorch weights ({' or '.join(_WEIGHTS)}): choose another")
-
-
-def _weight_files(folder: Path) -> list[Path]:
-    found = (sorted(folder.glob(pattern)) for pattern in _WEIGHTS)
-    return next((files for files in found if files), [])
-
-
-def _fingerprint(folder: Path, option: str) -> str:
-    """16 hex digits of everything that affects an image's embedding."""
-    config = folder / "config.json"
-    weights = _weight_files(folder)
-    if not config.is_file() or not weights:
-        raise UserError(
-            f"{folder} is not a model in Hugging Face format: it needs config.json and "
-            f"{' or '.join(_WEIGHTS)}; give {spoken(option)} the folder that holds them"
-        )
-    preprocessing = sorted(folder.glob("p*processor_config.json"))
-    digests = []
-    for path in [config, *preprocessing, *weights]:
-        status = path.stat()
-        digests.append(_digest(path, status.st_size, status.st_mtime_ns))
-    return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
-
-
-@lru_cache(maxsize=64)
-def _digest(path: Path, size: int, modified_ns: int) -> str:
-    """A file's SHA-256 (about a second per gigabyte), cached by size and modification time."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
-
-
-def _has(folder: Path, *names: str) -> bool:
-    return all((folder / name).is_file() for name in names)
-
-
 def _channels(values: Sequence[float], device: torch.device) -> Float[Tensor, "3 1 1"]:
     return torch.tensor(values, dtype=torch.float32, device=device)[:, None, None]
 
 
-def _resize(images: Float[Tensor, "n 3 h w"], side: int) -> Float[Tensor, "n 3 side side"]:
-    """Images squashed to squares, antialiased bicubic, as in the training of both models."""
+def _resize(
+    images: Float[Tensor, "n 3 h w"], side: int, mode: str = "bicubic"
+) -> Float[Tensor, "n 3 side side"]:
+    """Images squashed to squares, antialiased, as in the training of the models."""
     if images.shape[-2:] == (side, side):
         return images
-    return F.interpolate(images, (side, side), mode="bicubic", antialias=True).clamp(0.0, 1.0)
+    return F.interpolate(images, (side, side), mode=mode, antialias=True).clamp(0.0, 1.0)
 
 
 def _precision_of_images(device: torch.device) -> torch.autocast:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.preparation.collection import SCALE_RATIO, CropPlan
 from lang3dxl_ns.preparation.physical_scale import crop_sides
@@ -163,7 +163,7 @@ def read_needs(folder: Path) -> dict[str, bool]:
     if not path.is_file():
         return {}
     try:
-        found = json.loads(path.read_text())
+        found = read_json(path)
         return {component: bool(need["needed"]) for component, need in found.items()}
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path} can't be read ({error!r}): copy it again, or remove it") from error

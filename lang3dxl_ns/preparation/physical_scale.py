@@ -111,15 +111,17 @@ def relative_scales(
     return space(smallest, largest, count).tolist()
 
 
-def crop_sides(scales: Sequence[float], pixel_size: float, width: int) -> tuple[list[int], list[float]]:
+def crop_sides(
+    scales: Sequence[float], pixel_size: float, width: int, smallest: float = SMALLEST_CROP
+) -> tuple[list[int], list[float]]:
     """Crop sides in pixels of a photo of `width` pixels, and their sizes in world units after clipping.
 
-    Sides are clipped to 32 … `width` pixels; duplicates are dropped, so that a photo can have fewer crops
-    than there are scales. For relative scales the pixel size is 1 / width.
+    Sides are clipped to `smallest` … `width` pixels; duplicates are dropped, so that a photo can have fewer
+    crops than there are scales. For relative scales the pixel size is 1 / width.
     """
     sizes: dict[int, float] = {}
     for scale in sorted(scales):
-        side = min(max(scale / pixel_size, SMALLEST_CROP), width)
+        side = min(max(scale / pixel_size, smallest), width)
         sizes.setdefault(math.floor(side + 1e-6), side * pixel_size)  # 0.47 / 0.01 is 46.99…
     return list(sizes), list(sizes.values())
 

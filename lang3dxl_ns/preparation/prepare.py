@@ -9,17 +9,20 @@ from __future__ import annotations
 import math
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.crop_budget import Crops, choose_crops, input_side
+from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import (
     CLIP_OPTION,
     DENSE_OPTION,
@@ -28,23 +31,28 @@ from lang3dxl_ns.preparation.encoders import (
     find_model,
     load_dense_encoder,
     load_image_text_encoder,
+    patch_reading,
+    spoken,
 )
-from lang3dxl_ns.preparation.physical_scale import crop_sides, fine_crops
-from lang3dxl_ns.preparation.pyramid import HALF, THIRD, build_clip_target, crop_centers
+from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
-from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
 from lang3dxl_ns.preparation.workers import Workers
+from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.photo import Photo
 
 _CROP_RULE = 4
 """Increased when crops, their encoding or their average change, so that older entries are made again."""
-_CHECKERS = 4
-"""Threads that check photos."""
-_PATIENCE_S = 1.0
-"""Seconds between checks for photos that another process is making."""
-_BUSY = "another process is making it"
+_READERS = 2
+"""Threads that read photos while others are encoded."""
+_ANNOUNCED_CROPS = 5_000
+"""Fewer are encoded in seconds: no duration is measured."""
+_PATCHES_PER_CROP = 32
+"""Windows of patch features are encoded this many times fewer at once than crops: they hold more."""
+_LONG_S = 1800.0
+"""Seconds on a CPU from which the remedies are named."""
 
 
 @dataclass
@@ -64,8 +72,9 @@ class _Task:
     """A photo's targets to make, and their settings; None for what is up to date."""
 
     photo: Photo
-    sides: list[int]
-    scales: list[float]
+    crops: Crops
+    fast: int
+    """Crops that `--quality fast` would take."""
     clip: dict[str, Any] | None
     dense: dict[str, Any] | None
     regions: dict[str, Any] | None
@@ -73,15 +82,12 @@ class _Task:
     has_regions: bool
     is_fine: bool = False
     """Whether the crops are small ones alone, on a finer grid."""
+    grids: tuple[Grid, Grid] | None = None
+    """Grids of a map of patch features, which then takes the place of crops."""
 
     @property
     def clip_kind(self) -> str:
         return FINE if self.is_fine else CLIP
-
-    @property
-    def steps(self) -> int:
-        """Crops per side."""
-        return THIRD if self.is_fine else HALF
 
     @property
     def is_done(self) -> bool:
@@ -143,47 +149,53 @@ def _plan(
     fine: Collection[str],
 ) -> list[_Task]:
     """A task per photo; unreadable photos go to `left_out`."""
-    clip_model = find_model(config.clip, CLIP_OPTION).identity
+    clip_model = find_model(config.clip, CLIP_OPTION)
+    input_pixels = input_side(clip_model.folder)
+    patches = patch_reading(config.clip, config.clip_features)
     dense_model = None if not config.makes_dense else find_model(config.dense, DENSE_OPTION).identity
 
-    def plan_one(photo: Photo) -> _Task | UserError:
-        try:
-            source = _source(photo)
-        except UserError as error:
-            return error
+    def crops_of(photo: Photo, quality: Quality) -> Crops:
         pixel_size = 1 / photo.width if pixel_sizes is None else pixel_sizes[photo.name]
-        sides, sizes = crop_sides(scales, pixel_size, photo.width)
-        if is_fine := photo.name in fine:
-            sides, sizes = fine_crops(sides[0], sizes[0])
-        clip = {**source, "encoder": clip_model, "crop_sides": sides, "rule": _CROP_RULE}
+        size = photo.width, photo.height
+        return choose_crops(scales, pixel_size, size, photo.name in fine, input_pixels, quality)
+
+    tasks = []
+    for photo, content in zip(photos, store.photo_hashes(photos).values(), strict=True):
+        if isinstance(content, UserError):
+            left_out[photo.name] = str(content)
+            continue
+        source, is_fine = _source(photo, content), photo.name in fine
+        crops = crops_of(photo, config.quality)
+        fast = crops_of(photo, "fast").count(photo.height, photo.width)
+        clip = {**source, "encoder": clip_model.identity, "crop_sides": crops.sides, "rule": _CROP_RULE}
+        if is_fine and crops.steps != THIRD:
+            clip["steps"] = crops.steps
+        grids = None
+        if patches is not None:
+            grids = map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
+            sides = sorted(math.ceil(photo.width / columns) for _, columns in grids)
+            clip = {**source, "encoder": clip_model.identity, "crop_sides": sides}
+            clip |= {"patches": patches.recipe, "grids": grids, "rule": RULE}
         has_dense = dense_model is not None and (is_fine or not fine)
         dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if has_dense else None
         labels = None if regions is None else regions.settings(photo)
         settings = None if labels is None else {**source, **labels}
-        task = _Task(photo, sides, sizes, clip, dense, settings, has_dense, labels is not None, is_fine)
+        has_regions = labels is not None
+        task = _Task(photo, crops, fast, clip, dense, settings, has_dense, has_regions, is_fine, grids)
         task.drop_current(store)
-        return task
-
-    tasks = []
-    # Reading and hashing files, in parallel threads.
-    with ThreadPoolExecutor(_CHECKERS) as pool, progress("checking photos", len(photos)) as advance:
-        for photo, planned in zip(photos, pool.map(plan_one, photos), strict=True):
-            advance()
-            if isinstance(planned, UserError):
-                left_out[photo.name] = str(planned)
-            else:
-                tasks.append(planned)
+        tasks.append(task)
     without = [task.photo.name for task in tasks if not task.has_regions]
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
     return tasks
 
 
-def _source(photo: Photo) -> dict[str, Any]:
-    """Everything that determines the result of `photo.read()`. The camera matters only if it undistorts."""
+def _source(photo: Photo, content: str) -> dict[str, Any]:
+    """Everything that determines the photo as it is read. The camera matters only if it undistorts."""
     lens = photo.lens
     camera = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion, lens.fisheye] if lens.distorts else None
-    return {"photo": photo.content_hash(), "size": [photo.width, photo.height], "undistorted": camera}
+    source = {"photo": content, "size": [photo.width, photo.height], "undistorted": camera}
+    return {**source, "turned": photo.quarter_turns} if photo.quarter_turns else source
 
 
 def _make(
@@ -197,25 +209,35 @@ def _make(
 ) -> None:
     """Write the missing entries, photo by photo, in the configured number of processes."""
     with_clip, with_dense = any(task.clip for task in missing), any(task.dense for task in missing)
-    maker = _Maker(config, store, regions, with_clip, with_dense)
+    maker = _Maker(config, store, regions, with_clip, with_dense, missing)
     store.remove_leftovers()
     clip, dense = maker.models(str(device))
-    crop_size = clip.crop_size if clip else 0
-    _announce(missing, photos, _bytes_needed(missing, clip, dense), crop_size, config, store)
+    _announce(missing, photos, clip, dense, config, store)
+    if clip:
+        _announce_duration(missing, clip, dense, config, torch.device(device))
     workers = Workers(config.workers, config.engine, config.address)
     with progress("encoding photos", len(missing)) as advance:
-        while missing:
-            busy = []
-            for task, trouble in workers.run(maker, missing, str(device)):
-                if trouble == _BUSY:
-                    busy.append(task)
-                    continue
-                if trouble:
-                    left_out[task.photo.name] = trouble
-                advance()
-            missing, workers = busy, Workers()  # the few that another command is making: wait for them here
-            if busy:
-                time.sleep(_PATIENCE_S)
+        for task, trouble in workers.run(maker, missing, str(device)):
+            if trouble:
+                left_out[task.photo.name] = trouble
+            advance()
+
+
+class _ReadAhead:
+    """Reads the photos of tasks in threads, a few before their turn."""
+
+    def __init__(self, read: Callable[[Photo], UInt8[Tensor, "h w 3"]], tasks: Sequence[_Task]) -> None:
+        self._read, self._waiting = read, deque(tasks)
+        self._pool = ThreadPoolExecutor(_READERS, thread_name_prefix="photo-reader")
+        self._read_by_name: dict[str, Future[UInt8[Tensor, "h w 3"]]] = {}
+
+    def get(self, photo: Photo) -> UInt8[Tensor, "h w 3"]:
+        """The photo's pixels. Raises UserError if it can't be read."""
+        while self._waiting and len(self._read_by_name) <= _READERS:
+            ahead = self._waiting.popleft().photo
+            self._read_by_name[ahead.name] = self._pool.submit(self._read, ahead)
+        future = self._read_by_name.pop(photo.name, None)
+        return self._read(photo) if future is None else future.result()
 
 
 @dataclass
@@ -227,10 +249,12 @@ class _Maker:
     regions: RegionSource | None
     with_clip: bool
     with_dense: bool
+    tasks: list[_Task]
+    """In their order, to be read ahead; a worker process doesn't know which it gets."""
     _models: tuple[ImageTextEncoder | None, DenseEncoder | None] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_models": None}  # every process loads its own
+        return {**self.__dict__, "tasks": [], "_models": None}  # every process loads its own
 
     def models(self, device: str) -> tuple[ImageTextEncoder | None, DenseEncoder | None]:
         """The encoders needed; loaded once."""
@@ -242,24 +266,18 @@ class _Maker:
         return self._models
 
     def start(self, device: str) -> Callable[[_Task], str | None]:
-        """As `workers.Maker.start`. The work returns why a photo can't be used, or that another process is
-        making it, or None."""
+        """As `workers.Maker.start`. The work returns why a photo can't be used, or None."""
         clip, dense = self.models(device)
+        photos = _ReadAhead(WorkingPhotos(self.store).read, self.tasks)
 
         def work(task: _Task) -> str | None:
-            with self.store.claim(task.photo.name) as is_ours:
-                if not is_ours:
-                    return _BUSY
-                task.drop_current(self.store)  # another process may have made it meanwhile
-                if task.is_done:
-                    return None
-                try:
-                    image = task.photo.read()  # once for all kinds
-                except UserError as error:
-                    return str(error)
-                batch = self.config.crop_batch
-                _encode(task, image.to(device), clip, dense, self.regions, batch, self.store)
-                return None
+            try:
+                pixels = photos.get(task.photo)
+            except UserError as error:
+                return str(error)
+            image = pixels.to(device).float() / 255  # a quarter of the bytes travel to a GPU
+            _encode(task, image, clip, dense, self.regions, self.config.crop_batch, self.store)
+            return None
 
         return work
 
@@ -273,15 +291,21 @@ def _encode(
     crop_batch: int,
     store: FeatureStore,
 ) -> None:
-    if task.clip and clip:
+    if task.clip and clip and task.grids:
+        tokens, windows = clip.crop_size // clip.patch_size, max(crop_batch // _PATCHES_PER_CROP, 1)
+        lit = clip.in_known_light(image)
+        features = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
+        tensors = {"features": features, "valid": torch.ones_like(features[..., 0])}
+        store.write(task.clip_kind, task.photo.name, tensors, task.clip)
+    elif task.clip and clip:
         target = build_clip_target(
             clip.in_known_light(image),
-            task.sides,
-            task.scales,
+            task.crops.sides,
+            task.crops.sizes,
             clip.encode_images,
             clip.crop_size,
             crop_batch,
-            task.steps,
+            task.crops.steps,
         )
         tensors = {"features": target.features, "valid": target.valid}
         store.write(task.clip_kind, task.photo.name, tensors, task.clip)
@@ -297,11 +321,8 @@ def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: 
     total = 0
     for task in tasks:
         if task.clip and clip:
-            rows, columns = (
-                len(crop_centers(n, min(task.sides), task.steps))
-                for n in (task.photo.height, task.photo.width)
-            )
-            total += 2 * rows * columns * (clip.dim + 1)
+            grid = task.grids[-1] if task.grids else task.crops.grid(task.photo.height, task.photo.width)
+            total += 2 * math.prod(grid) * (clip.dim + 1)
         if task.dense and dense:
             total += 2 * dense.tokens**2 * dense.dim
         if task.regions:
@@ -309,15 +330,64 @@ def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: 
     return total
 
 
+def _announce_duration(
+    missing: list[_Task],
+    clip: ImageTextEncoder,
+    dense: DenseEncoder | None,
+    config: PreparationConfig,
+    device: torch.device,
+) -> None:
+    """Log how many crops are encoded, and for how long, by the time that noise takes."""
+    tasks = [task for task in missing if task.clip and not task.grids]
+    crops = sum(task.crops.count(task.photo.height, task.photo.width) for task in tasks)
+    if crops < _ANNOUNCED_CROPS:
+        return
+    batch = 4 if device.type == "cpu" else config.crop_batch
+    noise = torch.rand(batch, 3, clip.crop_size, clip.crop_size, device=device)
+    of_crop = _seconds(lambda: clip.encode_images(noise)) / batch
+    rest = 0.0
+    if dense is not None:
+        encoder = dense
+        rest = sum(task.dense is not None for task in tasks) * _seconds(
+            lambda: encoder.encode(noise[0].permute(1, 2, 0))
+        )
+    takes, faster = ((n * of_crop + rest) / config.workers for n in (crops, sum(task.fast for task in tasks)))
+    quality = spoken("--pipeline.datamanager.quality")
+    hint = "" if faster > 0.9 * takes else f"; {quality} fast: {_duration(faster)}"
+    say(f"{len(tasks):,} photos, {crops:,} crops with {config.clip}: about {_duration(takes)}{hint}")
+    if device.type == "cpu" and takes > _LONG_S:
+        say(
+            f"That is long, since this runs on the CPU. What shortens it: a GPU (some hundred times), "
+            f"{quality} fast, {spoken(CLIP_OPTION)} builtin if its words suffice, or fewer photos. It can be "
+            "stopped at any time and goes on where it was"
+        )
+
+
+def _seconds(work: Callable[[], Tensor]) -> float:
+    """Seconds that some work takes, once it is warm."""
+    for _ in range(2):
+        start = time.perf_counter()
+        work().cpu()  # waits for a GPU
+    return time.perf_counter() - start
+
+
+def _duration(seconds: float) -> str:
+    """A duration to two digits at most."""
+    if seconds < 90:
+        return f"{max(round(seconds), 1)} seconds"
+    return f"{round(seconds / 60)} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"
+
+
 def _announce(
     missing: list[_Task],
     photos: int,
-    needed: int,
-    crop_size: int,
+    clip: ImageTextEncoder | None,
+    dense: DenseEncoder | None,
     config: PreparationConfig,
     store: FeatureStore,
 ) -> None:
     """Log the work ahead, and the disk and memory it needs. Raises UserError if the disk is too small."""
+    needed, crop_size = _bytes_needed(missing, clip, dense), clip.crop_size if clip else 0
     store.make_folder()
     free = shutil.disk_usage(store.root).free
     if needed > free:

@@ -39,6 +39,11 @@ HALF, THIRD = 2, 3
 """Crops per side: how many steps a crop's own side is, from one center to the next."""
 
 
+def crop_count(length: int, side: int, steps: int = HALF) -> int:
+    """Number of crops along an axis of `length` pixels."""
+    return max(length // max(2 * _half(side) // steps, 1), 1)
+
+
 def crop_centers(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]:
     """Pixel positions of the crop centers along an axis of `length` pixels: the middles of n equal cells, as
     a target is read, n such that they are about a crop over `steps` apart.
@@ -46,7 +51,7 @@ def crop_centers(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]
     A crop covers `side // 2` pixels to either side of its center and may reach out of the photo. Method:
     Lang3D-XL, crop grid; there centers are exactly half a crop apart, up to half a cell beside their cells.
     """
-    count = max(length // max(2 * _half(side) // steps, 1), 1)
+    count = crop_count(length, side, steps)
     return ((2 * torch.arange(count) + 1) * length + count - 1) // (2 * count)  # rounded
 
 

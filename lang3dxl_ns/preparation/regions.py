@@ -1,8 +1,9 @@
-"""Region label maps: segments of a photo whose features should agree, from SAM, colors, or a folder."""
+"""Region label maps: segments of a photo whose features should agree, from networks, colors, or a folder."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from tokenize import TokenError
@@ -16,9 +17,17 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
-from lang3dxl_ns.preparation.encoders import ModelFiles
-from lang3dxl_ns.preparation.segmentation import AutomaticSam, find_sam
-from lang3dxl_ns.preparation.settings import RegionLevel
+from lang3dxl_ns.preparation.model_files import ModelFiles
+from lang3dxl_ns.preparation.sam3 import Sam3
+from lang3dxl_ns.preparation.segmentation import (
+    TEXT_OPTION,
+    AutomaticSam,
+    SegmenterFiles,
+    find_sam,
+    find_text_segmenter,
+    is_sam3,
+)
+from lang3dxl_ns.preparation.settings import PreparationConfig, RegionLevel
 from lang3dxl_ns.scene.companions import companion, named_folder
 from lang3dxl_ns.scene.photo import Photo
 
@@ -44,24 +53,25 @@ class RegionSource(Protocol):
         """Labels of the photo as read by `photo.read()` (`image`), at any size; negative for no region."""
 
 
-def region_source(
-    choice: str, level: RegionLevel, sam: str, data: Path, device: torch.device | str
-) -> RegionSource | None:
-    """The source named by an option: none, felzenszwalb, sam, a folder (relative to `data`), or auto, the
-    folder regions/ if `data` has one.
+def region_source(config: PreparationConfig, data: Path, device: torch.device | str) -> RegionSource | None:
+    """The source named by `config.regions`: none, felzenszwalb, sam, text, a folder (relative to `data`), or
+    auto, the folder regions/ if `data` has one.
 
-    Raises UserError if there is no such folder, or SAM can't be found or downloaded.
+    Raises UserError if there is no such folder, or a network can't be found or downloaded.
     """
-    if choice == "auto":
+    if config.regions == "auto":
         folder = data / "regions"
         return FolderRegions(folder) if folder.is_dir() else None
-    if choice == "none":
+    if config.regions == "none":
         return None
-    if choice == "felzenszwalb":
+    if config.regions == "felzenszwalb":
         return FelzenszwalbRegions()
-    if choice == "sam":
-        return SamRegions(find_sam(sam), level, device)
-    return FolderRegions(named_folder(choice, data, "regions"))
+    if config.regions == "sam":
+        return SamRegions(find_sam(config.sam), config.region_level, device)
+    if config.regions == "text":
+        files = find_text_segmenter(config.foreground_model, config.sam)
+        return TextRegions(files, config.region_prompts, config.region_level, device)
+    return FolderRegions(named_folder(config.regions, data, "regions"))
 
 
 class FelzenszwalbRegions:
@@ -99,6 +109,39 @@ class SamRegions:
     @cached_property
     def _sam(self) -> AutomaticSam:
         return AutomaticSam(self._files, self._device)
+
+
+class TextRegions:
+    """Regions from SAM 3: one for each instance of what the prompts name. Raises UserError for another
+    model."""
+
+    def __init__(
+        self, files: SegmenterFiles, prompts: Sequence[str], level: RegionLevel, device: torch.device | str
+    ) -> None:
+        if not is_sam3(files):
+            raise UserError(
+                f"regions text needs a SAM 3, and {files.words.name} is none: {TEXT_OPTION} facebook/sam3"
+            )
+        self._files, self._prompts, self._level, self._device = files, sorted(prompts), level, device
+
+    def settings(self, photo: Photo) -> dict[str, Any]:
+        """As `RegionSource.settings`."""
+        made_with = {"prompts": self._prompts, "model": self._files.identity, "level": self._level}
+        return {"regions": "text", **made_with, "rule": _RULE}
+
+    def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
+        """As `RegionSource.labels`."""
+        small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
+        masks = torch.cat([masks for masks, _ in self._sam.instances(small, self._prompts)])
+        if not len(masks):
+            return torch.full(label_size(*small.shape[:2]), -1)
+        return label_map(
+            torch.stack([_nearest(mask, label_size(*mask.shape)) for mask in masks]), self._level
+        )
+
+    @cached_property
+    def _sam(self) -> Sam3:
+        return Sam3(self._files.words, self._device)
 
 
 class FolderRegions:

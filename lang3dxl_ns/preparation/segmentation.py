@@ -1,4 +1,4 @@
-"""Segmentation networks: CLIPSeg or GroundingDINO with SAM for prompts, SAM alone for everything.
+"""Segmentation networks: CLIPSeg, SAM 3, or GroundingDINO with SAM for prompts; SAM alone for everything.
 
 All are read from a local folder or by Hugging Face name, like the encoders.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 import torch.nn.functional as F
@@ -16,7 +16,14 @@ from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.encoders import ModelFiles, find_model, load_weights, model_type
+from lang3dxl_ns.preparation.model_files import (
+    ModelFiles,
+    find_model,
+    load_processor,
+    load_weights,
+    model_type,
+)
+from lang3dxl_ns.preparation.sam3 import MODEL_TYPES, Sam3
 
 TEXT_OPTION = "--pipeline.datamanager.foreground-model"
 SAM_OPTION = "--pipeline.datamanager.sam"
@@ -58,16 +65,16 @@ class SegmenterFiles:
 
 
 def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
-    """A text segmenter's files: a CLIPSeg alone, or a GroundingDINO with a SAM.
+    """A text segmenter's files: a CLIPSeg or SAM 3 alone, or a GroundingDINO with a SAM.
 
     Raises UserError when one can't be found or downloaded, or is another kind of model.
     """
     words = find_model(name_or_dir, TEXT_OPTION)
     kind = model_type(words)
-    if kind not in ("clipseg", "grounding-dino"):
+    if kind not in ("clipseg", "grounding-dino", *MODEL_TYPES):
         raise UserError(
-            f"{words.name} is a {kind} model: {TEXT_OPTION} takes a GroundingDINO, such as "
-            "IDEA-Research/grounding-dino-tiny, or a CLIPSeg, such as CIDAS/clipseg-rd64-refined"
+            f"{words.name} is a {kind} model: {TEXT_OPTION} takes a GroundingDINO "
+            "(IDEA-Research/grounding-dino-tiny), a CLIPSeg (CIDAS/clipseg-rd64-refined) or facebook/sam3"
         )
     return SegmenterFiles(words, find_sam(sam) if kind == "grounding-dino" else None)
 
@@ -83,7 +90,14 @@ def find_sam(name_or_dir: str) -> ModelFiles:
 
 def load_text_segmenter(files: SegmenterFiles, device: torch.device | str) -> TextSegmenter:
     """The networks on `device`. Raises UserError when one is incomplete."""
-    return ClipSeg(files.words, device) if files.sam is None else BoxesAndSam(files.words, files.sam, device)
+    if files.sam is not None:
+        return BoxesAndSam(files.words, files.sam, device)
+    return Sam3(files.words, device) if is_sam3(files) else ClipSeg(files.words, device)
+
+
+def is_sam3(files: SegmenterFiles) -> bool:
+    """Whether a text segmenter is a SAM 3, which tells instances apart."""
+    return model_type(files.words) in MODEL_TYPES
 
 
 class ClipSeg:
@@ -93,7 +107,7 @@ class ClipSeg:
         from transformers import CLIPSegForImageSegmentation, CLIPSegProcessor
 
         self._model = load_weights(CLIPSegForImageSegmentation, files, device)
-        self._processor = _load_processor(CLIPSegProcessor, files)
+        self._processor = load_processor(CLIPSegProcessor, files)
         self._context: int = self._model.config.text_config.max_position_embeddings
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
@@ -128,9 +142,9 @@ class BoxesAndSam:
         )
 
         self._detector = load_weights(GroundingDinoForObjectDetection, words, device)
-        self._detector_processor = _load_processor(GroundingDinoProcessor, words)
+        self._detector_processor = load_processor(GroundingDinoProcessor, words)
         self._sam = load_weights(SamModel, sam, device)
-        self._sam_processor = _load_processor(SamProcessor, sam)
+        self._sam_processor = load_processor(SamProcessor, sam)
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
         """As `TextSegmenter.segment`."""
@@ -187,7 +201,7 @@ class AutomaticSam:
         from transformers import SamModel, SamProcessor, pipeline
 
         model = load_weights(SamModel, files, device)
-        processor = _load_processor(SamProcessor, files).image_processor
+        processor = load_processor(SamProcessor, files).image_processor
         self._generate = pipeline("mask-generation", model=model, image_processor=processor, device=device)
 
     def masks(self, image: UInt8[Tensor, "h w 3"]) -> list[Bool[Tensor, "h w"]]:
@@ -195,17 +209,6 @@ class AutomaticSam:
         return [
             torch.as_tensor(mask).cpu() for mask in self._generate(_picture(image), **_AUTOMATIC)["masks"]
         ]
-
-
-def _load_processor(processor_class: Any, files: ModelFiles) -> Any:
-    """Preprocessor of a network's images and texts. Raises UserError if its files are missing."""
-    try:
-        return processor_class.from_pretrained(files.folder, local_files_only=True)
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise UserError(
-            f"{files.folder} lacks files that preprocess the input of {files.name} ({error}): copy its "
-            "preprocessor_config.json and tokenizer files there, or download the model again"
-        ) from error
 
 
 def _picture(image: UInt8[Tensor, "h w 3"]) -> Image.Image:

@@ -12,23 +12,41 @@ from typing import Literal
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.errors import UserError
 
+ClipFeatures = Literal["auto", "crops", "dense"]
 DistanceRule = Literal["median", "mean", "mean-inner"]
 AngleRule = Literal["half", "paper", "exact"]
 RegionLevel = Literal["small", "medium", "large"]
+Quality = Literal["fast", "normal", "fine"]
 DENSE_MODEL = "facebook/dinov2-small"
 """For semantics that are trained with the scene."""
 
 
-_BOUNDS = {"scales": (1, 100), "dense_tokens": (1, 1024), "crop_batch": (1, 1 << 16), "workers": (1, 1024)}
+_BOUNDS = {
+    "longer_side": (16, 1 << 16),
+    "scales": (1, 100),
+    "dense_tokens": (1, 1024),
+    "crop_batch": (1, 1 << 16),
+    "workers": (1, 1024),
+}
 
 
 @dataclass
 class PreparationConfig:
     """Settings of the targets."""
 
+    longer_side: int = 1600
+    """Pixels of a photo's longer side at most: larger photos are shrunk once, before crops are cut and colors
+    are trained."""
+    quality: Quality = "normal"
+    """Number of crops. normal: at most 2,500 of a photo for an encoder of 224 pixels (as many pixels of other
+    encoders); fast: at most 700; fine: no bound, some 10,000 in a photo of 1,600 pixels."""
     clip: str = "openai/clip-vit-base-patch32"
-    """CLIP in Hugging Face format: a name, a folder, or "builtin". Queries need the same one. The paper uses
-    this architecture fine-tuned on landmarks."""
+    """CLIP, SigLIP or another image-text encoder (docs/encoders.md) in Hugging Face format: a name, a folder,
+    or "builtin". Queries need the same one. The paper uses this architecture fine-tuned on landmarks."""
+    clip_features: ClipFeatures = "auto"
+    """What it reads photos as. crops: one vector for each of thousands of crops. dense: a map of patch
+    features in about ten passes. auto: dense if its patches were trained to fit texts (TIPSv2), otherwise
+    crops."""
     dense: str = "auto"
     """Vision transformer whose patch tokens sharpen what crops blur: a name, a folder, or "none" to do
     without. auto: facebook/dinov2-small, or the built-in one with the built-in CLIP."""
@@ -56,7 +74,8 @@ class PreparationConfig:
     ranges), the paper's text ("paper"), or the pinhole's d / f ("exact")."""
     dense_tokens: int = 64
     """Dense tokens per side of a photo, which is squashed to a square. The authors use 128: four times the
-    disk and over four times the time."""
+    disk and over four times the time. Also the fewest patches along a photo's longer side in dense
+    `clip_features`."""
     crop_batch: int = 256
     """Crops encoded at once: more are faster on a GPU, but need more memory."""
     workers: int = 1
@@ -74,8 +93,8 @@ class PreparationConfig:
     foreground_prompts: tuple[str, ...] = ("building",)
     """With "text": the foreground is everything that any of these prompts names."""
     foreground_model: str = "IDEA-Research/grounding-dino-tiny"
-    """Model that finds the prompts: a GroundingDINO, with `sam` for the masks, or a CLIPSeg, lighter and
-    coarser (CIDAS/clipseg-rd64-refined). A name or a folder."""
+    """Model that finds the prompts: a GroundingDINO, with `sam` for the masks; a CLIPSeg, lighter and coarser
+    (CIDAS/clipseg-rd64-refined); or SAM 3, the best (facebook/sam3, gated). A name or a folder."""
 
     @property
     def makes_dense(self) -> bool:
@@ -84,8 +103,11 @@ class PreparationConfig:
 
     regions: str = "auto"
     """Segments inside which features should agree: "auto" (regions/ in the data folder, if there is one),
-    "none", "sam", "felzenszwalb" (needs no weights), or a folder of label maps named like the photos: 16-bit
+    "none", "sam", "felzenszwalb" (needs no weights), "text" (instances of `region_prompts`, found by a SAM 3
+    as `foreground_model`), or a folder of label maps named like the photos: 16-bit
     PNG, 0 = no region, or .npy, negative = no region."""
+    region_prompts: tuple[str, ...] = ("window", "door", "tower", "roof", "column", "statue")
+    """With "text": what regions are instances of."""
     region_level: RegionLevel = "small"
     """Which of SAM's masks a pixel gets where they overlap. Small, as in the paper."""
     sam: str = "facebook/sam-vit-base"

@@ -7,26 +7,33 @@ import errno
 import hashlib
 import json
 import logging
+import os
 import re
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.scene.photo import Photo
 
 logger = logging.getLogger(__name__)
 
 _HALF_MAX = torch.finfo(torch.float16).max
-_ENTRIES = (".safetensors", ".png")
-"""Targets, and masks."""
-_LEFTOVER_AGE_S = (
-    3600.0  # a write takes seconds: an older temporary file belongs to a process that was killed
-)
+_ENTRIES = (".safetensors", ".png", ".jpg")
+"""Targets, masks, and photos at working size."""
+_HASHES = "photo_hashes.json"
+_SECOND = 10**9  # nanoseconds
+_LEFTOVER_AGE_S = 3600.0
+"""A write takes seconds: an older temporary file belongs to a process that was killed."""
+_READERS = 4
+"""Threads that check photos."""
 
 
 class FeatureStore:
@@ -54,8 +61,9 @@ class FeatureStore:
 
         stored = {key: _compact(tensor, f"{key} of {name} ({kind})") for key, tensor in tensors.items()}
         metadata = {"settings": _canonical(settings), "checksum": _checksum(stored)}
-        content = save(stored, metadata=metadata)
-        self.write_bytes(self.path(kind, name), content, f"{name} ({kind})")
+        path = self.path(kind, name)
+        self.write_bytes(path, save(stored, metadata=metadata), f"{name} ({kind})")
+        _seal(path)
 
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
         """Write a file of the store, atomically. Raises UserError if the disk is full or read-only."""
@@ -109,7 +117,7 @@ class FeatureStore:
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
         """Whether the entry exists, is complete, and was made with these settings. Damaged counts as absent.
 
-        If the settings match, reads the whole entry to verify its checksum.
+        Reads the entry's header alone, and all of it only if the file has changed since it was last whole.
         """
         path = self.path(kind, name)
         if not path.exists():
@@ -119,13 +127,46 @@ class FeatureStore:
                 metadata = file.metadata()
                 if _canonical(json.loads(metadata["settings"])) != _canonical(settings):
                     return False
+                if _is_sealed(path):
+                    return True
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
                 if metadata.get("checksum") != _checksum(tensors):
                     raise UserError(f"{path} ({kind} of {name}) is damaged: its checksum differs")
-                return True
+            _seal(path)
+            return True
         except (UserError, ValueError) as error:
             logger.warning("%s; it will be made again", error)
             return False
+
+    def photo_hashes(self, photos: Sequence[Photo]) -> dict[str, str | UserError]:
+        """A hash of every photo's file by name, or the reason why it can't be read.
+
+        A file is read once, and again when its size, time of change or inode is another than recorded.
+        """
+        path = self.root / _HASHES
+        known = _read_json(path)
+        found: dict[str, Any] = {}
+
+        def look(photo: Photo) -> str | UserError:
+            try:
+                stamp = photo.stamp()
+                recorded = known.get(photo.name)
+                if not (isinstance(recorded, list) and len(recorded) == 2 and recorded[0] == stamp):
+                    recorded = [stamp, photo.content_hash()]
+                found[photo.name] = recorded
+                return recorded[1]
+            except UserError as error:
+                return error
+
+        with ThreadPoolExecutor(_READERS) as pool, progress("checking photos", len(photos)) as advance:
+            hashes = {}
+            for photo, result in zip(photos, pool.map(look, photos), strict=True):
+                hashes[photo.name] = result
+                advance()
+        if any(known.get(name) != entry for name, entry in found.items()):
+            with contextlib.suppress(OSError):  # a store that can't be written to can still be read
+                write_atomically(path, json.dumps({**known, **found}))
+        return hashes
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Files and bytes on disk, by kind."""
@@ -152,20 +193,6 @@ class FeatureStore:
             with contextlib.suppress(FileNotFoundError):  # another process may clean up too
                 if time.time() - path.stat().st_mtime > _LEFTOVER_AGE_S:
                     path.unlink()
-
-    @contextlib.contextmanager
-    def claim(self, name: str) -> Iterator[bool]:
-        """Yields whether this process may make a photo's entries; False while another process is at it.
-
-        The claim is a lock on a byte of one file, so it ends with its process. On file systems without locks
-        every process may; then a photo may be made twice, and the last result wins.
-        """
-        place = int(hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:12], 16)
-        self.make_folder()
-        with self._writable("its list of claims"):
-            file = (self.root / ".claims").open("ab")
-        with file:
-            yield _lock_byte(file, place)  # closing the file releases it
 
 
 @contextlib.contextmanager
@@ -207,17 +234,23 @@ def _checksum(tensors: dict[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _lock_byte(file: BinaryIO, place: int) -> bool:
-    """Lock a byte of a file until it is closed; False if another process holds it."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return True
-    try:
-        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
-    except OSError as error:
-        return error.errno not in (errno.EAGAIN, errno.EACCES)
-    return True
+def _seal(path: Path) -> None:
+    """Mark a file as whole by a time of change in full seconds, which a later change makes another."""
+    with contextlib.suppress(OSError):
+        seconds = path.stat().st_mtime_ns // _SECOND
+        os.utime(path, ns=(seconds * _SECOND, seconds * _SECOND))
+
+
+def _is_sealed(path: Path) -> bool:
+    return path.stat().st_mtime_ns % _SECOND == 0
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """A JSON object; empty for a file that is missing or damaged."""
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        content = json.loads(path.read_text())
+        return content if isinstance(content, dict) else {}
+    return {}
 
 
 def _canonical(settings: dict[str, Any]) -> str:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import check_regular, write_atomically
 
 
 def fingerprint(state: Mapping[str, Any], settings: object) -> str:
@@ -45,6 +45,7 @@ def load_tensors(path: Path, key: str) -> tuple[dict[str, Tensor], object] | Non
     from safetensors import SafetensorError, safe_open
 
     try:
+        check_regular(path)
         with safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
             if metadata.get("key") != key:

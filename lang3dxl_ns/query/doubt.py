@@ -8,9 +8,10 @@ here depends on the encoder or the scene (conformal p-values: Vovk, Gammerman & 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -30,6 +31,8 @@ DOUBTFUL = 0.1
 """A prompt with more doubt than this is reported as doubtful: so are nine in ten absent things."""
 _BEST = 0.005
 """Share of the Gaussians that a prompt's fit is read from."""
+_AT_A_TIME = 4
+"""Unrelated words asked together."""
 
 
 class Doubts:
@@ -56,7 +59,17 @@ class Doubts:
 
     @cached_property
     def _unrelated(self) -> Float[Tensor, " u"]:
-        return peaks(self._relevancy(self._queries(UNRELATED)))
+        return torch.cat([peaks(self._relevancy(few)) for few in _few(self._queries(UNRELATED))])
+
+
+def _few(queries: Queries) -> Iterator[Queries]:
+    """The same queries, a few at a time: all of them to millions of Gaussians would take gigabytes."""
+    for first in range(0, len(queries), _AT_A_TIME):
+        groups = [group[first : first + _AT_A_TIME] for group in (queries.positive, queries.negative)]
+        rows = sorted({row for group in groups for members in group for row in members})
+        place = {row: k for k, row in enumerate(rows)}
+        positive, negative = (tuple(tuple(place[row] for row in each) for each in group) for group in groups)
+        yield Queries(queries.vectors[rows], positive, negative)
 
 
 def peaks(relevancy: Float[Tensor, "q n"]) -> Float[Tensor, " q"]:

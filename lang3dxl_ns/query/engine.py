@@ -6,7 +6,7 @@ engine compute maps from the result.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -16,11 +16,25 @@ from torch import Tensor
 
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
-from lang3dxl_ns.query.relevancy import TEMPERATURE, Decode, Queries, relevancy_of_codes
+from lang3dxl_ns.query.relevancy import (
+    TEMPERATURE,
+    Decode,
+    Queries,
+    calibrated,
+    cosines_of_codes,
+    relevancy_of_codes,
+)
+
+_SAMPLE = 4096
+"""Gaussians that a calibration is read from."""
 
 
 class QueryEngine(Protocol):
     """Answers prompts about a scene."""
+
+    @property
+    def temperature(self) -> float:
+        """Temperature of the relevancies, for cosines as they are."""
 
     def channels(self, queries: Queries) -> Float[Tensor, "n d"]:
         """Values that Gaussians carry in a rendering that answers these prompts."""
@@ -33,6 +47,12 @@ class QueryEngine(Protocol):
 
     def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
         """Unit CLIP features of some Gaussians; 0 for those visible in no photo."""
+
+    def calibrated(self, words: Queries) -> QueryEngine:
+        """The same with a temperature that suits the encoder: `relevancy.calibrated`.
+
+        words: a fixed set for all scenes and encoders, `TextEncoder.yardstick`.
+        """
 
 
 @dataclass(frozen=True)
@@ -55,6 +75,10 @@ class PerGaussian:
     def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
         return self.decoded.features(rows)
 
+    def calibrated(self, words: Queries) -> PerGaussian:
+        cosines = self.decoded.some(_SAMPLE).cosines(words)
+        return replace(self, temperature=calibrated(self.temperature, cosines))
+
 
 @dataclass(frozen=True)
 class PerPixel:
@@ -75,6 +99,10 @@ class PerPixel:
 
     def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
         return F.normalize(self.decode(self.codes[rows]), dim=1)
+
+    def calibrated(self, words: Queries) -> PerPixel:
+        cosines = cosines_of_codes(self.decode, self.codes[:: max(len(self.codes) // _SAMPLE, 1)], words)
+        return replace(self, temperature=calibrated(self.temperature, cosines))
 
 
 @torch.no_grad()

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.query.run_file import SCENE_FILE
 
 OUTPUTS = Path("outputs")
 """Where `ns-train` puts runs."""
@@ -16,17 +19,21 @@ def find_config(run: str | Path | None = None) -> Path:
     """The config.yml of a run.
 
     run: the file, the run's folder, or a folder above it, whose newest run is taken; None: the newest under
-    outputs/. Raises UserError if there is none.
+    outputs/. Runs of other methods, which lack a description of the scene, are skipped. Raises UserError if
+    there is none.
     """
-    place = OUTPUTS if run is None else Path(run).expanduser()
+    place = OUTPUTS if run is None else expanded(run)
     if place.is_dir():
-        configs = [path for depth in range(_DEEPEST + 1) for path in place.glob("*/" * depth + "config.yml")]
-        if place.joinpath("config.yml") in configs:
+        if place.joinpath("config.yml").is_file():
             return place / "config.yml"
-        if configs:
-            return max(configs, key=lambda path: path.stat().st_mtime)
+        configs = [path for depth in range(1, _DEEPEST + 1) for path in _configs(place, depth)]
+        ours = [path for path in configs if path.with_name(SCENE_FILE).is_file()]
+        if ours:
+            return max(ours, key=lambda path: path.stat().st_mtime)
+        others = f" of this method ({len(configs)} of others)" if configs else ""
         raise UserError(
-            f"{place} holds no run: name the folder of one, or train with ns-train lang3dxl --data FOLDER"
+            f"{place} holds no run{others}: name the folder of one, or train with ns-train lang3dxl --data "
+            "FOLDER"
         )
     if run is None:
         raise UserError(
@@ -35,3 +42,7 @@ def find_config(run: str | Path | None = None) -> Path:
     if not place.is_file():
         raise UserError(f"{place} is not a file or folder: pass a run's folder, or its config.yml")
     return place
+
+
+def _configs(place: Path, depth: int) -> Iterator[Path]:
+    return (path for path in place.glob("*/" * depth + "config.yml") if path.is_file())

@@ -53,6 +53,12 @@ class GaussianFeatures:
         rows = _in_chunks(decode, carried, encoder.clip_dim)
         return cls(rows, head, (rows != 0).any(1))
 
+    def some(self, count: int) -> GaussianFeatures:
+        """About `count` of the known Gaussians, evenly chosen."""
+        rows = self.rows[self.known]
+        rows = rows[:: max(len(rows) // count, 1)]
+        return GaussianFeatures(rows, self.head, torch.ones_like(rows[:, 0], dtype=torch.bool))
+
     @torch.no_grad()
     def features(self, which: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
         """Unit features of some Gaussians; 0 where unknown."""

@@ -16,7 +16,8 @@ class QueryConfig:
     text: TextConfig = field(default_factory=TextConfig)
     """Synonyms, their combination, canonical phrases."""
     temperature: float = TEMPERATURE
-    """Softmax temperature of the relevancy; changes neither the ranking of Gaussians nor what matches."""
+    """Softmax temperature of the relevancy, for an encoder whose cosines spread like the built-in CLIP's;
+    those of others are scaled. Changes neither the ranking of Gaussians nor what matches."""
     threshold: float | None = None
     """Relevancy above which a pixel matches (default: what stands out in the scene, at most 0.5)."""
     min_alpha: float = 0.3

@@ -55,7 +55,7 @@ def rank_views(
     closeness = ((peaks - low) / (top - low).clamp_min(1e-9)).clamp(0, 1)
     rows = []
     for view in views.values():
-        values, shares = scores[view.rows], view.pixels.float() / view.size
+        values, shares = scores[view.rows], view.shares
         strong = (values > level) * shares
         size = (strong.sum() / LARGE).clamp_max(1.0).sqrt()
         excess = (values - low) * strong
@@ -69,7 +69,7 @@ def rank_views(
 def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, ""]:
     """Mean relevancy of the most relevant share `PEAK` of a view."""
     order = scores[view.rows].argsort(descending=True)
-    shares = view.pixels.float()[order] / view.size
+    shares = view.shares[order]
     before = shares.cumsum(0) - shares
     counted = (PEAK - before).clamp_min(0).minimum(shares)
     return (scores[view.rows][order] * counted).sum() / PEAK

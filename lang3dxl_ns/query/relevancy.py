@@ -15,7 +15,11 @@ from lang3dxl_ns.common.memory import with_less_memory
 CANONICAL = ("object", "things", "stuff", "texture")
 """Phrases that fit anything (LERF): a prompt matches where it fits better than all of them."""
 TEMPERATURE = 10.0
-"""As in LERF's code. Neither the ranking of pixels nor the 0.5 contour depends on it."""
+"""As in LERF's code, for cosines of the spread `SPREAD`. Neither a Gaussian's rank nor the 0.5 contour
+depends on it."""
+SPREAD = 0.245
+"""`spread` of the built-in CLIP's cosines in scenes that it knows."""
+_LEAST_SPREAD = 1e-4
 Decode = Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]]
 """Codes to raw CLIP features: `SemanticField.decode_clip`."""
 _CPU_CHUNK = 8192
@@ -84,6 +88,29 @@ class Queries:
             for mine, theirs in zip(self.positive, self.negative, strict=True)
         ]
         return torch.sigmoid(temperature * torch.stack(margins))
+
+
+def spread(cosines: Float[Tensor, "n w"]) -> float:
+    """How far apart a feature's cosines with a fixed set of words are: their standard deviation, as root mean
+    square over the features. Features without a direction, whose cosines are all 0 or unknown, don't
+    count."""
+    known = (cosines.isfinite() & (cosines != 0)).any(1)
+    return float(cosines[known].var(1, correction=0).mean().sqrt()) if known.any() else 0.0
+
+
+def calibrated(temperature: float, cosines: Float[Tensor, "n w"]) -> float:
+    """The temperature that gives an encoder's margins the meaning that `temperature` gives the built-in
+    CLIP's.
+
+    Encoders differ in how far their cosines spread: ±.5 or ±.05. A relevancy at the calibrated temperature
+    stays the same if all cosines are multiplied by a number or shifted by one.
+
+    Args:
+        cosines: of a scene's features with words for what it may and surely doesn't show
+            (`TextEncoder.yardstick`).
+    """
+    own = spread(cosines)
+    return temperature * SPREAD / max(own, _LEAST_SPREAD) if own else temperature
 
 
 def _largest(cosines: Float[Tensor, "... v"], rows: tuple[int, ...]) -> Float[Tensor, "..."]:

@@ -17,15 +17,15 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
 
+from lang3dxl_ns.common.checks import is_coordinate
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
-from lang3dxl_ns.scene.colmap import FARTHEST
+from lang3dxl_ns.common.files import read_json, write_atomically
+from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.photo import Photo
 
@@ -57,13 +57,17 @@ class ScenePhoto:
     @property
     def camera(self) -> Camera:
         """The camera for the rasterizer, at training resolution."""
-        return self.lens.camera(view_matrix(torch.tensor(self.camera_to_world)))
+        return self.lens.camera(self._view_matrix)
 
     @property
     def full_camera(self) -> Camera:
         """The camera at the file's resolution."""
         lens = self.lens if self.size is None else self.lens.resized(*self.size)
-        return lens.camera(view_matrix(torch.tensor(self.camera_to_world)))
+        return lens.camera(self._view_matrix)
+
+    @property
+    def _view_matrix(self) -> Float[Tensor, "4 4"]:
+        return view_matrix(torch.tensor(self.camera_to_world, dtype=torch.float32))
 
     @property
     def pose(self) -> Float64[Array, "4 4"]:
@@ -125,7 +129,7 @@ class SceneFile:
                 f"an earlier version, or its folder is incomplete"
             )
         try:
-            content: dict[str, Any] = json.loads(path.read_text())
+            content: dict[str, Any] = read_json(path)
             if content.pop("version") != _VERSION:
                 raise ValueError("another version wrote it")
             return scene_from_json(content)
@@ -169,9 +173,8 @@ def _checked(scene: SceneFile) -> SceneFile:
         _expect(is_name(photo.name), f"a photo is called {photo.name!r}")
         _expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
         _expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
-        _expect(_is_pose(photo.camera_to_world), f"{photo.name} has no pose")
-        turned = torch.tensor(photo.camera_to_world)[:, :3].double().det()
-        _expect(1e-3 < abs(float(turned)) < 1e3, f"{photo.name} has no pose")
+        _expect(len(photo.camera_to_world) == 3, f"{photo.name} has no pose")
+        check_pose(photo.camera_to_world)
         photo.lens.check()
         if photo.size is not None:
             _expect(len(photo.size) == 2, f"{photo.name} has the size {photo.size}")
@@ -183,7 +186,7 @@ def _checked(scene: SceneFile) -> SceneFile:
     _expect(
         isinstance(scene.scale, float | int) and 0 < scene.scale < math.inf, f"its scale is {scene.scale!r}"
     )
-    _expect(_is_pose(scene.transform), "it has no transform")
+    _expect(_is_transform(scene.transform), "it has no transform")
     return scene
 
 
@@ -192,21 +195,17 @@ def _expect(holds: bool, otherwise: str) -> None:
         raise ValueError(otherwise)
 
 
-def _is_pose(rows: object) -> bool:
+def _is_transform(rows: object) -> bool:
     """Whether these are three rows of four finite numbers."""
     if not isinstance(rows, list) or [len(row) for row in rows if isinstance(row, list)] != [4, 4, 4]:
         return False
-    return len(rows) == 3 and all(_is_number(value) for row in rows for value in row)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < FARTHEST
+    return len(rows) == 3 and all(is_coordinate(value) for row in rows for value in row)
 
 
 def read_camera_path(path: Path) -> Sequence[Camera]:
     """Cameras of a camera path saved by nerfstudio's viewer. Raises UserError for other files."""
     try:
-        content = json.loads(path.read_text())
+        content = read_json(path)
         width, height = int(content["render_width"]), int(content["render_height"])
         _expect(content["camera_path"] != [], "it has no camera")
         return [_path_camera(frame, width, height) for frame in content["camera_path"]]
@@ -218,8 +217,7 @@ def read_camera_path(path: Path) -> Sequence[Camera]:
 
 def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
     pose = torch.tensor(frame["camera_to_world"], dtype=torch.float32).reshape(4, 4)
-    turned = pose[:3, :3].det()
-    _expect(bool(pose.isfinite().all()) and 0.5 < float(turned) < 2, "a camera has no pose")
+    check_pose(pose.tolist())
     _expect(0 < frame["fov"] < 180, f"a camera has a field of view of {frame['fov']} degrees")
     focal = height / 2 / math.tan(math.radians(frame["fov"]) / 2)
     lens = Lens(width, height, focal, focal, width / 2, height / 2)

@@ -69,7 +69,9 @@ class Scene:
         looks: lighting of the photos; None where all share one.
         background: color behind the scene, 0…1; None for black.
         config: defaults of queries.
-        encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text.
+        encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text that
+            is not among `vectors`.
+        vectors: unit vectors of common words, which need no CLIP.
         cache: file to keep which Gaussians the photos show; None: they are measured in every process.
         backend: the rasterizer, see `rasterize`.
         watch: called with a short description of slow work; None: a progress bar.
@@ -86,6 +88,7 @@ class Scene:
         background: Float[Tensor, "3"] | None = None,
         config: QueryConfig | None = None,
         encode_texts: EncodeTexts | None = None,
+        vectors: Mapping[str, Float[Tensor, " c"]] | None = None,
         cache: Path | None = None,
         backend: Backend = "auto",
         watch: Callable[[str], None] | None = None,
@@ -93,7 +96,8 @@ class Scene:
         self.splats, self.file, self.decoder, self.codes = splats, file, decoder, codes
         self.looks, self.background, self.backend = looks, background, backend
         self.config = config or QueryConfig()
-        self._encode_texts, self._cache, self._watch = encode_texts, cache, watch
+        self._encode_texts, self._vectors = encode_texts, vectors
+        self._cache, self._watch = cache, watch
         self._doubt_alone: dict[str, float] = {}
         """Doubt about texts without their synonyms."""
 
@@ -321,7 +325,8 @@ class Scene:
 
     def best_views(self, question: Question) -> list[str]:
         """For each prompt the name of the training photo whose view shows it best, or comes closest."""
-        return [(found.views or found.closest)[0].name for found in self.places(question, most=1)]
+        rows = range(len(question.prompts))
+        return [self._ranked(question, row)[0].name for row in rows]
 
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
@@ -481,15 +486,22 @@ class Scene:
             raise UserError(f"{text!r} are {len(question.prompts)} prompts: ask for one at a time")
         return question
 
-    def _found(self, question: Question, row: int, most: int) -> Found:
-        scores, threshold = question.relevancy[row], question.thresholds[row]
-        means = self.splats.means
-        ranks = rank_views(self.visible, means, scores, threshold)
-        closest = [
+    def _ranked(self, question: Question, row: int) -> list[Viewpoint]:
+        """All training views, those that show a prompt first; best first."""
+        ranks = rank_views(self.visible, self.splats.means, question.relevancy[row], question.thresholds[row])
+        views = [
             Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
             for name, found in ranks.items()
         ]
-        closest.sort(key=lambda v: v.rank, reverse=True)
+
+        def order(view: Viewpoint) -> tuple[bool, float]:
+            return view.area * self.visible[view.name].size >= _LEAST_PIXELS, view.rank
+
+        return sorted(views, key=order, reverse=True)
+
+    def _found(self, question: Question, row: int, most: int) -> Found:
+        scores, threshold = question.relevancy[row], question.thresholds[row]
+        means, closest = self.splats.means, self._ranked(question, row)
         views = [v for v in closest if v.area * self.visible[v.name].size >= _LEAST_PIXELS]
         box = strongest_match(means, scores, self._mass, threshold, self._gap) if views else None
         return Found(
@@ -513,13 +525,19 @@ class Scene:
     @cached_property
     def engine(self) -> QueryEngine:
         """The query engine; decodes the features of all Gaussians at first use."""
-        return make_engine(*self._semantics(), self.config.temperature)
+        engine = make_engine(*self._semantics(), self.config.temperature)
+        return engine.calibrated(self.text.yardstick.to(self.device))
 
     @cached_property
     def text(self) -> TextEncoder:
-        """The encoder of prompts; loads the scene's CLIP at first use."""
+        """The encoder of prompts; loads the scene's CLIP at the first text that it doesn't know."""
         self._semantics()
-        return TextEncoder(self._encode_texts or text_encoder(self.file, self.device), self.config.text)
+        return TextEncoder(self._encode, self.config.text, self._vectors)
+
+    def _encode(self, texts: list[str]) -> Float[Tensor, "n c"]:
+        if self._encode_texts is None:
+            self._encode_texts = text_encoder(self.file, self.device)
+        return self._encode_texts(texts)
 
     @cached_property
     def doubts(self) -> Doubts:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from math import prod
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -36,6 +37,7 @@ from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
 from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
 
@@ -104,6 +106,10 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         field = scene.looks.field
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
+        if scene.file.clip is not None:
+            words = common_words()
+            described["words"] = list(words)
+            content["words"] = _array(scene.text.vectors(words), np.float16)
     masks = {i: _mask_of(photo) for i, photo in enumerate(scene.photos) if photo.mask is not None}
     content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
     file = replace(scene.file, photos=[replace(photo, mask=None) for photo in scene.photos])
@@ -194,8 +200,8 @@ def read_scene(
 
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
-    """What a scene file says of itself: `provenance`, `scene`, `gaussians`, `photos`, `clip`, `decoder`, `looks`
-    and `bytes`.
+    """What a scene file says of itself: `provenance`, `scene`, `gaussians`, `photos`, `clip`, `decoder`,
+    `looks` and `bytes`.
 
     Raises UserError as `read_scene` does; no tensor is read.
     """
@@ -248,6 +254,7 @@ class _Description:
     background: list[float] | None
     decoder: dict[str, Any] | None
     looks: dict[str, Any] | None
+    words: list[str] | None
 
 
 def _read(
@@ -262,6 +269,7 @@ def _read(
             codes = _codes(file, sizes, decoder.bounded, len(splats)).to(device)
         if about.looks is not None:
             looks = Looks(_looks(file, sizes, about.looks).to(device))
+        vectors = None if about.words is None else _vectors(file, sizes, about.words)
         photos = [
             replace(photo, mask=_checked_mask(file.get_tensor(f"mask.{i}")) if f"mask.{i}" in sizes else None)
             for i, photo in enumerate(about.scene.photos)
@@ -270,7 +278,7 @@ def _read(
     return Scene(
         splats, replace(about.scene, photos=photos), decoder, codes,
         looks=looks, background=background, config=config, encode_texts=encode_texts,
-        cache=path.with_name(f".{path.stem}.visible"),
+        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
     )  # fmt: skip
 
 
@@ -300,6 +308,7 @@ def _description(file: Any) -> _Description:
         background,
         content.get("decoder"),
         content.get("looks"),
+        content.get("words"),
     )
 
 
@@ -330,56 +339,62 @@ def _codes(file: Any, sizes: Mapping[str, list[int]], bounded: bool, count: int)
 
 
 def _decoder(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> SemanticEncoder:
-    settings = told["settings"] or {}
-    numbers = [told["clip_dim"], told["dense_dim"], *settings.values()]
-    bad = [
-        x
-        for x in numbers
-        if not isinstance(x, int | float | str) or (not isinstance(x, str) and not 0 <= x <= _MOST_SETTING)
-    ]
-    _expect(not bad, f"a decoder has the setting {bad[:1]}")
-    layers = {name: settings.get(name, 0) for name in ("levels", "hidden_layers", "log2_table_size")}
-    _expect(max(layers.values()) <= 32, "its decoder has too many layers")
+    settings, clip, dense = told["settings"] or {}, told["clip_dim"], told["dense_dim"]
+    for value in (clip, dense, *settings.values()):
+        _expect(isinstance(value, int | float | str), f"a decoder has the setting {value!r}")
+        _expect(isinstance(value, str) or 0 <= value <= _MOST_SETTING, f"a decoder has the setting {value}")
+    stored = sum(prod(size) for name, size in sizes.items() if name.startswith("decoder."))
+    _expect(
+        _parameters(settings, clip + dense) <= 4 * stored + 10_000_000, "its decoder is larger than the file"
+    )
+    decoder = make_encoder(
+        EncoderConfig(name=told["name"]),
+        SemanticFieldConfig(preset="short", **settings),
+        *(clip, dense, torch.zeros(3), 1.0),
+    )
+    return _loaded(file, sizes, "decoder", decoder)
 
-    def build() -> SemanticEncoder:
-        return make_encoder(
-            EncoderConfig(name=told["name"]),
-            SemanticFieldConfig(preset="short", **settings),
-            told["clip_dim"],
-            told["dense_dim"],
-            torch.zeros(3),
-            1.0,
-        )
 
-    return _loaded(file, sizes, "decoder", build)
+def _parameters(settings: Mapping[str, Any], channels: int) -> int:
+    """At most how many numbers a decoder with these settings and outputs has."""
+    if not settings:
+        return 1000 * channels + channels**2
+    depth, width = settings["hidden_layers"], settings["hidden_width"]
+    _expect(
+        max(settings["log2_table_size"], settings["levels"], depth) <= 64, "its decoder has too many layers"
+    )
+    table = settings["levels"] * 2 ** int(settings["log2_table_size"]) * settings["features_per_level"]
+    inputs = settings["levels"] * settings["features_per_level"] + channels + 100
+    return table + width * (inputs + depth * width + channels)
+
+
+def _vectors(file: Any, sizes: Mapping[str, list[int]], words: list[str]) -> dict[str, Float[Tensor, " c"]]:
+    _expect(isinstance(words, list) and all(isinstance(word, str) for word in words), "its words")
+    _expect(len(sizes["words"]) == 2 and sizes["words"][0] == len(words), "its words")
+    return dict(zip(words, F.normalize(_tensor(file, "words"), dim=1), strict=True))
 
 
 def _looks(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> AppearanceField:
-    names = told["names"]
+    names, config = told["names"], AppearanceConfig(**told["config"])
     _expect(isinstance(names, list) and all(isinstance(name, str) for name in names), "its looks' photos")
-    config = AppearanceConfig(**told["config"])
-    _expect(isinstance(config.vector_dim, int) and 0 < config.vector_dim <= _MOST_SETTING, "its looks")
-    state = {"_extra_state": names}
-    return _loaded(file, sizes, "looks", lambda: AppearanceField(config, names, torch.zeros(3), 1.0), state)
+    _expect(sizes["looks.vectors"] == [len(names), config.vector_dim], "its looks")
+    field = AppearanceField(config, names, torch.zeros(3), 1.0)
+    return _loaded(file, sizes, "looks", field, {"_extra_state": names})
 
 
 def _loaded(
     file: Any,
     sizes: Mapping[str, list[int]],
     name: str,
-    build: Callable[[], Module],
+    module: Module,
     state: Mapping[str, Any] | None = None,
 ) -> Module:
-    """A module with its tensors from the file.
-
-    It is first built on the device `meta`, where nothing is allocated, to compare its shapes with the file's.
-    """
-    with torch.device("meta"):
-        expected = {key: value for key, value in build().state_dict().items() if isinstance(value, Tensor)}
-    for key, value in expected.items():
-        _expect(sizes.get(f"{name}.{key}") == list(value.shape), f"{name}.{key} has the wrong shape")
-    module = build()
-    tensors = {key: torch.from_numpy(file.get_tensor(f"{name}.{key}")) for key in expected}
+    """A module with its tensors from the file, whose shapes must be those that it expects."""
+    tensors = {}
+    for key, value in module.state_dict().items():
+        if isinstance(value, Tensor):
+            _expect(sizes.get(f"{name}.{key}") == list(value.shape), f"{name}.{key} has the wrong shape")
+            tensors[key] = torch.from_numpy(file.get_tensor(f"{name}.{key}"))
     module.load_state_dict({**tensors, **(state or {})})
     return module.eval().requires_grad_(False)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -14,9 +14,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
-from lang3dxl_ns.query.chat_synonyms import ChatSettings, ChatSynonyms
+from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 
@@ -25,6 +26,7 @@ EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 
 _QUOTED = r'"[^"]*"'
 _NEGATIVES = re.compile(rf"\s*\bnot\s+({_QUOTED}(?:\s*,\s*{_QUOTED})*)", re.IGNORECASE)
+_SINGLE_QUOTES = re.compile(r"‘([^‘’]*)’")
 _CURLY_QUOTES = str.maketrans("“”„«»", '"""""')
 
 
@@ -46,7 +48,10 @@ def parse_prompts(typed: str) -> list[Prompt]:
     word; a `;` in quotes doesn't separate. Raises UserError if there is no prompt.
     """
     # An unpaired UTF-16 surrogate, as from a broken paste, is invalid text: tokenizers reject it.
+    if not isinstance(typed, str):
+        raise TypeError(f"a prompt is a text, not {type(typed).__name__}: {typed!r:.40}")
     clean = typed.encode("utf-8", "ignore").decode().translate(_CURLY_QUOTES)
+    clean = _SINGLE_QUOTES.sub(r'"\1"', clean)
     parts = re.findall(rf"(?:{_QUOTED}|[^;])+", clean)
     prompts = [_parse_prompt(part) for part in parts if part.strip(' "\t\r\n\0')]
     if not prompts:
@@ -57,6 +62,11 @@ def parse_prompts(typed: str) -> list[Prompt]:
 def _parse_prompt(part: str) -> Prompt:
     negatives = [_tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
     text = _tidy(_NEGATIVES.sub(" ", part))
+    if found := re.fullmatch(r"(.+) not (.+)", text, re.IGNORECASE):
+        say(
+            f"{text} is searched for as it stands. To tell one thing from another: "
+            f'"{found[1]}" not "{found[2]}"'
+        )
     if not text:
         raise UserError(f"{part.strip()!r} has only negatives: put what to find first")
     return Prompt(text, tuple(negative for negative in negatives if negative))
@@ -73,14 +83,11 @@ def _tidy(text: str) -> str:
 class TextConfig:
     """How prompts become vectors."""
 
-    synonyms: Literal["off", "table", "chat"] = "table"
-    """Source of common words for specialist ones: off; the shipped table of architectural terms; or a chat
-    model behind an OpenAI-compatible endpoint, set by the environment
-    (LANG3DXL_CHAT_URL, LANG3DXL_CHAT_KEY, LANG3DXL_CHAT_MODEL), with the table as fallback."""
-    combine: Literal["fallback", "joined", "mean", "max"] = "fallback"
+    synonyms: Literal["off", "table"] = "table"
+    """Source of common words for specialist ones: off, or the shipped table of architectural terms."""
+    combine: Literal["fallback", "joined"] = "fallback"
     """How a prompt and its synonyms are combined: the prompt alone unless the scene doubts it, then the best
-    of all at each place (fallback); as one string with commas (joined, the paper's way); as the mean of their
-    vectors; or always the best at each place (max)."""
+    of all at each place (fallback); or as one string with commas (joined, the paper's way)."""
     negatives: tuple[str, ...] = NEGATIVES
     """A prompt matches where it fits better than all of these: phrases that fit anything, and other contents
     of building photos. Phrases named by a prompt or its synonyms don't compete with it."""
@@ -121,27 +128,28 @@ class TextEncoder:
 
     Args:
         encode: the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
+        known: unit vectors of texts that need not be encoded.
     """
 
-    def __init__(self, encode: EncodeTexts, config: TextConfig | None = None) -> None:
+    def __init__(
+        self,
+        encode: EncodeTexts,
+        config: TextConfig | None = None,
+        known: Mapping[str, Float[Tensor, " c"]] | None = None,
+    ) -> None:
         self.config = config or TextConfig()
         self._encode = encode
-        self._vectors: dict[str, Float[Tensor, " c"]] = {}
+        self._vectors = dict(known or {})
         self._synonyms: dict[str, list[str]] = {}
         self._table = SynonymTable()
         self._lock = threading.Lock()
-
-    @cached_property
-    def _chat(self) -> ChatSynonyms:
-        return ChatSynonyms(ChatSettings.from_environment(), fallback=self._table)
 
     def synonyms(self, text: str) -> list[str]:
         """Common words for a prompt, most common first; none if it is common itself."""
         if self.config.synonyms == "off":
             return []
         if text not in self._synonyms:
-            found = self._table(text) if self.config.synonyms == "table" else self._chat(text)
-            self._synonyms[text] = [word for word in found if word.lower() != text.lower()]
+            self._synonyms[text] = [word for word in self._table(text) if word.lower() != text.lower()]
         return self._synonyms[text]
 
     def queries(self, prompts: Sequence[Prompt], known: Collection[str] = ()) -> Queries:
@@ -164,6 +172,12 @@ class TextEncoder:
             against=[self._against(text) for text in texts],
         )
 
+    @cached_property
+    def yardstick(self) -> Queries:
+        """The words by which an encoder's cosines are measured, whatever the settings are."""
+        words = self.vectors((*NEGATIVES, *UNRELATED))
+        return Queries(words, (), ())
+
     def _against(self, text: str) -> list[int]:
         return competitors(self.config.negatives, [text, *self.synonyms(text)])
 
@@ -171,10 +185,7 @@ class TextEncoder:
         if prompt.vector is not None:
             return prompt.vector.to(self.vectors(self.config.negatives))[None]
         words = [*synonyms, prompt.text]
-        if self.config.combine == "joined":
-            return self.vectors([", ".join(words)])
-        vectors = self.vectors(words)
-        return vectors.mean(0, keepdim=True) if self.config.combine == "mean" else vectors
+        return self.vectors([", ".join(words)] if self.config.combine == "joined" else words)
 
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:
         """Unit vectors of texts."""

@@ -24,14 +24,19 @@ class VisibleGaussians:
     camera: Camera
     rows: Int[Tensor, " m"]
     """Indices of the visible Gaussians."""
-    pixels: Float[Tensor, " m"]
-    """Share of the view that each fills, half precision."""
+    shares: Float[Tensor, " m"]
+    """Share of the view that each fills."""
 
     @classmethod
     def of(cls, camera: Camera, mass: Float[Tensor, " n"]) -> VisibleGaussians:
         """From the pixels that every Gaussian fills."""
         rows = (mass > _LEAST).nonzero().squeeze(1)
-        return cls(camera, rows.int(), mass[rows].half())
+        return cls(camera, rows.int(), (mass[rows] / (camera.width * camera.height)).float())
+
+    @property
+    def pixels(self) -> Float[Tensor, " m"]:
+        """Pixels that each fills."""
+        return self.shares * self.size
 
     @property
     def size(self) -> int:
@@ -49,7 +54,7 @@ def save_visible(path: Path, views: Mapping[str, VisibleGaussians], key: str) ->
     """Write the views, concatenated into one tensor per field."""
     parts = {
         "rows": torch.cat([view.rows for view in views.values()]),
-        "pixels": torch.cat([view.pixels for view in views.values()]),
+        "shares": torch.cat([view.shares for view in views.values()]),
     }
     save_tensors(path, parts, key, [len(view.rows) for view in views.values()])
 
@@ -59,9 +64,9 @@ def load_visible(
 ) -> dict[str, VisibleGaussians] | None:
     """The views cached under this key, which covers names and cameras."""
     found = load_tensors(path, key)
-    if found is None:
+    if found is None or "shares" not in found[0]:  # an earlier version's
         return None
     tensors, sizes = found
-    rows, pixels = (tensors[name].to(device).split(sizes) for name in ("rows", "pixels"))  # type: ignore[arg-type]
-    named = zip(cameras.items(), rows, pixels, strict=True)
+    rows, shares = (tensors[name].to(device).split(sizes) for name in ("rows", "shares"))  # type: ignore[arg-type]
+    named = zip(cameras.items(), rows, shares, strict=True)
     return {name: VisibleGaussians(camera, r, p) for (name, camera), r, p in named}

@@ -11,6 +11,9 @@ from typing import Any
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
+from lang3dxl_ns.query.doubt import UNRELATED
+from lang3dxl_ns.query.negatives import NEGATIVES
+from lang3dxl_ns.query.relevancy import CANONICAL
 
 _COMMON = (
     "wall", "window", "door", "roof", "tower", "dome", "sky", "tree", "grass", "street", "people", "car",
@@ -23,10 +26,24 @@ _WHOLE = re.compile(r"(?P<end>[a-z]{3,})</w>|[▁Ġ](?P<start>[a-z]{3,})")
 
 @lru_cache(maxsize=1)
 def shipped_vocabulary() -> tuple[str, ...]:
-    """Single words and terms of architecture and its surroundings, without repetition, as typed."""
+    """Words and terms of architecture and its surroundings, in the singular, without repetition."""
     terms: dict[str, list[str]] = load_preset("synonyms/architecture")
     listed = [*_COMMON, *terms, *(word for words in terms.values() for word in words)]
     return tuple(dict.fromkeys(listed))
+
+
+def common_words() -> tuple[str, ...]:
+    """What a scene file knows without its CLIP: the shipped vocabulary, its single words in the plural too,
+    and the phrases that every query needs."""
+    words = shipped_vocabulary()
+    plurals = [_plural(word) for word in words if " " not in word]
+    return tuple(dict.fromkeys([*NEGATIVES, *CANONICAL, *UNRELATED, *words, *plurals]))
+
+
+def _plural(word: str) -> str:
+    if word.endswith(("s", "x", "ch", "sh")):
+        return f"{word}es"
+    return f"{word[:-1]}ies" if word.endswith("y") and word[-2] not in "aeiou" else f"{word}s"
 
 
 def whole_words(clip: str | Path) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Compositing on the CPU in fused kernels: like `compositing.composite`, but several times as fast."""
+"""Compositing on the CPU in fused kernels: as `torch_rasterizer`, but many times as fast."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
-from lang3dxl_ns.rendering.fused_plan import make_plan
+from lang3dxl_ns.rendering.fused_plan import LOG2_E, make_plan
 from lang3dxl_ns.rendering.fused_tiles import CHANNELS_FROM, PIXELS, WAVE, backward_tiles, composite_tiles
-from lang3dxl_ns.rendering.tile_plan import LOG2_E
 
 PARTS_PER_THREAD = 8
 """Tiles may stop early, by an unknown amount: small parts spread the rest over the threads."""
@@ -40,7 +39,7 @@ _kept = _Kept()
 
 
 class FusedCompositing(torch.autograd.Function):
-    """What `compositing.composite` computes, in compiled kernels."""
+    """What `torch_rasterizer.Compositing` computes, in compiled kernels; no gradient for the variances."""
 
     @staticmethod
     def forward(  # type: ignore[override]

@@ -11,8 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
-from lang3dxl_ns.rendering.tile_plan import LOG2_E, depth_order
+from lang3dxl_ns.rendering.ellipses import REACH_SLACK
 
+LOG2_E = math.log2(math.e)
 TILE = 16
 """Tiles of 16 × 16 pixels."""
 SPLAT_COLUMNS = 6
@@ -20,8 +21,6 @@ SPLAT_COLUMNS = 6
 log2 opacity − steepness·(dx + shear·dy)² − rise·dy², which stays accurate far from the center of a needle."""
 UNROLL = 4
 """Channels are composited four at a time, so their number is rounded up to a multiple of four."""
-# Pixel ranges are widened by this much, so that rounding never drops a visible pair.
-_SLACK = 1e-3
 
 
 @dataclass
@@ -83,6 +82,12 @@ def make_plan(
     return Plan(order, splats, table, attached, starts, ranks)
 
 
+def depth_order(depths: Float[Tensor, " v"]) -> Int[Tensor, " v"]:
+    """Indices front to back. Positive floats sort like their bits, and integers have a radix sort."""
+    keys = depths.view(torch.int32) if depths.dtype == torch.float32 else depths
+    return torch.sort(keys, stable=True).indices
+
+
 def _rounded_up(count: int) -> int:
     return -(-count // UNROLL) * UNROLL
 
@@ -96,8 +101,8 @@ def _find_visible(means2d, variances, opacities, width, height, boxes, visible):
         if not opacity * 255.0 >= 1.0:
             continue
         bound = 2 * math.log(255.0 * opacity)
-        reach_x = math.sqrt(bound * variances[g, 0]) + _SLACK
-        reach_y = math.sqrt(bound * variances[g, 1]) + _SLACK
+        reach_x = math.sqrt(bound * variances[g, 0]) + REACH_SLACK
+        reach_y = math.sqrt(bound * variances[g, 1]) + REACH_SLACK
         x, y = means2d[g, 0] - 0.5, means2d[g, 1] - 0.5
         left, right = max(x - reach_x, 0.0), min(x + reach_x, width - 1.0)
         top, bottom = max(y - reach_y, 0.0), min(y + reach_y, height - 1.0)

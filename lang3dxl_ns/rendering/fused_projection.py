@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
+from lang3dxl_ns.rendering.ellipses import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Ellipses
 from lang3dxl_ns.rendering.gaussians import Gaussians
-from lang3dxl_ns.rendering.projection import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Splats
 from lang3dxl_ns.rendering.simd import (
     LANES,
     ceil,
@@ -34,8 +33,30 @@ _LENGTH_MIN = 1e-12
 """A quaternion shorter than this is divided by this, as by `torch.nn.functional.normalize`."""
 
 
-def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool) -> Splats:
-    """See `projection.project`; no gradient for the intrinsics."""
+class Lens(NamedTuple):
+    """The camera without its pose, and the settings of a projection; numbers of the Gaussians' type."""
+
+    focal_x: float
+    focal_y: float
+    center_x: float
+    center_y: float
+    low_x: float
+    """Slopes x / z and y / z are held between these for the Jacobian."""
+    low_y: float
+    high_x: float
+    high_y: float
+    width: float
+    height: float
+    near: float
+    eps2d: float
+    antialiased: float
+    """1 or 0."""
+
+
+def project(
+    gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool
+) -> Ellipses:
+    """See `projection.project`; no gradient for the intrinsics, and none from the variances."""
     count = len(gaussians.means)
     parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
     if count < LANES:  # a vector's worth at least; the rest is out of sight
@@ -48,20 +69,22 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, 
     lens = torch.cat([focal, center, -center / focal - margin, (size - center) / focal + margin, size])
     limits = lens.new_tensor([near, eps2d, float(antialiased)])
     view = camera.view_matrix.to(gaussians.means)
-    found = _Projection.apply(*parts, view, torch.cat([lens, limits]).detach())
+    found = _Projection.apply(*parts, view, Lens(*torch.cat([lens, limits]).detach().numpy()))
     means2d, conics, variances, depths, opacities, radii = (part[:count] for part in found)
-    return Splats(means2d[None], conics, variances, depths, opacities, radii[None])
+    return Ellipses(means2d[None], conics, variances, depths, opacities, radii[None])
 
 
 class _Projection(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *values: Tensor) -> Any:  # type: ignore[override]
-        inputs = tuple(value.contiguous() for value in values)
+    def forward(ctx: Any, *values: Any) -> Any:  # type: ignore[override]
+        inputs = tuple(value.contiguous() for value in values[:-1])
         means, count = inputs[0], len(inputs[0])
         found = tuple(means.new_empty(count, *columns) for columns in ((2,), (3,), (2,), (), ()))
         found += (torch.empty(count, dtype=torch.int32),)
         arrays = [part.numpy() for part in (*inputs, *found)]
-        in_threads(_project, [(*part, *arrays) for part in _vectors(count)])
+        arguments = (*arrays[: len(inputs)], values[-1], *arrays[len(inputs) :])
+        in_threads(_project, [(*part, *arguments) for part in _vectors(count)])
+        ctx.lens = values[-1]
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(found[2], found[5])
         ctx.set_materialize_grads(False)
@@ -78,9 +101,10 @@ class _Projection(torch.autograd.Function):
         ]
         found = [torch.empty_like(part) for part in inputs[:4]]
         arrays = [part.numpy() for part in (*inputs, *upstream, *found)]
+        arguments = (*arrays[: len(inputs)], ctx.lens, *arrays[len(inputs) :])
         parts = _vectors(count)
         views = np.zeros((len(parts), 4, 4), arrays[0].dtype)
-        in_threads(_backward, [(*part, *arrays, views[k]) for k, part in enumerate(parts)])
+        in_threads(_backward, [(*part, *arguments, views[k]) for k, part in enumerate(parts)])
         return *found, torch.from_numpy(views.sum(0)), None
 
 
@@ -155,8 +179,8 @@ def _points(means, scales, view, lens, g):
     right, down, forward = _camera_axes(view)
     mean, scale = _load3(means, g), _load3(scales, g)
     z = _dot(mean, forward) + view[2, 3]
-    sigma = maximum(maximum(scale[0], scale[1]), scale[2]) * max(lens[0], lens[1])
-    drawable = (z > lens[10]) & (sigma < z * MAX_SIGMA_PIXELS)
+    sigma = maximum(maximum(scale[0], scale[1]), scale[2]) * max(lens.focal_x, lens.focal_y)
+    drawable = (z > lens.near) & (sigma < z * MAX_SIGMA_PIXELS)
     x = where(drawable, _dot(mean, right) + view[0, 3], 0.0)
     y = where(drawable, _dot(mean, down) + view[1, 3], 0.0)
     scale = where(drawable, scale[0], 0.0), where(drawable, scale[1], 0.0), where(drawable, scale[2], 0.0)
@@ -195,15 +219,19 @@ def _project(
     radii,
 ):  # fmt: skip
     right, down, forward = _camera_axes(view)
-    width, height, eps2d, antialiased = lens[8], lens[9], lens[11], lens[12] > 0
+    width, height, eps2d, antialiased = lens.width, lens.height, lens.eps2d, lens.antialiased > 0
     reach = np.empty(LANES, means.dtype)
     for start in range(first, last, LANES):
         g = min(start, len(means) - LANES)  # the last vector repeats some of the one before it
         _, scale, drawable, x, y, z = _points(means, scales, view, lens, g)
         slope_x, slope_y = x / z, y / z
-        u, v = slope_x * lens[0] + lens[2], slope_y * lens[1] + lens[3]
-        row_x = _jacobian_row(right, forward, minimum(maximum(slope_x, lens[4]), lens[6]), lens[0], z)
-        row_y = _jacobian_row(down, forward, minimum(maximum(slope_y, lens[5]), lens[7]), lens[1], z)
+        u, v = slope_x * lens.focal_x + lens.center_x, slope_y * lens.focal_y + lens.center_y
+        row_x = _jacobian_row(
+            right, forward, minimum(maximum(slope_x, lens.low_x), lens.high_x), lens.focal_x, z
+        )
+        row_y = _jacobian_row(
+            down, forward, minimum(maximum(slope_y, lens.low_y), lens.high_y), lens.focal_y, z
+        )
         w, i, j, k, _ = _unit(quats, g)
         _, _, _, _, _, area2, xx, yy, xy, determinant = _ellipse(
             row_x, row_y, _columns(w, i, j, k), scale, eps2d
@@ -237,7 +265,7 @@ def _backward(
 ):  # fmt: skip
     """The chain rule through `_project`, from its outputs back."""
     right, down, forward = _camera_axes(view)
-    eps2d, antialiased = lens[11], lens[12] > 0
+    eps2d, antialiased = lens.eps2d, lens.antialiased > 0
     lanes = np.empty(LANES, means.dtype)
     for lane in range(LANES):
         lanes[lane] = lane
@@ -249,10 +277,10 @@ def _backward(
         g = min(start, len(means) - LANES)
         mean, scale, drawable, x, y, z = _points(means, scales, view, lens, g)
         slope_x, slope_y = x / z, y / z
-        held_x = minimum(maximum(slope_x, lens[4]), lens[6])
-        held_y = minimum(maximum(slope_y, lens[5]), lens[7])
-        row_x = _jacobian_row(right, forward, held_x, lens[0], z)
-        row_y = _jacobian_row(down, forward, held_y, lens[1], z)
+        held_x = minimum(maximum(slope_x, lens.low_x), lens.high_x)
+        held_y = minimum(maximum(slope_y, lens.low_y), lens.high_y)
+        row_x = _jacobian_row(right, forward, held_x, lens.focal_x, z)
+        row_y = _jacobian_row(down, forward, held_y, lens.focal_y, z)
         w, i, j, k, length = _unit(quats, g)
         columns = _columns(w, i, j, k)
         plain_x, plain_y, axes_x, axes_y, normal, area2, xx, yy, xy, exact = _ellipse(
@@ -304,12 +332,12 @@ def _backward(
         )
 
         # To the camera's axes and the point in its frame.
-        g_right, g_down = _scaled(g_row_x, lens[0] / z), _scaled(g_row_y, lens[1] / z)
+        g_right, g_down = _scaled(g_row_x, lens.focal_x / z), _scaled(g_row_y, lens.focal_y / z)
         g_forward = _scaled(_plus(_scaled(g_right, held_x), _scaled(g_down, held_y)), -1.0)
-        free_x = where((slope_x >= lens[4]) & (slope_x <= lens[6]), _dot(g_right, forward), 0.0)
-        free_y = where((slope_y >= lens[5]) & (slope_y <= lens[7]), _dot(g_down, forward), 0.0)
-        g_slope_x = load_column(g_means2d, g, 0) * lens[0] - free_x
-        g_slope_y = load_column(g_means2d, g, 1) * lens[1] - free_y
+        free_x = where((slope_x >= lens.low_x) & (slope_x <= lens.high_x), _dot(g_right, forward), 0.0)
+        free_y = where((slope_y >= lens.low_y) & (slope_y <= lens.high_y), _dot(g_down, forward), 0.0)
+        g_slope_x = load_column(g_means2d, g, 0) * lens.focal_x - free_x
+        g_slope_y = load_column(g_means2d, g, 1) * lens.focal_y - free_y
         turned = _dot(g_row_x, row_x) + _dot(g_row_y, row_y) + g_slope_x * slope_x + g_slope_y * slope_y
         new = drawable & (numbers >= (start - g) * 1.0)
         g_x, g_y = where(drawable, g_slope_x / z, 0.0), where(drawable, g_slope_y / z, 0.0)

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 
 from lang3dxl_ns.common.jit import kernel
+from lang3dxl_ns.rendering.ellipses import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from lang3dxl_ns.rendering.fused_plan import SPLAT_COLUMNS, TILE, UNROLL
 from lang3dxl_ns.rendering.simd import (
     LANES,
@@ -28,12 +29,13 @@ from lang3dxl_ns.rendering.simd import (
     total,
     where,
 )
-from lang3dxl_ns.rendering.tile_backward import ABSOLUTE_COLUMNS, SHAPE_COLUMNS
-from lang3dxl_ns.rendering.tile_forward import ALPHA_MAX, TRANSMITTANCE_MIN
-from lang3dxl_ns.rendering.tile_plan import ALPHA_MIN
 
 WAVE = 32
 PIXELS = TILE * TILE
+SHAPE_COLUMNS = 6
+"""Gradients per row: conic xx, xy, yy; first moments x, y; ln opacity."""
+ABSOLUTE_COLUMNS = 2
+"""Sums of the absolute pixel gradients of the screen position, x and y."""
 CHANNELS_FROM = SHAPE_COLUMNS + ABSOLUTE_COLUMNS
 """First column of the channels' gradients, after those of the shape and the absolute ones."""
 _BLOCKS = PIXELS // LANES

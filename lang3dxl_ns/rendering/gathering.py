@@ -2,23 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
+
+from lang3dxl_ns.common.image import resize
 
 Composite = Callable[[nn.Parameter], Float[Tensor, "h w c"]]
 """Composites values of Gaussians, [n, c], in one view."""
 
 
-MEMORY = 1e9
+MEMORY = 5e8
 """Bytes for the channels gathered at a time: of the Gaussians and of the pixels, values and gradients."""
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """A view's values at every pixel, and a last channel of 1 on the foreground; all are 0 elsewhere.
+
+    They are computed a few channels at a time: all channels of a large photo would take gigabytes.
+    """
+
+    maps: Sequence[Float[Tensor, "hd wd c"]]
+    """Maps of any size, which are stretched over the view and follow each other."""
+    foreground: Float[Tensor, "h w"]
+    """1 on the foreground, 0 elsewhere."""
+
+    @classmethod
+    def of(
+        cls, maps: Sequence[Float[Tensor, "hd wd c"]], size: tuple[int, int], mask: Tensor | None = None
+    ) -> Pixels:
+        """A view of this size, rows and columns, whose foreground is the mask [H, W] (None: everything),
+        without the pixels where a map isn't finite."""
+        foreground = maps[0].new_ones(size)
+        if mask is not None:
+            foreground *= resize(mask[..., None].to(foreground), size)[..., 0] >= 0.5
+        finite = [each.isfinite().all(-1, keepdim=True) for each in maps]
+        for each in finite:
+            foreground *= resize(each.to(foreground), size)[..., 0] > 1 - 1e-4
+        return cls([torch.where(*pair, 0.0) for pair in zip(finite, maps, strict=True)], foreground)
+
+    def channels(self, start: int, stop: int) -> Float[Tensor, "h w part"]:
+        """A range of the channels."""
+        size, found, first = self.foreground.shape, [], 0
+        for each in (*self.maps, self.foreground[..., None]):
+            part = each[..., max(start - first, 0) : max(stop - first, 0)]
+            if part.shape[-1]:
+                found.append(resize(part, (size[0], size[1])))
+            first += each.shape[-1]
+        return torch.cat(found, dim=-1).mul_(self.foreground[..., None])
 
 
 def gather(
     count: int,
-    views: Iterable[tuple[Composite, Float[Tensor, "h w c+1"]]],
+    views: Iterable[tuple[Composite, Pixels]],
     width: int,
     like: Tensor,
     memory: float | None = None,
@@ -31,8 +71,7 @@ def gather(
 
     Args:
         count: number of Gaussians, n.
-        views: for each, a function that composites values of the Gaussians, and the pixels' values F, whose
-            last channel is 1 on the foreground; all channels are 0 elsewhere.
+        views: for each, a function that composites values of the Gaussians, and the pixels' values F.
         width: channels of F without the last one.
         like: gives number type and device.
         memory: bytes to work in (default `MEMORY`), beside the result, which is on the CPU if it is larger.
@@ -41,17 +80,36 @@ def gather(
     place = like.device if 4 * count * (width + 1) <= memory else torch.device("cpu")
     sums = torch.zeros(count, width + 1, dtype=like.dtype, device=place)
     for composite, pixels in views:
-        numbers = 2 * (count + pixels[..., 0].numel())  # per channel
+        numbers = 2 * (count + pixels.foreground.numel())  # per channel
         channels = max(int(memory / 4 / numbers), 1)
         for start in range(0, width + 1, channels):
-            part = pixels[..., start : start + channels].to(like)
+            part = pixels.channels(start, start + channels).to(like)
             with torch.enable_grad():
                 probe = nn.Parameter(like.new_zeros(count, part.shape[-1]))
                 (gradient,) = torch.autograd.grad(composite(probe), probe, part)
             sums[:, start : start + channels] += gradient.to(place)
-    features, mass = sums[:, :-1], sums[:, -1]
-    seen = mass > 0
-    return torch.where(seen[:, None], features / torch.where(seen, mass, 1.0)[:, None], 0.0), mass
+    features, mass = sums[:, :-1], sums[:, -1].clone()
+    features /= torch.where(mass > 0, mass, torch.inf)[:, None]
+    return features, mass
+
+
+def lift_masks(
+    count: int, views: Iterable[tuple[Composite, Bool[Tensor, "h w"]]], like: Tensor
+) -> Float[Tensor, " n"]:
+    """Votes of masks in photos about Gaussians: the share of each Gaussian's visible pixels that lie in the
+    masks, 0…1; 0 for Gaussians never visible. Above 0.5 the majority says that it belongs to what was
+    segmented.
+
+    Args:
+        count: number of Gaussians, n.
+        views: for each, a function that composites values of the Gaussians, and the mask.
+        like: gives number type and device.
+    """
+    pixels = (
+        (composite, Pixels([mask.to(like)[..., None]], torch.ones_like(mask).to(like)))
+        for composite, mask in views
+    )
+    return gather(count, pixels, 1, like)[0][:, 0]
 
 
 def filled_pixels(composite: Composite, weight: Float[Tensor, "h w"], count: int) -> Float[Tensor, " n"]:

@@ -173,11 +173,12 @@ def search_path() -> str:
 
 def device_arch() -> str:
     """Compute capabilities of the visible GPUs, as nvcc and torch know them: "8.6", "7.5;8.6". One that
-    torch is too old for gets the newest it knows, compiled by the driver (+PTX)."""
+    torch is too old for gets the newest it knows, compiled by the driver (+PTX). TORCH_CUDA_ARCH_LIST counts
+    only where there is no GPU: container images set it to five architectures, five times the work."""
     import torch
 
-    if os.environ.get("TORCH_CUDA_ARCH_LIST"):
-        return os.environ["TORCH_CUDA_ARCH_LIST"]
+    if not torch.cuda.device_count():
+        return os.environ.get("TORCH_CUDA_ARCH_LIST", "")
     known = [re.fullmatch(r"sm_(\d+)(\d)\w*", name) for name in torch.cuda.get_arch_list()]
     newest = max(((int(m[1]), int(m[2])) for m in known if m), default=(99, 9))
     arches = set()
@@ -336,7 +337,7 @@ def _link_tree(toolkit: Toolkit, folder: Path) -> Path:
     libraries = toolkit.home / "lib"
     for library in libraries.glob("lib*.a"):
         (folder / "lib64" / library.name).symlink_to(library)
-    for library in libraries.glob("libcudart.so.*"):
+    for library in sorted(libraries.glob("libcudart.so.*"))[:1]:  # others are links to it, or its target
         (folder / "lib64" / "libcudart.so").symlink_to(library)
     return folder
 

@@ -2,42 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lang3dxl_ns.rendering.ellipses import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Ellipses
 from lang3dxl_ns.rendering.gaussians import Gaussians
 from lang3dxl_ns.scene.camera import Camera
 
-# The affine approximation is poor far outside the image, so it is evaluated at a position clamped to the
-# image plus this share of its half size on every side (gsplat 1.4's rule).
-FRUSTUM_MARGIN = 0.3
-# Larger ellipses overflow float32 in the determinant; only Gaussians that enclose the camera are so large.
-MAX_SIGMA_PIXELS = 1e8
 
-
-@dataclass
-class Splats:
-    """Screen ellipses, one for every Gaussian; radius and opacity are 0 for those not visible."""
-
-    means2d: Float[Tensor, "1 n 2"]
-    """Centers, pixels from the top-left corner. One tensor with gsplat's leading camera axis, because
-    densification reads the gradient from it."""
-    conics: Float[Tensor, "n 3"]
-    """Inverse covariances (xx, xy, yy), pixels⁻²."""
-    variances: Float[Tensor, "n 2"]
-    """Diagonal of the covariances (xx, yy), pixels², without gradient."""
-    depths: Float[Tensor, " n"]
-    """Distance along the camera's z axis, world units."""
-    opacities: Float[Tensor, " n"]
-    radii: Int[Tensor, "1 n"]
-    """Three standard deviations along the long axis, whole pixels; 0 if not visible."""
-
-
-def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool) -> Splats:
+def project(
+    gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool
+) -> Ellipses:
     """Project Gaussians to the screen (EWA splatting, Zwicker et al. 2001, with gsplat's conventions).
 
     `near`: world units. `eps2d`: variance added to both screen axes, pixels². `antialiased`: scale the
@@ -77,8 +54,7 @@ def project(gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, 
         opacities = opacities * area / determinant.sqrt()
     with torch.no_grad():
         radii = _radii(means2d[0], xx, yy, xy, camera) * drawable
-    variances = torch.stack([xx, yy], dim=1).detach()
-    return Splats(means2d, conics, variances, z, opacities, radii[None])
+    return Ellipses(means2d, conics, torch.stack([xx, yy], dim=1), z, opacities, radii[None])
 
 
 @torch.no_grad()

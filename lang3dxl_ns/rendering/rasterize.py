@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -13,11 +13,11 @@ from torch import Tensor
 import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
-from lang3dxl_ns.rendering.compositing import composite
+from lang3dxl_ns.rendering.ellipses import ALPHA_MIN, Ellipses
 from lang3dxl_ns.rendering.gaussians import Gaussians, Raster
 from lang3dxl_ns.rendering.gsplat_backend import rasterize_with_gsplat
-from lang3dxl_ns.rendering.projection import Splats, project
-from lang3dxl_ns.rendering.tile_plan import ALPHA_MIN
+from lang3dxl_ns.rendering.projection import project
+from lang3dxl_ns.rendering.torch_rasterizer import Compositing
 from lang3dxl_ns.scene.camera import Camera
 
 Backend = Literal["auto", "torch", "numba", "gsplat"]
@@ -118,14 +118,14 @@ def _without_broken(
     )
 
 
-def _kernels(backend: Backend) -> tuple[Callable[..., Splats], Callable[..., Any]]:
+def _kernels(backend: Backend) -> tuple[Callable[..., Ellipses], type[torch.autograd.Function]]:
     """Projection and compositing."""
     if backend == "numba":
         from lang3dxl_ns.rendering.fused_compositing import FusedCompositing
         from lang3dxl_ns.rendering.fused_projection import project as fused_project
 
-        return fused_project, functools.partial(composite, by=FusedCompositing)
-    return project, composite
+        return fused_project, FusedCompositing
+    return project, Compositing
 
 
 def _check_sizes(
@@ -158,17 +158,18 @@ def _rasterize(
     eps2d: float,
 ) -> Raster:
     """One pass for everything: depth and features are extra channels of the image."""
-    to_screen, to_pixels = _kernels(backend)
-    splats = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
+    to_screen, compositing = _kernels(backend)
+    ellipses = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
     attached = [channels]
     if features is not None and not detach_features:
         attached.append(features)
     if render_depth:
-        attached.append(splats.depths[:, None])
-    maps, detached_map, alpha = to_pixels(
-        splats.means2d, splats.conics, splats.variances, splats.depths, splats.opacities,
-        torch.cat(attached, dim=1) if len(attached) > 1 else channels, camera.width, camera.height,
-        detached_channels=features if detach_features else None, absgrad=absgrad,
+        attached.append(ellipses.depths[:, None])
+    maps, detached_map, alpha = compositing.apply(
+        ellipses.means2d, ellipses.conics, ellipses.opacities,
+        torch.cat(attached, dim=1) if len(attached) > 1 else channels,
+        features if features is not None and detach_features else channels[:, :0],
+        ellipses.variances, ellipses.depths, camera.width, camera.height, absgrad,
     )  # fmt: skip
     parts = list(maps.split([part.shape[1] for part in attached], dim=2))
     depth = parts.pop() / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None
@@ -180,8 +181,8 @@ def _rasterize(
         "width": camera.width,
         "height": camera.height,
         "n_cameras": 1,
-        "radii": splats.radii,
+        "radii": ellipses.radii,
         "gaussian_ids": None,
-        "means2d": splats.means2d,
+        "means2d": ellipses.means2d,
     }
     return Raster(image, feature_map, alpha, depth, info)

@@ -11,8 +11,10 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.common.checks import is_coordinate
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.memory import machine_memory
 
 MOST_PIXELS = 180_000_000
 """Most pixels of a picture: Pillow rejects larger ones as an attack."""
@@ -54,7 +56,7 @@ class Lens:
     def check(self) -> None:
         """Raises ValueError for a lens that cannot be rendered with."""
         values = (self.width, self.height, self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(type(x) in (int, float) and abs(x) < 1e30 for x in values):
+        if not all(map(is_coordinate, values)):
             raise ValueError("a lens has a value that is not a number")
         if type(self.width) is not int or type(self.height) is not int or min(self.width, self.height) < 1:
             raise ValueError(f"a picture has {self.width} × {self.height} pixels")
@@ -79,6 +81,18 @@ class Lens:
     def camera(self, view_matrix: Float[Tensor, "4 4"]) -> Camera:
         """This lens, undistorted, at a pose (world → camera, OpenCV axes)."""
         return Camera(view_matrix, self.matrix.float(), self.width, self.height)
+
+
+def check_pose(rows: object) -> None:
+    """The check of every pose that a file gives, whatever wrote it: [3, 4] or [4, 4] nested lists of finite
+    numbers, in which a rotation keeps volumes within a factor of eight. Raises ValueError otherwise."""
+    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+        raise ValueError("a pose is not three rows of four numbers")
+    if len(rows) not in (3, 4) or not all(is_coordinate(value) for row in rows for value in row):
+        raise ValueError("a pose is not three rows of four numbers")
+    turn = float(np.linalg.det(np.array([row[:3] for row in rows[:3]], dtype=np.float64)))
+    if not 1 / 8 < turn < 8:
+        raise ValueError("a pose is not a rotation and a position")
 
 
 @dataclass
@@ -162,17 +176,28 @@ def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "
     return seen
 
 
+_PER_PIXEL = 20
+"""Bytes per pixel of a rendering and its maps: 5.7 GB were measured at 20,000 × 15,000 pixels."""
+
+
 def resized(camera: Camera, longer_side: int) -> Camera:
     """The same view with fewer pixels, never more."""
     return with_longer_side(camera, min(longer_side, max(camera.width, camera.height)))
 
 
 def with_longer_side(camera: Camera, pixels: int) -> Camera:
-    """The same view at another resolution. Raises UserError for fewer than one pixel, or too many."""
+    """The same view at another resolution. Raises UserError for fewer than one pixel, or more than the memory
+    holds."""
     if not (isinstance(pixels, int) and 1 <= pixels <= LONGEST_SIDE):
         raise UserError(f"a picture of {pixels} pixels can't be rendered: give 1 to {LONGEST_SIDE}")
     factor = pixels / max(camera.width, camera.height)
     width, height = max(round(camera.width * factor), 1), max(round(camera.height * factor), 1)
+    needed, most = _PER_PIXEL * width * height, machine_memory() / 2
+    if needed > most:
+        raise UserError(
+            f"a picture of {width} × {height} pixels takes about {needed / 1e9:.1f} GB, over half of this "
+            f"machine's memory: give at most {int(pixels * (most / needed) ** 0.5)} pixels"
+        )
     zoom = camera.intrinsics.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
     return Camera(camera.view_matrix, camera.intrinsics * zoom, width, height)
 
@@ -195,4 +220,8 @@ def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:
     """A camera at a pose (camera → world, nerfstudio's axes) with the lens and size of `like`."""
     if pose.shape not in ((3, 4), (4, 4)):
         raise UserError(f"a pose has shape [3, 4] or [4, 4], not {list(pose.shape)}")
+    try:
+        check_pose(pose.double().tolist())
+    except ValueError as error:
+        raise UserError(f"{error}: give camera → world, such as the `pose` of a photo") from error
     return Camera(view_matrix(pose[:3].float()), like.intrinsics, like.width, like.height)

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
+from lang3dxl_ns.common.checks import FARTHEST
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError, is_plain
-from lang3dxl_ns.scene.camera import MOST_PIXELS, Lens
+from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap_check import check_binary_model
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE_MODELS = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
 """COLMAP camera models with OpenCV's distortion, and their parameters in OpenCV's order."""
-FARTHEST = 1e12
-"""Largest coordinate, world units; map coordinates are below 1e8."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +37,8 @@ class TrackedPhoto:
     """World units."""
     pixels: Float[Array, "n 2"]
     """Positions of the points in the (distorted) photo."""
+    quarter_turns: int = 0
+    """Clockwise, from the file's pixels as stored to this photo's."""
 
     @property
     def width(self) -> int:
@@ -131,6 +132,9 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
             "folder that holds them (usually sparse/0), or make one from photos: "
             "lang3dxl reconstruct --data PHOTOS"
         )
+    for path in (*folder.glob("*.bin"), *folder.glob("*.txt")):
+        if not path.is_file():
+            raise UserError(f"{path} is not a regular file: remove it, or copy the model again")
     check_binary_model(folder)
     try:
         return pycolmap.Reconstruction(folder)
@@ -141,25 +145,30 @@ def _read_model(folder: Path) -> pycolmap.Reconstruction:
 def _tracked_photo(
     image: pycolmap.Image, camera: pycolmap.Camera, positions: dict[int, Array]
 ) -> TrackedPhoto:
-    fx, fy = camera.focal_length_x, camera.focal_length_y
-    pixels = camera.width * camera.height
-    if min(pixels, fx, fy) <= 0 or pixels > MOST_PIXELS or not np.isfinite(camera.params).all():
-        raise UserError(f"photo {image.name} has an impossible camera, remove it from the model: {camera}")
     distortion, fisheye = _distortion(image.name, camera)
+    lens = Lens(
+        width=camera.width,
+        height=camera.height,
+        fx=camera.focal_length_x,
+        fy=camera.focal_length_y,
+        cx=camera.principal_point_x,
+        cy=camera.principal_point_y,
+        distortion=distortion,
+        fisheye=fisheye,
+    )
+    pose = image.cam_from_world().matrix()
+    try:
+        lens.check()
+        check_pose(pose.tolist())
+    except ValueError as error:
+        raise UserError(
+            f"photo {image.name} has an impossible camera ({error}), remove it from the model: {camera}"
+        ) from error
     tracked = [point for point in image.get_observation_points2D() if point.point3D_id in positions]
     return TrackedPhoto(
         name=image.name,
-        lens=Lens(
-            width=camera.width,
-            height=camera.height,
-            fx=fx,
-            fy=fy,
-            cx=camera.principal_point_x,
-            cy=camera.principal_point_y,
-            distortion=distortion,
-            fisheye=fisheye,
-        ),
-        camera_from_world=image.cam_from_world().matrix(),
+        lens=lens,
+        camera_from_world=pose,
         points=np.array([positions[point.point3D_id] for point in tracked], dtype=np.float64).reshape(-1, 3),
         pixels=np.array([point.xy for point in tracked], dtype=np.float64).reshape(-1, 2),
     )

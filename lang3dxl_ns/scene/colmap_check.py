@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import open_file
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 
 _POSE, _KEYPOINT, _OBSERVATION, _SENSOR = 7 * 8, 3 * 8, 2 * 4, 2 * 4
@@ -29,7 +30,8 @@ def check_binary_model(folder: Path) -> None:
 
 
 def _walk(path: Path, step: Callable[[bytes, int], int]) -> None:
-    content = path.read_bytes()
+    with open_file(path) as file:
+        content = file.read()
     try:
         count, place = _number("<Q", content, 0), 8
         for _ in range(count):

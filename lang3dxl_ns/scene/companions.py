@@ -7,6 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from lang3dxl_ns.common.errors import UserError, is_plain
+from lang3dxl_ns.common.files import expanded
+
+_LONGEST_NAME = 255
+"""Bytes that file systems allow."""
 
 
 def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
@@ -18,6 +22,8 @@ def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
     path = folder / name
     if not name or "\0" in name or os.path.isabs(name) or ".." in Path(name).parts:
         raise UserError(f"{name!r} leads out of {folder}: names are relative to that folder, without ..")
+    if any(len(os.fsencode(part)) > _LONGEST_NAME for part in Path(name).parts):
+        raise UserError(f"{name:.40}… is too long for a file's name: {_LONGEST_NAME} bytes at most")
     target = Path(os.path.realpath(path))  # unlike resolve(), accepts links in a circle
     if not follow_links and not target.is_relative_to(os.path.realpath(folder)):
         raise UserError(
@@ -50,7 +56,7 @@ def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bo
 
 def named_folder(choice: str, data: Path, option: str) -> Path:
     """The folder given to an option, relative to `data`. Raises UserError if it does not exist."""
-    folder = data / Path(choice).expanduser()
+    folder = data / expanded(choice)
     if not folder.is_dir():
         raise UserError(
             f"--pipeline.datamanager.{option} {choice}: there is no folder {folder}; give an existing one "

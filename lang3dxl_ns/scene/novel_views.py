@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 
 FOLDER = "test_views"
@@ -44,10 +45,10 @@ def read_novel_views(scene: Path) -> NovelViews | None:
     if not path.is_file():
         return None
     try:
-        content = json.loads(path.read_text())
+        content = read_json(path)
         cameras = [_tracked(view) for view in content["views"]]
         return NovelViews(path.parent, cameras, bool(content["same_light"]))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise UserError(f"{path} is damaged ({error!r}): make the scene again, or remove the file") from error
 
 
@@ -73,6 +74,7 @@ def _tracked(view: dict) -> TrackedPhoto:
     lens = Lens(int(view["width"]), int(view["height"]), fx, fy, cx, cy)
     lens.check()
     points = np.array(view["points"], dtype=np.float64).reshape(-1, 3)
+    check_pose(view["camera_from_world"])
     pose = np.array(view["camera_from_world"], dtype=np.float64).reshape(3, 4)
     x, y, z = pose @ np.column_stack([points, np.ones(len(points))]).T
     return TrackedPhoto(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +21,13 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.scene.camera import Lens, scaled_size
+from lang3dxl_ns.scene.orientation import quarter_turns, upright
 
 if TYPE_CHECKING:
     from lang3dxl_ns.scene.colmap import TrackedPhoto
+
+_LARGE = 1_500_000
+"""Pixels of a file above which JPEG's own reduction is used: half of the time, 50 dB from the exact one."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,7 @@ class Photo:
     """One photo on disk with its lens.
 
     The file may have another size than the lens but the same aspect ratio: reading resizes it to the lens's.
-    EXIF rotation is ignored, as in COLMAP.
+    This is the one place that decodes a photo: everything is read upright.
     """
 
     name: str
@@ -38,6 +44,9 @@ class Photo:
     mask_path: Path | None
     """A picture of any size, bright on the foreground."""
     lens: Lens
+    """Of the upright photo."""
+    quarter_turns: int = 0
+    """Clockwise, from the file's pixels as stored to upright ones."""
 
     @property
     def width(self) -> int:
@@ -53,13 +62,18 @@ class Photo:
     def from_model(cls, tracked: TrackedPhoto, path: Path, mask_path: Path | None = None) -> Photo:
         """The photo with its lens from the COLMAP model, adapted to the size of the file on disk.
 
-        So a folder of resized photos works with the same model. Raises UserError for an unreadable file and
-        for another aspect ratio.
+        So a folder of resized photos works with the same model. tracked: from `upright_in_model`. Raises
+        UserError for an unreadable file and for another aspect ratio.
         """
-        with _readable(path, tracked.name), open_picture(path) as image:
-            size = image.size
+        size, _ = stored_size(path, tracked.name)
+        size = _turned_size(size, tracked.quarter_turns)
         _check_shape(tracked.name, path, size, (tracked.width, tracked.height))
-        return cls(tracked.name, path, mask_path, tracked.lens.resized(*size))
+        return cls(tracked.name, path, mask_path, tracked.lens.resized(*size), tracked.quarter_turns)
+
+    def at_most(self, longer_side: int) -> Photo:
+        """The same photo, read with at most `longer_side` pixels on its longer side."""
+        shrink = longer_side / max(self.width, self.height)
+        return self if shrink >= 1 else replace(self, lens=self.lens.scaled(shrink))
 
     def read(self, scale: float = 1.0) -> Float[Tensor, "h w 3"]:
         """RGB in 0..1 at `scaled_size`, undistorted: what a pinhole camera with the same fx, fy, cx, cy sees.
@@ -71,13 +85,13 @@ class Photo:
 
     def read_uint8(self, scale: float = 1.0) -> UInt8[Tensor, "h w 3"]:
         """`read` in 0..255, for a quarter of the memory."""
-        image = _read_rgb(self.path, self.name)
+        size = scaled_size(self.width, self.height, scale)
+        image = self._decoded(size)
         _check_shape(self.name, self.path, image.size, (self.width, self.height))
         if self.lens.distorts:
             image = Image.fromarray(self._undistort(np.asarray(image)))
         # Pillow's bilinear filter widens when shrinking: it averages the area of each output pixel.
-        image = image.resize(scaled_size(self.width, self.height, scale), Image.Resampling.BILINEAR)
-        return torch.from_numpy(np.array(image))
+        return torch.from_numpy(np.array(image.resize(size, Image.Resampling.BILINEAR)))
 
     def read_mask(self, scale: float = 1.0) -> Bool[Tensor, "h w"] | None:
         """The foreground: where the mask is at least half bright and undistortion stays inside the photo.
@@ -89,7 +103,7 @@ class Photo:
             return None
         mask = np.ones((self.height, self.width), dtype=bool)
         if self.mask_path is not None:
-            gray = _read_rgb(self.mask_path, self.name).convert("L")
+            gray = self._drawn_upright(_read_rgb(self.mask_path, self.name).convert("L"))
             mask = np.asarray(gray.resize((self.width, self.height), Image.Resampling.NEAREST)) >= 128
         if self.lens.distorts:
             mask = self._undistort(mask * np.uint8(255)) >= 128
@@ -97,11 +111,12 @@ class Photo:
         return torch.from_numpy(np.array(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST)))
 
     def read_file(self, longer_side: int) -> UInt8[Tensor, "h w 3"]:
-        """The file as it is on disk, distorted, shrunk to at most `longer_side` pixels.
+        """The file upright, distorted, shrunk to at most `longer_side` pixels.
 
         A mask drawn on it can be read by `read_mask`. Raises UserError for an unreadable file.
         """
-        image = _read_rgb(self.path, self.name)
+        shrink = longer_side / max(self.width, self.height)
+        image = self._decoded(scaled_size(self.width, self.height, min(shrink, 1.0)))
         image.thumbnail((longer_side, longer_side), Image.Resampling.BILINEAR)
         return torch.from_numpy(np.array(image))
 
@@ -110,14 +125,38 @@ class Photo:
 
         Labels must fit into 32 bits.
         """
+        labels = self._drawn_upright(labels)
         if not self.lens.distorts:
             return labels
         return torch.from_numpy(self._undistort(labels.numpy().astype(np.int32), nearest=True, empty=-1))
+
+    def stamp(self, path: Path | None = None) -> list[int]:
+        """Size, time of change and inode of the photo's file (or its mask's, at `path`): another when its
+        content is. Raises UserError if it is missing."""
+        with _readable(path or self.path, self.name):
+            status = (path or self.path).stat()
+            return [status.st_size, status.st_mtime_ns, status.st_ino]
 
     def content_hash(self) -> str:
         """Hash of the file's bytes, without camera and mask."""
         with _readable(self.path, self.name):
             return hashlib.blake2b(self.path.read_bytes(), digest_size=16).hexdigest()
+
+    def _decoded(self, at_least: tuple[int, int]) -> Image.Image:
+        """The file upright, distorted, in its size or, if that is large, in one not below `at_least`."""
+        image = _read_rgb(self.path, self.name, _turned_size(at_least, self.quarter_turns))
+        return image.transpose(_TURNS[self.quarter_turns]) if self.quarter_turns else image
+
+    def _drawn_upright(self, drawn: Any) -> Any:
+        """A mask (picture) or labels (tensor) drawn on the file, upright: turned if they are shaped like the
+        pixels as stored. Most programs draw on photos that they show upright."""
+        width, height = drawn.size if isinstance(drawn, Image.Image) else tuple(drawn.shape)[::-1]
+        lies = abs(math.log(width * self.height / (height * self.width)))
+        if self.quarter_turns % 2 == 0 or lies <= abs(math.log(width * self.width / (height * self.height))):
+            return drawn
+        if isinstance(drawn, Image.Image):
+            return drawn.transpose(_TURNS[self.quarter_turns])
+        return drawn.rot90(-self.quarter_turns)
 
     def _undistort(
         self, image: UInt8[Array, "h w *c"] | Int32[Array, "h w"], nearest: bool = False, empty: int = 0
@@ -126,18 +165,27 @@ class Photo:
         import cv2
 
         height, width = image.shape[:2]
-        lens = self.lens.resized(width, height)
-        # OpenCV's origin is the center of the first pixel, hence -0.5.
-        pinhole = lens.matrix.numpy() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-        coefficients = np.array(lens.distortion or (0.0,) * 4)
-        module = cv2.fisheye if lens.fisheye else cv2
-        columns, rows = module.initUndistortRectifyMap(
-            pinhole, coefficients, np.eye(3), pinhole, (width, height), cv2.CV_32FC1
-        )
+        columns, rows, seen = _undistortion(self.lens.resized(width, height))
         blend = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
         view = cv2.remap(image, columns, rows, blend, borderMode=cv2.BORDER_REPLICATE)
-        view[~_seen(columns, rows)] = empty
+        view[~seen] = empty
         return view
+
+
+@lru_cache(maxsize=4)  # photos of one camera share a lens
+def _undistortion(lens: Lens) -> tuple[Float32[Array, "h w"], Float32[Array, "h w"], Bool[Array, "h w"]]:
+    """Column and row in the photo for every pixel of the pinhole's view, and whether the photo reaches it."""
+    import cv2
+
+    # OpenCV's origin is the center of the first pixel, hence -0.5.
+    pinhole = lens.matrix.numpy() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    coefficients = np.array(lens.distortion or (0.0,) * 4)
+    module = cv2.fisheye if lens.fisheye else cv2
+    size = lens.width, lens.height
+    columns, rows = module.initUndistortRectifyMap(
+        pinhole, coefficients, np.eye(3), pinhole, size, cv2.CV_32FC1
+    )
+    return columns, rows, _seen(columns, rows)
 
 
 def _seen(columns: Float32[Array, "h w"], rows: Float32[Array, "h w"]) -> Bool[Array, "h w"]:
@@ -152,6 +200,28 @@ def _seen(columns: Float32[Array, "h w"], rows: Float32[Array, "h w"]) -> Bool[A
         return inside
     (column_dy, column_dx), (row_dy, row_dx) = np.gradient(columns), np.gradient(rows)
     return inside & (column_dx * row_dy > column_dy * row_dx)
+
+
+_TURNS = {1: Image.Transpose.ROTATE_270, 2: Image.Transpose.ROTATE_180, 3: Image.Transpose.ROTATE_90}
+"""Pillow counts counterclockwise."""
+
+
+def _turned_size(size: tuple[int, int], quarters: int) -> tuple[int, int]:
+    """Width and height after turning by quarters."""
+    return size[::-1] if quarters % 2 else size
+
+
+def stored_size(path: Path, name: str) -> tuple[tuple[int, int], int]:
+    """Width and height of a file's pixels as stored, and the quarter turns that bring them upright. Raises
+    UserError for an unreadable file."""
+    with _readable(path, name), open_picture(path) as image:
+        return image.size, quarter_turns(image)
+
+
+def upright_in_model(tracked: TrackedPhoto, path: Path) -> TrackedPhoto:
+    """A model's photo turned upright with its file, for `Photo.from_model`. Raises UserError for a file that
+    can't be read."""
+    return upright(tracked, *stored_size(path, tracked.name))
 
 
 @contextmanager
@@ -169,9 +239,12 @@ def _readable(path: Path, name: str) -> Iterator[None]:
         ) from error
 
 
-def _read_rgb(path: Path, name: str) -> Image.Image:
-    """The file as 8-bit RGB: gray, CMYK and palettes converted, 16 bits reduced, transparency dropped."""
+def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) -> Image.Image:
+    """The file as stored, in 8-bit RGB: gray, CMYK and palettes converted, 16 bits reduced, transparency
+    dropped. A large JPEG may be smaller, not below `at_least`."""
     with _readable(path, name), open_picture(path) as image:
+        if at_least is not None and image.width * image.height > _LARGE:
+            image.draft(None, at_least)  # for other formats, nothing
         if image.mode == "F":
             raise ValueError("its pixels are floating-point numbers of unknown range")
         if image.mode.startswith("I"):  # 16-bit gray, which convert() would clip at 255

@@ -68,7 +68,7 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     good, bad = [], {}
     for name in photos.names:
         path = photos.folder / name
-        if path.suffix.lower() in (*UNREADABLE_SUFFIXES, ".webp", ".gif"):
+        if path.suffix.lower() in UNREADABLE_SUFFIXES:
             bad[name] = f"{path.suffix} can't be read here: convert it to JPEG or PNG"
             continue
         try:

@@ -21,12 +21,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lang3dxl_ns.common.console import progress, say
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.errors import UserError, is_plain
+from lang3dxl_ns.common.files import expanded, open_file, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruction_report import ReconstructionReport
 from lang3dxl_ns.scene.reconstruction_settings import ReconstructionSettings
 from lang3dxl_ns.scene.video import extract_frames, is_video
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 _MEMORY_PER_THREAD = 1e9  # bytes, SIFT on a photo of MAX_SIZE pixels
 _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's ten may be more than there are
+_CONVERTED = (".webp", ".gif")  # which Pillow reads and COLMAP does not
 _CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar, and the most work lost if killed
 
 
@@ -53,20 +56,29 @@ def reconstruct(
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
     good, left_out = readable(photos)
+    good, unnamed = _with_names(good)
     good, twins = _without_twins(good)
-    left_out |= twins
+    left_out |= unnamed | twins
     _check_count(photos, good, left_out)
     clock: dict[str, float] = {}
     with _quiet():
         with _timed(clock, "features"):
             database = _database(good, work, settings)
-            _extract(database, good, settings)
+            copies = _numbered(good, work)
+            _extract(database, copies, settings)
         with _timed(clock, "matching"):
-            _match(database, good.names)
+            _match(database, copies.names)
         with _timed(clock, "mapping"):
-            models = _map(database, good, work, settings.mapper)
+            models = _map(database, copies, work, settings.mapper)
     if not models:
-        raise UserError(_why_no_model(database, good.names))
+        raise UserError(_why_no_model(database, copies.names))
+    names = dict(zip(copies.names, good.names, strict=True))
+    reasons = _reasons(database, copies.names, models)
+    with _opened(database) as db:
+        doubts = doubtful_placements(rotations_of(models[0]), matched_pairs(db, models[0]))
+    doubtful = {names[models[0].images[i].name]: why for i, why in sorted(doubts.items())}
+    for image in (image for model in models for image in model.images.values()):
+        image.name = names[image.name]
     best = models[0]
     report = ReconstructionReport(
         photos=len(photos.names),
@@ -75,7 +87,8 @@ def reconstruct(
         error=float(best.compute_mean_reprojection_error()),
         cameras=len({image.camera_id for image in best.images.values() if image.has_pose}),
         mapper=settings.mapper,
-        left_out=left_out | _reasons(database, good.names, models),
+        doubtful=doubtful,
+        left_out=left_out | {names[number]: why for number, why in reasons.items()},
         other_models=tuple(other.num_reg_images() for other in models[1:]),
         seconds={stage: round(seconds, 1) for stage, seconds in clock.items()},
     )
@@ -92,11 +105,11 @@ def reconstruct_scene(
     The model goes to sparse/0 in the scene's folder or, if sparse is taken or the folder is read-only,
     to the cache. Raises UserError like `reconstruct` and `extract_frames`.
     """
-    data = data.expanduser().absolute()
+    data = expanded(data).absolute()
     if is_video(data):
         data = extract_frames(data)
     photos = find_photos(data)
-    work = (cache_dir or data / "lang3dxl_cache").expanduser().absolute() / "reconstruction"
+    work = expanded(cache_dir or data / "lang3dxl_cache").absolute() / "reconstruction"
     model = data / "sparse"
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
         model = work / "sparse"
@@ -130,12 +143,44 @@ def _check_count(photos: PhotoFolder, good: PhotoFolder, left_out: dict[str, str
     )
 
 
+def _with_names(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
+    """The photos whose names a COLMAP model can hold, and the others with the reason."""
+    odd = {name: "its name is not plain text: rename the file" for name in photos.names if not is_plain(name)}
+    return PhotoFolder(photos.folder, tuple(name for name in photos.names if name not in odd)), odd
+
+
+def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
+    """The photos under numbers, in their order: links or, in formats that COLMAP can't read, converted
+    copies. COLMAP separates names by spaces, so that "photo 1.jpg" would be two."""
+    folder = work / "photos"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    numbers = []
+    for index, name in enumerate(photos.names):
+        source, suffix = photos.folder / name, Path(name).suffix.lower()
+        number = f"{index:06d}{'.png' if suffix in _CONVERTED else suffix}"
+        if suffix in _CONVERTED:
+            with open_picture(source) as image:
+                image.convert("RGB").save(folder / number)
+        else:
+            _link(source.absolute(), folder / number)
+        numbers.append(number)
+    return PhotoFolder(folder, tuple(numbers))
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        target.symlink_to(source)
+    except OSError:  # a disk or system without links
+        shutil.copyfile(source, target)
+
+
 def _without_twins(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     """The photos without duplicate files."""
     first: dict[str, str] = {}
     twins = {}
     for name in photos.names:
-        with (photos.folder / name).open("rb") as file:
+        with open_file(photos.folder / name) as file:
             content = (
                 hashlib.file_digest(file, "blake2b").hexdigest()
                 if hasattr(hashlib, "file_digest")
@@ -154,7 +199,7 @@ def _database(photos: PhotoFolder, work: Path, settings: ReconstructionSettings)
     stamp = json.dumps(
         {
             "photos": [[n, s.st_size, s.st_mtime_ns] for n, s in zip(photos.names, states, strict=True)],
-            "settings": [settings.max_size, settings.features, settings.one_camera],
+            "settings": [settings.max_size, settings.features, settings.one_camera, "numbered"],
         }
     )
     database, stamped = work / "database.db", work / "photos.json"
@@ -168,8 +213,11 @@ def _database(photos: PhotoFolder, work: Path, settings: ReconstructionSettings)
     groups = shared_cameras(photos)
     if settings.one_camera is not None:
         groups = [list(photos.names)] if settings.one_camera else [[name] for name in photos.names]
+    copies = _numbered(photos, work)
+    number = dict(zip(photos.names, copies.names, strict=True))
     for group in groups:
-        pycolmap.import_images(importing, photos.folder, pycolmap.CameraMode.SINGLE, group)
+        numbers = [number[name] for name in group]
+        pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
     importing.rename(database)
     write_atomically(stamped, stamp)
     return database
@@ -188,8 +236,7 @@ def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettin
     with progress("features of photos", len(missing)) as advance:
         for chunk in _chunks(missing, _CHUNK_PHOTOS):
             pycolmap.extract_features(database, photos.folder, chunk, extraction_options=options)
-            for _ in chunk:
-                advance()
+            advance(len(chunk))
 
 
 def _match(database: Path, names: Sequence[str]) -> None:
@@ -213,8 +260,7 @@ def _match(database: Path, names: Sequence[str]) -> None:
         for chunk in _chunks(missing, _CHUNK_PAIRS):
             listed.write_text("".join(f"{a} {b}\n" for a, b in chunk))
             pycolmap.match_image_pairs(database, options, pairing)
-            for _ in chunk:
-                advance()
+            advance(len(chunk))
 
 
 def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pycolmap.Reconstruction]:
@@ -275,7 +321,7 @@ def _publish(models: list[pycolmap.Reconstruction], work: Path, model: Path) -> 
         complete.rename(model)
     except OSError as error:
         raise UserError(
-            f"the model can't be written to {model} ({error}): make room, or choose --out"
+            f"the model can't be written to {model} ({error}): make room, or choose --cache-dir"
         ) from error
     finally:
         shutil.rmtree(complete, ignore_errors=True)

@@ -20,6 +20,8 @@ class ReconstructionReport:
     mapper: str
     left_out: dict[str, str] = field(default_factory=dict)
     """Photos without a pose, with reasons."""
+    doubtful: dict[str, str] = field(default_factory=dict)
+    """Photos with a pose that may be wrong, with reasons."""
     other_models: tuple[int, ...] = ()
     """Sizes of further models, of photos not connected to the largest one."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -39,8 +41,14 @@ class ReconstructionReport:
                 f"largest, of {self.registered}, is used; the others have {sizes}. Add photos that connect "
                 "them, or give each group its own folder"
             )
-        reasons: dict[str, list[str]] = {}
-        for name, why in self.left_out.items():
-            reasons.setdefault(why, []).append(name)
-        found += [f"left out, {why}: {some(names, 20)}" for why, names in reasons.items()]
+        for what, photos in (("doubtfully placed", self.doubtful), ("left out", self.left_out)):
+            reasons: dict[str, list[str]] = {}
+            for name, why in photos.items():
+                reasons.setdefault(why, []).append(name)
+            found += [f"{what}, {why}: {some(names, 20)}" for why, names in reasons.items()]
+        if self.doubtful:
+            found.append(
+                "a building that looks alike from several sides takes photos to the wrong one: look at the "
+                "doubtful ones in the viewer, and remove those that stand wrong"
+            )
         return found

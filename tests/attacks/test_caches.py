@@ -21,6 +21,18 @@ def test_a_cache_with_any_damage_counts_as_absent(tmp_path):
         assert found is None or torch.equal(found[0]["rows"], tensors["rows"])
 
 
+def test_a_target_whose_settings_are_lost_or_altered_counts_as_absent(tmp_path):
+    store, made_with = FeatureStore(tmp_path), {"encoder": "a"}
+    store.write("clip", "a.jpg", {"features": torch.arange(12.0).view(3, 4)}, made_with)
+    assert store.is_current("clip", "a.jpg", made_with)
+    path = store.path("clip", "a.jpg")
+    whole = path.read_bytes()
+    for damage in ((b"settings", b"sittings"), (b"encoder", b"encodex"), (b"[0,24]", b"[0,99]")):
+        assert damage[0] in whole
+        path.write_bytes(whole.replace(*damage))
+        assert not store.is_current("clip", "a.jpg", made_with)
+
+
 def test_a_target_whose_checksum_is_lost_counts_as_absent(tmp_path):
     store, made_with = FeatureStore(tmp_path), {"encoder": "a"}
     store.write("clip", "a.jpg", {"features": torch.arange(12.0).view(3, 4)}, made_with)

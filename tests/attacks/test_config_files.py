@@ -1,6 +1,8 @@
 """Hostile and damaged config.yml files and checkpoints, in our commands and in nerfstudio's."""
 
 import contextlib
+import math
+import os
 import shutil
 import zipfile
 
@@ -205,3 +207,80 @@ def test_the_config_of_another_method_is_named(copy):
     for opening in (load_scene, open_run):
         with pytest.raises(UserError, match="another method"):
             opening(copy / "config.yml")
+
+
+# ── kinds that are not files, values of other kinds ─────────────────────────────────────────────────────
+
+
+def test_a_config_that_can_not_be_looked_at_first_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "config.yml")
+    with pytest.raises(SystemExit, match="can't be checked before it is used"):
+        check_command_line(["--load-config", str(tmp_path / "config.yml")])
+    with pytest.raises(SystemExit, match="can't be checked before it is used"):
+        check_command_line(["--load-config", "/dev/null"])
+    with pytest.raises(UserError, match="can't be read"):
+        read_config(tmp_path / "config.yml")
+
+
+def test_configs_of_other_methods_are_left_to_nerfstudio(tmp_path):
+    """A plugin does not decide about commands of others."""
+    path = tmp_path / "config.yml"
+    path.write_text("a: !!python/object/apply:os.system ['true']\n")
+    check_command_line(["--load-config", str(path)])
+
+
+def test_pipes_in_place_of_checkpoints_are_refused(copy):
+    path = max((copy / "nerfstudio_models").glob("*.ckpt"))
+    path.unlink()
+    os.mkfifo(path)
+    for opening in (load_scene, open_run):
+        with pytest.raises(UserError, match="checkpoint"):
+            opening(copy / "config.yml")
+
+
+@pytest.mark.parametrize("value", [torch.full((5, 3), math.nan), torch.eye(3).to_sparse()])
+def test_checkpoints_of_no_numbers_and_sparse_ones_are_named(copy, value):
+    path = max((copy / "nerfstudio_models").glob("*.ckpt"))
+    state = torch.load(path, weights_only=True)
+    (key,) = [k for k in state["pipeline"] if k.endswith("gauss_params.means")]
+    state["pipeline"][key] = value
+    torch.save(state, path)
+    with pytest.raises(UserError, match=r"not a checkpoint of lang3dxl .*(number|sparse)"):
+        load_scene(copy / "config.yml")
+
+
+@pytest.mark.parametrize(
+    ("setting", "other"),
+    [
+        ("densify_every: 0.0", "densify_every: null #"),
+        ("densify_from: 0.0", "densify_from: abc #"),
+        ("sh_degree: 3", "sh_degree: null"),
+        ("densify_until: 0.5", "densify_until: .nan"),
+        ("background_color: black", "background_color: -5"),
+    ],
+)
+def test_values_of_another_kind_are_named(tmp_path, setting, other):
+    text = yaml.dump(lang3dxl.config)
+    assert setting in text
+    (tmp_path / "config.yml").write_text(text.replace(setting, other))
+    with pytest.raises(UserError, match=f"sets .*{setting.partition(':')[0]}"):
+        read_config(tmp_path / "config.yml")
+
+
+def test_a_run_made_on_windows_opens(tmp_path):
+    text = yaml.dump(lang3dxl.config)
+    (tmp_path / "config.yml").write_text(text.replace("pathlib.PosixPath", "pathlib.WindowsPath"))
+    assert read_config(tmp_path / "config.yml").relative_model_dir == lang3dxl.config.relative_model_dir
+
+
+def test_a_copy_of_a_run_loads_its_own_checkpoint_in_nerfstudios_commands(copy, two_steps, monkeypatch):
+    """As `ns-eval` reads it."""
+    original = two_steps.base_dir
+    config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
+    assert config.get_checkpoint_dir().parent == original
+    monkeypatch.setattr("sys.argv", ["/bin/ns-eval", "--load-config", str(copy / "config.yml")])
+    assert config.get_checkpoint_dir().parent == copy
+    config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
+    assert config.pipeline.datamanager.run == copy
+    monkeypatch.setattr("sys.argv", ["/bin/ns-train", "lang3dxl", "--load-config", str(copy / "config.yml")])
+    assert config.get_base_dir() == original

@@ -23,6 +23,7 @@ from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.regions import _read_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras
 from lang3dxl_ns.scene.video import extract_frames
 
@@ -328,3 +329,10 @@ def test_masks_that_are_all_black_are_said_to_be(folder):
     Image.new("L", (8, 6), 255).save(folder / "masks" / "photo_002.png")
     _, said = masked(photos, folder)
     assert "the masks of 3 photos are all black" in said
+
+
+def test_a_name_too_long_for_a_file_is_one_error(tmp_path):
+    """Asking the system for such a file raises an error of its own."""
+    for name in ("n" * 300, f"a/{'ä' * 200}.jpg"):
+        with pytest.raises(UserError, match="too long for a file's name"):
+            inside(tmp_path, name)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 
 import pytest
 
@@ -154,3 +155,16 @@ def test_a_camera_path_that_nothing_can_be_rendered_from_is_named(tmp_path, chan
     assert len(read_camera_path(camera_path(tmp_path))) == 1
     with pytest.raises(UserError, match=r"path\.json is not a camera path"):
         read_camera_path(camera_path(tmp_path, **changes))
+
+
+def test_poses_written_as_integers_are_poses(tmp_path):
+    whole = [[int(value) for value in row] for row in POSE]
+    path = scene_file(tmp_path, set_of_photo("camera_to_world", whole))
+    assert SceneFile.read(path).photos[1].camera.view_matrix.is_floating_point()
+
+
+@pytest.mark.parametrize("read", [SceneFile.read, read_camera_path])
+def test_pipes_are_refused_instead_of_waited_for(tmp_path, read):
+    os.mkfifo(tmp_path / "file.json")
+    with pytest.raises(UserError, match=r"file\.json"):
+        read(tmp_path / "file.json")

@@ -2,18 +2,14 @@
 
 import contextlib
 import http.client
-import json
 import math
 import socket
 import time
-from types import SimpleNamespace
 
 import msgspec
 import pytest
 import viser
-from viser._messages import ViewerCameraMessage
-from viser.infra._infra import WebsockMessageHandler
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from lang3dxl_ns.plugin.viewer.guard import RENDER_NAME, Guard, file_name, guard_viewers

@@ -24,7 +24,6 @@ from lang3dxl_ns.baselines.rows import (
 )
 from lang3dxl_ns.benchmarks.ablation import Ablation, bound_figures, make_all
 from lang3dxl_ns.benchmarks.ablation_report import mark_front, spread, table_of_runs, write_ablation
-from lang3dxl_ns.benchmarks.landmarks import LANDMARKS, TEST, VALIDATION
 from lang3dxl_ns.benchmarks.scored_runs import (
     Run,
     RunSettings,
@@ -229,18 +228,6 @@ def test_the_front_holds_rows_unbeaten_in_time_and_quality():
     assert [row["front"] for row in rows] == [True, True, False, False, True, False]
 
 
-def test_decision_published_and_training_landmarks_are_disjoint():
-    from lang3dxl_ns.demo.clip_training.views import SPLITS
-
-    assert not set(VALIDATION) & set(TEST) and len(LANDMARKS) == len(VALIDATION) + len(TEST)
-    assert sorted(family for _, family in VALIDATION.values()) == sorted(("cathedral", "hall", "mosque") * 2)
-    for seed, _ in LANDMARKS.values():
-        assert seed in SPLITS["test"]
-    assert (
-        min(seed for seed, _ in VALIDATION.values()) >= 250
-    )  # those below are reported in docs/small_clip.md
-
-
 def test_new_weights_of_the_same_name_make_runs_anew(tmp_path, monkeypatch):
     made: list[str] = []
     make_all(runs_of(FULL), Counting(tmp_path, made), lambda *_: None)
@@ -249,7 +236,7 @@ def test_new_weights_of_the_same_name_make_runs_anew(tmp_path, monkeypatch):
     assert len(made) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 

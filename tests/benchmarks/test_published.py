@@ -69,7 +69,7 @@ def table(out, name):
     return {row[1]: dict(zip(heads, row, strict=True)) for row in rows}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_downloaded_folder_becomes_a_table(downloaded, tmp_path):
     benchmark, data, scene = downloaded
     out = tmp_path / "out"

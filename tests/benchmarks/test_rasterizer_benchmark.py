@@ -146,39 +146,3 @@ def test_a_baseline_that_needs_too_much_memory_is_left_out_and_said_so(tmp_path,
     assert set(case["forward_ms"]) == {OURS, TORCH, DENSE}
     assert set(case["forward_backward_ms"]) == {OURS, TORCH}
     assert "would need more than 0 GB" in (tmp_path / "rasterizer.md").read_text()
-
-
-def test_a_peer_gets_its_row_of_time_error_and_memory(tmp_path):
-    peer = tmp_path / "peer.py"
-    peer.write_text(
-        """from lang3dxl_ns.rendering import rasterize
-NAME = "the same again"
-def render(p):
-    result = rasterize(p.gaussians, p.camera, p.channels, p.background, backend="torch")
-    return result.image, result.alpha
-"""
-    )
-    RasterizerBenchmark(tmp_path, quick=True, device="cpu", recipes=("B",), peers=(peer,)).main()
-    case = json.loads((tmp_path / "rasterizer.json").read_text())["cases"][0]
-    assert case["forward_ms"]["the same again"] > 0
-    assert case["forward_backward_ms"]["the same again"] > 0
-    assert case["peak_mib"]["the same again"] >= 0
-    assert case["error"]["the same again"] == case["error"][TORCH]
-    report = (tmp_path / "rasterizer.md").read_text()
-    assert "| B | 1,000 | 80×60 | the same again |" in report
-    assert f"--peers {peer}" in report
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("NAME = 'half'", r"half\.py must define NAME, a string, and render"),
-        ("import no_such_build", r"half\.py can't be run \(ModuleNotFoundError: .*no_such_build"),
-        ("NAME, render = 'dense tiles', print", r"half\.py names its rasterizer 'dense tiles', as another"),
-    ],
-)
-def test_a_file_that_is_no_peer_is_named_with_what_it_lacks(tmp_path, text, complaint):
-    peer = tmp_path / "half.py"
-    peer.write_text(text)
-    with pytest.raises(UserError, match=complaint):
-        RasterizerBenchmark(tmp_path, quick=True, device="cpu", peers=(peer,)).main()

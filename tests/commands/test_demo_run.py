@@ -60,7 +60,7 @@ def test_the_same_command_does_nothing_twice_but_goes_on_when_asked_for_more(dem
 
 
 def test_another_scene_in_the_same_folder_is_refused(demo):
-    with pytest.raises(UserError, match="seed 2, and 3 was asked for"):
+    with pytest.raises(UserError, match="seed 2, not 3: give --out"):
         Demo(out=demo.out, seed=3, **SCENE).main()
 
 

@@ -80,7 +80,7 @@ def test_a_camera_path_is_followed(run, tmp_path):
     ("words", "message"),
     [
         (("--text", " ; "), "the prompt is empty"),
-        ((), "the prompt is empty"),
+        ((), "there is no --text"),
         (("--text", "dome", "--image", "x"), "no photo 'x'"),
         (("--text", "dome", "--image", "0001", "--all"), "exclude each other"),
     ],

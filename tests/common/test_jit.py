@@ -9,6 +9,7 @@ import pytest
 import torch
 from processes import Process
 
+from lang3dxl_ns.common import jit
 from lang3dxl_ns.common.jit import in_threads
 
 MODULE = """
@@ -65,3 +66,18 @@ def test_threads_return_results_in_the_order_of_the_arguments():
     finally:
         torch.set_num_threads(before)
     assert in_threads(np.sum, []) == []
+
+
+def test_kernels_of_different_numbers_of_parts_share_one_pool(monkeypatch):
+    made, before = [], torch.get_num_threads()
+    pool = jit.ThreadPoolExecutor
+    monkeypatch.setattr(jit, "ThreadPoolExecutor", lambda *a, **k: made.append(a) or pool(*a, **k))
+    jit._pool.cache_clear()
+    torch.set_num_threads(8)
+    try:
+        for parts in (3, 8, 5, 20, 3):
+            assert in_threads(lambda k: k, [(k,) for k in range(parts)]) == list(range(parts))
+    finally:
+        torch.set_num_threads(before)
+        jit._pool.cache_clear()
+    assert made == [(8,)]

@@ -1,10 +1,17 @@
-"""Laws of compressing features on Gaussians to three numbers each."""
+"""Laws of compressing features on Gaussians to a few numbers each."""
 
 import pytest
 import torch
 import torch.nn.functional as F
 
-from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, compress
+from lang3dxl_ns.components import compression
+from lang3dxl_ns.components.compression import (
+    CompressedField,
+    CompressionConfig,
+    Gathered,
+    centered_cosine,
+    compress,
+)
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
@@ -111,3 +118,66 @@ def test_coordinates_in_a_basis_compress_like_the_features():
     # All variance lies in the basis but for the noise of 14 channels.
     torch.testing.assert_close(trained.output_std, expected.output_std, atol=0.02, rtol=0.02)
     assert agreement(features, whole, expected).mean() - agreement(features, codes, trained).mean() < 0.005
+
+
+def test_a_hundred_times_as_many_gaussians_are_compressed_as_well():
+    """The work grows with them; the field is trained on a sample."""
+    found = []
+    for sizes in ([40] * 8, [4000] * 8):
+        features, _ = clusters(sizes)
+        codes, trained = compressed(
+            features, torch.ones(len(features)), CompressionConfig(300, 512, sample=320)
+        )
+        found.append(centered_cosine(features, trained, codes))
+    assert found[0] > 0.95 and found[1] > found[0] - 0.02
+
+
+def test_the_centered_cosine_sees_what_the_cosine_does_not():
+    """Features that hardly differ from their mean, decoded to the mean."""
+    features = 10 + 0.1 * torch.randn(200, CHANNELS, generator=torch.Generator().manual_seed(0))
+    trained, codes = field(), torch.zeros(200, 3)
+    trained.set_output_statistics(features.mean(0), torch.full((CHANNELS,), 1e-6))
+    assert agreement(features, codes, trained).mean() > 0.999
+    assert abs(centered_cosine(features, trained, codes)) < 0.1
+    mean, std = features.mean(0), features.std(0)
+    basis = PrincipalBasis.of([features], CHANNELS)
+    trained.set_output_statistics(mean, std)
+    whole = centered_cosine(features, trained, codes)
+    assert centered_cosine(basis.coordinates(features), trained, codes, basis) == pytest.approx(
+        whole, abs=1e-3
+    )
+
+
+def test_a_sample_has_what_has_little_mass_more_often_than_its_mass():
+    mass = torch.cat([torch.full((900,), 100.0), torch.full((100,), 1.0)])
+    drawn = Gathered(torch.arange(1000.0)[:, None], mass, None).sample(200, torch.Generator().manual_seed(0))
+    rows = drawn.features[:, 0].long()
+    assert len(rows.unique()) == 200 and torch.equal(drawn.mass, mass[rows])
+    assert 0 < (rows >= 900).sum() < 10  # by √mass two of 200 are expected, by mass none, by number 20
+
+
+def test_codes_have_more_numbers_where_three_lose_too_much(monkeypatch):
+    features, _ = clusters([100] * 4)
+    losses = iter([0.9, 0.97, 0.97])
+    monkeypatch.setattr(compression, "centered_cosine", lambda *_: next(losses))
+    encoder = CompressedField(SemanticFieldConfig("short"), CHANNELS, CompressionConfig(20, 128))
+    codes = encoder.learn_gaussians(features, torch.ones(len(features)))
+    assert codes.shape[1] == encoder.code_dim == 4
+    assert (
+        encoder.learned is not None
+        and "4 numbers" in encoder.learned
+        and "3 numbers: 0.900" in encoder.learned
+    )
+    # Another process makes room for them, and decodes the same.
+    other = CompressedField(SemanticFieldConfig("short"), CHANNELS)
+    other.fit_codes(codes)
+    other.load_state_dict(encoder.state_dict())
+    torch.testing.assert_close(other.decode_clip(codes), encoder.decode_clip(codes))
+
+
+def test_a_number_of_numbers_that_was_asked_for_is_kept(monkeypatch):
+    features, _ = clusters([100] * 4)
+    monkeypatch.setattr(compression, "centered_cosine", lambda *_: 0.0)
+    config = SemanticFieldConfig("short", code_dim=2)
+    encoder = CompressedField(config, CHANNELS, CompressionConfig(20, 128))
+    assert encoder.learn_gaussians(features, torch.ones(len(features))).shape[1] == 2

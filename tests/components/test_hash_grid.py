@@ -1,4 +1,4 @@
-"""Laws of the hash grid, against a slow reference that visits one vertex at a time."""
+"""Laws of the hash grid, against the float64 reference of the numerics."""
 
 import itertools
 import math
@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from lang3dxl_ns.components import hash_grid
-from lang3dxl_ns.components.hash_grid import HashGrid
+from lang3dxl_ns.components.hash_grid import HASH_PRIMES, HashGrid
+from lang3dxl_ns.numerics.hash_grid import interpolate_reference
 
 pytestmark = pytest.mark.usefixtures("backend")
 PRIMES = (1, 2654435761, 805459861, 3674653429)
@@ -31,60 +32,20 @@ def make_points(count, dim, low=0.0, high=1.0, seed=1):
     return low + (high - low) * torch.rand(count, dim, generator=generator, dtype=torch.float64)
 
 
-def reference(grid, x, capacity, resolutions):
-    """Row of features of one point, and its derivative in the coordinates, with loops and Python integers."""
-    dim = len(x)
-    values, slopes, offset = [], [], 0
-    for resolution in resolutions:
-        dense = resolution**dim <= capacity
-        position = [v * (resolution - 2) + 0.5 for v in x]
-        cell = [math.floor(p) for p in position]
-        value, slope = 0.0, [0.0] * dim
-        for corner in itertools.product((0, 1), repeat=dim):
-            vertex = [c + k for c, k in zip(cell, corner, strict=True)]
-            if dense:
-                entry = sum((v % resolution) * resolution**axis for axis, v in enumerate(vertex))
-            else:
-                entry = 0
-                for v, prime in zip(vertex, PRIMES, strict=False):
-                    entry ^= (v * prime) % 2**32
-                entry %= capacity
-            row = grid.table[offset + entry]
-            parts = [p - c if k else 1 - (p - c) for p, c, k in zip(position, cell, corner, strict=True)]
-            value = value + math.prod(parts) * row
-            for axis in range(dim):
-                others = math.prod(parts[:axis] + parts[axis + 1 :])
-                slope[axis] = slope[axis] + (1 if corner[axis] else -1) * (resolution - 2) * others * row
-        values.append(value)
-        slopes.append(torch.stack(slope))
-        offset += min(-(-(resolution**dim) // 8) * 8, capacity)
-    return torch.cat(values), torch.cat(slopes, 1)
-
-
 @pytest.mark.parametrize("dim", [2, 3, 4])
 @pytest.mark.parametrize("spread", [(0.0, 1.0), (-3.0, 3.0)])
-def test_values_and_coordinate_gradients_equal_the_reference(dim, spread):
+def test_values_and_gradients_equal_the_reference(dim, spread):
     grid = make_grid(dim)
-    resolutions = [4, 8, 14, 24]
     assert 0 < grid.dense_levels < grid.levels
+    assert (grid.cells + 2).tolist() == [4, 8, 14, 24] and tuple(HASH_PRIMES[:4]) == PRIMES
     x = make_points(12, dim, *spread).requires_grad_()
-    features = grid(x)
-    expected = [reference(grid, point, grid.hash_mask + 1, resolutions) for point in x.detach().tolist()]
-    torch.testing.assert_close(features, torch.stack([value for value, _ in expected]))
-    for channel in range(grid.output_dim):
-        (gradient,) = torch.autograd.grad(features[:, channel].sum(), x, retain_graph=True)
-        torch.testing.assert_close(gradient, torch.stack([slope[:, channel] for _, slope in expected]))
-
-
-@pytest.mark.parametrize("dim", [2, 3, 4])
-def test_table_gradient_equals_the_reference(dim):
-    grid = make_grid(dim)
-    x, weight = make_points(20, dim), make_points(20, grid.output_dim, seed=2)
-    (grid(x) * weight).sum().backward()
-    actual, grid.table.grad = grid.table.grad, None
-    rows = [reference(grid, point, grid.hash_mask + 1, [4, 8, 14, 24])[0] for point in x.tolist()]
-    (torch.stack(rows) * weight).sum().backward()
-    torch.testing.assert_close(actual, grid.table.grad)
+    weight = make_points(12, grid.output_dim, seed=2)
+    found, expected = grid(x), interpolate_reference(grid, grid.table, x)
+    torch.testing.assert_close(found, expected)
+    gradients, right = (
+        torch.autograd.grad((out * weight).sum(), (x, grid.table)) for out in (found, expected)
+    )
+    torch.testing.assert_close(gradients, right)
 
 
 @pytest.mark.parametrize("dim", [2, 3, 4])

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lang3dxl_ns.benchmarks.scale import ScaleBenchmark, markdown
+from lang3dxl_ns.benchmarks.scale import ScaleBenchmark, Stage, markdown
 from lang3dxl_ns.demo.landmark.crowd import SIZES, write_crowd
 from lang3dxl_ns.scene.colmap import read_reconstruction
 
@@ -28,20 +28,14 @@ def test_a_crowd_is_a_scene_of_mixed_sizes_with_tracks_and_depends_on_its_seed_a
     assert first == again != other
 
 
-def test_the_report_holds_a_row_per_measurement_and_the_prediction():
-    row = dict.fromkeys(("preparation_s", "step_s", "data_s"), 0.25)
-    row |= dict.fromkeys(
-        (f"{part}_bytes" for part in ("preparation", "training", "evaluation", "store")), 3e8
-    )
-    row |= {"photos": 1234, "gaussians": 56789}
-    pairs = [
-        {"out of core": row | {"step_s": 0.1 * n}, "in memory": row | {"step_s": 0.1}} for n in (1, 3, 2)
-    ]
-    workers = [{"workers": 2, "seconds": 50.0, "photos_per_second": 4.0}]
-    rows = {"photos": [row], "pairs": pairs, "workers": workers, "gaussians": [row]}
-    report = markdown(ScaleBenchmark(out=Path("x")), rows)
-    assert "1,234, in memory | 0 | 300 | 300 | 300 | 100" in report
-    assert "2.000 of the time of one in memory (median of 3 pairs, 1.000 to 3.000)" in report
-    assert "| 2 | 50 | 4.0 |" in report
-    assert "| 56,789 |" in report
-    assert "Written before measuring" in report
+def test_the_report_holds_a_row_per_stage():
+    stages = [Stage("words", "20,000 Gaussians", 12.34, 9.87, "0.5 s", 2_500_000_000)]
+    report = markdown(ScaleBenchmark(out=Path("x")), stages)
+    assert "| words | 20,000 Gaussians | 12.3 | 9.9 | 0.5 s | 2.50 |" in report
+    assert "lang3dxl benchmark scale --out x" in report
+
+
+def test_zoomed_photos_have_more_pixels_and_as_many_tracks(tmp_path):
+    model = read_reconstruction(write_crowd(tmp_path / "3", 5, 50, zoom=3) / "sparse" / "0")
+    assert [(p.width, p.height) for p in model.photos.values()] == [(3 * w, 3 * h) for w, h in SIZES]
+    assert all(len(photo.points) >= 15 for photo in model.photos.values())

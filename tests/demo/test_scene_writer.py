@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.landmark.contact_sheet import contact_sheet
 from lang3dxl_ns.demo.landmark.labels import PART, SMALLEST_POSITIVE, building_mask, category_masks
 from lang3dxl_ns.demo.landmark.landmark import Landmark
 from lang3dxl_ns.demo.landmark.photography import take_photo
@@ -20,7 +19,7 @@ PHOTOS, SIZE, SEED = 12, (120, 90), 6
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("demo") / "scene", workers=2, contact_sheet=True)
+    return write(tmp_path_factory.mktemp("demo") / "scene", workers=2)
 
 
 def write(out, **changes):
@@ -45,7 +44,7 @@ def shot(number):
 
 
 def test_same_seed_gives_the_same_bytes_for_any_number_of_workers(folder, tmp_path):
-    again = write(tmp_path / "again", workers=1, contact_sheet=True)
+    again = write(tmp_path / "again", workers=1)
     files = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
     for path in files:
@@ -173,12 +172,6 @@ def test_world_frame_is_arbitrary(folder):
     assert np.linalg.det(rotation) == pytest.approx(1)
     assert abs(rotation[2, 2]) < 0.999
     assert similarity["scale"] != 1
-
-
-def test_contact_sheet_shows_the_truth_in_color(folder):
-    sheet = np.asarray(contact_sheet(folder)).astype(int)
-    assert (folder / "contact_sheet.jpg").is_file()
-    assert ((sheet[..., 2] - sheet[..., 0]) > 120).mean() > 0.002, "windows are painted blue"
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path):

@@ -1,14 +1,22 @@
 """The data manager's photo cache, and cameras that fit the photos as read."""
 
+import shutil
+import threading
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
+from PIL import Image, ImageOps
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.photo_cache import PhotoCache
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
+from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import view_matrix
-from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.geometry import sphere_around
 
 
@@ -53,18 +61,69 @@ def test_the_cache_raises_the_reading_error():
         cache.get(3, [])
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.37])
-def test_points_project_to_their_observations_through_the_whole_chain(scene, scale):
-    """COLMAP pose and lens → dataparser's frame → scaled pinhole: pixels agree with the model's tracks."""
+def test_the_first_that_fit_are_kept_and_the_rest_is_read_ahead_once_per_round():
+    reads = []
+    cache = PhotoCache(lambda i: reads.append(i) or photo(i), max_bytes=500)
+    for seed in range(3):
+        order = torch.randperm(20, generator=torch.Generator().manual_seed(seed)).tolist()
+        for place, index in enumerate(order):
+            assert int(cache.get(index, order[place + 1 : place + 4])["image"][0, 0]) == index
+    assert len(reads) == 20 + 2 * 15  # the first round, and then those that don't fit
+
+
+def test_several_photos_are_read_at_once():
+    together = threading.Barrier(3, timeout=10)
+
+    def read(index):
+        together.wait()
+        return photo(index)
+
+    cache = PhotoCache(read, max_bytes=0, readers=3)
+    assert int(cache.get(0, [1, 2])["image"][0, 0]) == 0
+
+
+def test_two_thousand_unusable_photos_in_a_row_are_passed_over():
+    manager = Lang3DXLDataManager.__new__(Lang3DXLDataManager)
+    torch.nn.Module.__init__(manager)
+    last = 2000
+
+    def read(index):
+        if index != last:
+            raise UserError("torn")
+        return photo(0)
+
+    manager.config = SimpleNamespace(read_ahead=2)
+    manager.train_dataset = SimpleNamespace(photos=[SimpleNamespace(name=str(i)) for i in range(last + 1)])
+    manager.__dict__["_train_cache"] = PhotoCache(read, 0)
+    manager._batch = lambda dataset, index, data: (SimpleNamespace(), {"name": str(index)})
+    manager._leave_out = lambda index, reason: None
+    manager.sample_train_cameras = lambda: [last]
+    manager.train_unseen_cameras = list(range(last + 1))
+    assert manager.next_train(0)[1]["name"] == str(last)
+
+
+@pytest.mark.parametrize(("scale", "exif"), [(1.0, 1), (0.37, 1), (1.0, 6), (0.37, 8), (1.0, 3)])
+def test_points_project_to_their_observations_through_the_whole_chain(scene, scale, exif, tmp_path):
+    """COLMAP pose and lens → upright photo → dataparser's frame → scaled pinhole: pixels agree with the
+    model's tracks, and show the file as EXIF says."""
+    if exif != 1:
+        scene = shutil.copytree(scene, tmp_path / "scene")
+        orientation = Image.Exif()
+        orientation[0x0112] = exif
+        for path in (scene / "images").glob("*.*"):
+            Image.open(path).save(path, exif=orientation, quality=95)
     parser = PhotoCollectionDataParserConfig(data=scene).setup()
     outputs = parser.get_dataparser_outputs(split="train")
-    dataset = PhotoDataset(outputs, scale)
-    geometries = read_reconstruction(scene / "sparse" / "0").photos
+    dataset = PhotoDataset(outputs, scale, WorkingPhotos(FeatureStore(scene / "cache")))
+    geometries = parser.reconstruction.photos
     transform, world_scale = outputs.dataparser_transform, outputs.dataparser_scale
     for i, taken in enumerate(dataset.photos):
         geometry, camera = geometries[taken.name], dataset.cameras[i]
         image = dataset.read(i)["image"]
         assert image.shape[:2] == (int(camera.height), int(camera.width))
+        upright = ImageOps.exif_transpose(Image.open(taken.path).convert("RGB"))
+        shown = upright.resize(image.shape[1::-1], Image.Resampling.BILINEAR)
+        assert (image.float() - torch.from_numpy(np.array(shown)).float()).abs().mean() < 2
         world = torch.cat([torch.tensor(geometry.points), torch.ones(len(geometry.points), 1)], dim=1).float()
         world = world @ transform.T * world_scale
         view = view_matrix(camera.camera_to_worlds)
@@ -83,3 +142,28 @@ def test_sky_surrounds_the_scene_evenly():
     assert float(radii.std() / radii.mean()) < 1e-5
     assert float(radii.min()) > 5 * float((points - 5).norm(dim=1).quantile(0.9))
     assert float((sky.mean(dim=0) - points.median(dim=0).values).norm() / radii.mean()) < 1e-2
+
+
+def test_thousands_of_unusable_photos_in_a_row_are_passed_over():
+    """More than Python's stack holds calls."""
+    count = 3_000
+
+    def read(index, _ahead):
+        if index != count - 1:
+            raise UserError("it is damaged")
+        return {}
+
+    manager = object.__new__(Lang3DXLDataManager)
+    photos = [SimpleNamespace(name=str(i)) for i in range(count)]
+    vars(manager).update(
+        train_unseen_cameras=list(range(count)),
+        train_dataset=SimpleNamespace(photos=photos, __len__=lambda: count),
+        config=SimpleNamespace(read_ahead=0),
+        _train_cache=SimpleNamespace(get=read),
+        _left_out=set(),
+        _gone=0,
+        _batch=lambda _dataset, index, _data: (SimpleNamespace(), {"name": str(index)}),
+        _leave_out=lambda *_: None,
+        sample_train_cameras=lambda: [count - 1],
+    )
+    assert manager.next_train(0)[1]["name"] == str(count - 1)

@@ -124,7 +124,7 @@ def test_a_query_is_what_evaluation_scores(scene, trainer, tiny_clip):
     scorer = open_scorer(SimpleNamespace(categories=["dome", "door"]), str(tiny_clip), "cpu")
     pipeline, camera = trainer.pipeline, scene.camera("photo_003.jpg")
     pipeline.eval()
-    maps = pipeline.evaluation.relevancy(view_of(camera), scorer.queries)
+    maps = pipeline.evaluation.relevancy(view_of(camera), scorer.queries, scorer.yardstick)
     for match, expected in zip(scene.query("dome; door", camera), maps, strict=True):
         seen = match.view.alpha >= scene.config.min_alpha
         np.testing.assert_allclose(match.relevancy[seen], expected.numpy()[seen], rtol=1e-5, atol=1e-6)
@@ -223,3 +223,13 @@ def test_a_view_has_the_size_of_the_photos_file(train, scene_photos):
         assert photo.size == file.size == (2 * photo.lens.width, 2 * photo.lens.height)
         assert scene.render(photo.name).pixels.shape[:2] == file.size[::-1]
     assert max(scene.render(photo.name, size=20).pixels.shape[:2]) == 20
+
+
+def test_a_run_of_a_version_without_some_settings_can_be_asked(trainer, tmp_path):
+    shutil.copytree(trainer.base_dir, tmp_path / "run")
+    config = tmp_path / "run" / "config.yml"
+    lines = config.read_text().splitlines(keepends=True)
+    config.write_text(
+        "".join(line for line in lines if not line.strip().startswith(("code_rate:", "unseen:")))
+    )
+    assert lang3dxl_ns.load_scene(config).query("dome").relevancy.any()

@@ -1,10 +1,13 @@
 """Exact resume: a resumed run equals the uninterrupted one to the last bit."""
 
+import signal
+
 import pytest
 import torch
 from conftest import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
 EVERYTHING = {
     "pipeline__model__encoder__name": "paper",
@@ -94,3 +97,17 @@ def test_a_damaged_photo_does_not_change_the_order_of_the_others(train, scene, w
     assert started + names(40) == whole_order
     datamanager._left_out.clear()
     datamanager.restore_round(state)
+
+
+def test_sigterm_ends_the_process_with_its_status_and_a_checkpoint(train, scene, monkeypatch, tmp_path):
+    original = Lang3DXLTrainer.train_iteration
+
+    def terminated(self, step):
+        if step == 1:
+            signal.raise_signal(signal.SIGTERM)
+        return original(self, step)
+
+    monkeypatch.setattr(Lang3DXLTrainer, "train_iteration", terminated)
+    with pytest.raises(SystemExit, match="143"):
+        train(scene, iterations=5, semantics=False, output_dir=tmp_path)
+    assert [path.name for path in tmp_path.rglob("*.ckpt")] == ["step-000000001.ckpt"]

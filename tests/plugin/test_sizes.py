@@ -1,50 +1,44 @@
 """Memory and time of training: the estimates, and the number of Gaussians that fit."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
+from lang3dxl_ns.common.stages import roughly
+from lang3dxl_ns.plugin import sizes
 from lang3dxl_ns.plugin import trainer as trainers
-from lang3dxl_ns.plugin.sizes import Sizes, plan, sizes_of
-
-SIZES = Sizes(numbers=62, network=6_000_000, pixels=700_000, looks=False, codes=0, decoded=0, on_gpu=False)
 
 
-@pytest.mark.parametrize("gaussians", [1, 1_000, 3_000_000])
-def test_as_many_gaussians_fit_as_the_memory_was_estimated_for(gaussians):
-    assert abs(SIZES.most(SIZES.memory(gaussians)) - gaussians) <= 1
+@pytest.fixture
+def model(scene, train):
+    return train(scene, iterations=1).pipeline.model
 
 
-def test_every_part_takes_memory():
-    least = SIZES.memory(1000)
-    for more in (
-        {"looks": True},
-        {"codes": 3},
-        {"decoded": 10_000},
-        {"pixels": 10**6},
-        {"network": 10**7},
-        {"on_gpu": True},
-    ):
-        assert replace(SIZES, **more).memory(1000) > least
+def cap(model, memory, monkeypatch, pixels=700_000, wanted=None):
+    monkeypatch.setattr(sizes, "memory_to_plan_with", lambda device: memory)
+    return sizes.plan(model, pixels, torch.device("cpu"), wanted)[0]
 
 
-def test_the_present_gaussians_are_kept_and_a_wish_is_obeyed(monkeypatch):
-    monkeypatch.setattr("lang3dxl_ns.plugin.sizes.memory_to_plan_with", lambda device: 1e6)  # too little
-    device = torch.device("cpu")
-    assert plan(SIZES, device, now=5_000, wanted=None)[0] == 5_000
-    assert plan(SIZES, device, now=5_000, wanted=70)[0] == 70
-    most, message = plan(SIZES, device, now=5_000, wanted=0)
+@pytest.mark.parametrize("gaussians", [10_000, 3_000_000])
+def test_as_many_gaussians_fit_as_the_memory_was_estimated_for(model, monkeypatch, gaussians):
+    fixed, each = sizes.bytes_of(model, 700_000)
+    assert abs(cap(model, fixed + gaussians * each, monkeypatch) - gaussians) <= 1
+
+
+def test_words_looks_and_pixels_take_memory(model, monkeypatch):
+    most = cap(model, 8e9, monkeypatch)
+    assert cap(model, 8e9, monkeypatch, pixels=12_000_000) < most
+    model.appearance = model.ssim
+    assert cap(model, 8e9, monkeypatch) < most
+    model.appearance = model.semantic_field = None
+    assert cap(model, 8e9, monkeypatch) > most
+
+
+def test_the_present_gaussians_are_kept_and_a_wish_is_obeyed(model, monkeypatch):
+    assert cap(model, 1e6, monkeypatch) == model.num_points  # too little
+    assert cap(model, 1e6, monkeypatch, wanted=70) == 70
+    monkeypatch.setattr(sizes, "memory_to_plan_with", lambda device: 1e6)
+    most, message = sizes.plan(model, 100, torch.device("cpu"), wanted=0)
     assert most == 0 and "no limit" in message
-
-
-def test_semantics_count_where_they_are_trained(scene, train):
-    gathered = train(scene, iterations=1).pipeline.model
-    trained = train(scene, iterations=1, pipeline__model__encoder__name="paper").pipeline.model
-    assert (sizes_of(gathered, 100, False).codes, sizes_of(gathered, 100, False).decoded) == (0, 0)
-    channels = len(trained.clip_mean) + len(trained.dense_mean)
-    assert sizes_of(trained, 100, False).codes == 3
-    assert sizes_of(trained, 100, False).decoded == 72**2 * channels
 
 
 def test_the_time_of_training_is_told_before_it_and_telling_changes_nothing(scene, train, monkeypatch):
@@ -53,9 +47,11 @@ def test_the_time_of_training_is_told_before_it_and_telling_changes_nothing(scen
     ticks = iter(range(1000))
     monkeypatch.setattr(trainers, "perf_counter", lambda: next(ticks))  # a rendering takes a second
     trainer = train(scene, iterations=2)
-    assert [line for line in said if "Gaussians multiply" in line] == [
-        "training: about 10 seconds for 2 iterations, more if Gaussians multiply"
-    ]
+    (line,) = (line for line in said if "Gaussians multiply" in line)
+    photos = len(trainer.pipeline.datamanager.train_dataset)
+    words = roughly(photos * trainers.RENDERINGS_PER_PHOTO + 0.1)
+    start = f"training: about 10 seconds for 2 iterations, then {words} to learn words"
+    assert line == f"{start}, more if Gaussians multiply"
     model, random = trainer.pipeline.model.train(), torch.get_rng_state()
     before = {name: value.clone() for name, value in model.state_dict().items()}
     trainer.config.max_num_iterations = 3000

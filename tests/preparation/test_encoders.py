@@ -12,13 +12,8 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
 from lang3dxl_ns.preparation import encoders
-from lang3dxl_ns.preparation.encoders import (
-    check_encoders,
-    find_model,
-    load_dense_encoder,
-    load_image_text_encoder,
-    option_prefix,
-)
+from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
+from lang3dxl_ns.preparation.model_files import check_encoders, find_model, option_prefix
 
 TEXTS = ["a rose window", "minaret", "the dome of a mosque, seen from far away in the evening light"]
 
@@ -138,6 +133,37 @@ def test_dense_features_are_the_patch_tokens_in_reading_order(dino_folder):
     features = encoder.encode(photo)
     assert features.shape == (6, 6, encoder.dim) == (6, 6, 32)
     torch.testing.assert_close(features.flatten(0, 1), output.last_hidden_state[0, 1:], rtol=1e-4, atol=1e-5)
+
+
+def _dinov3():
+    from transformers import DINOv3ViTConfig, DINOv3ViTModel
+
+    width = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+    return DINOv3ViTModel(DINOv3ViTConfig(**width, patch_size=16, image_size=64, num_register_tokens=4))
+
+
+def _radio():
+    from transformers import RadioConfig, RadioModel
+
+    config = RadioConfig(hidden_size=32, num_hidden_layers=2, num_attention_heads=2, max_img_size=128)
+    return RadioModel(config)
+
+
+@pytest.mark.parametrize("make", [_dinov3, _radio])
+@torch.no_grad()
+def test_register_tokens_and_a_networks_own_normalization_are_heeded(make, tmp_path):
+    torch.manual_seed(0)
+    model = make().eval()
+    for parameter in model.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)  # some start at zero
+    model.save_pretrained(tmp_path / "model")
+    encoder = load_dense_encoder(tmp_path / "model", "cpu", tokens=5)
+    photo = torch.rand(80, 80, 3, generator=torch.manual_seed(0))  # already 5 × 16 px: no resize
+    mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
+    pixels = photo if make is _radio else (photo - mean) / std
+    output = model(pixels.permute(2, 0, 1)[None])
+    expected = output.features[0] if make is _radio else output.last_hidden_state[0, 1 + 4 :]
+    torch.testing.assert_close(encoder.encode(photo).flatten(0, 1), expected, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("size", [(50, 130), (300, 40)])

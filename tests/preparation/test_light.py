@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 import torch
+from PIL import Image
 
 from lang3dxl_ns.preparation import prepare as module
 from lang3dxl_ns.preparation.encoders import BUILTIN, load_image_text_encoder
@@ -76,8 +77,9 @@ def test_targets_are_made_in_that_light(tmp_path, photo, monkeypatch):
         module, "build_clip_target", lambda image, *rest: seen.append(image) or build(image, *rest)
     )
     taken = Photo("a.png", tmp_path / "a.png", None, Lens(60, 40, 50.0, 50.0, 30.0, 20.0))
-    monkeypatch.setattr(Photo, "read", lambda self: 0.3 * photo)
-    monkeypatch.setattr(Photo, "content_hash", lambda self: "0")
+    Image.new("RGB", (60, 40)).save(taken.path)
+    dark = (0.3 * photo * 255).round().to(torch.uint8)
+    monkeypatch.setattr(Photo, "read_uint8", lambda self, scale: dark)
     config = PreparationConfig(clip=BUILTIN, dense="none")
     prepare([taken], None, config, [0.5], FeatureStore(tmp_path / "store"), "cpu")
-    torch.testing.assert_close(seen[0], in_known_light(0.3 * photo, 0.6))
+    torch.testing.assert_close(seen[0], in_known_light(dark / 255, 0.6))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import contextlib
 import errno
 import os
 import shutil
@@ -18,6 +17,7 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 from lang3dxl_ns.common import console as progress
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import prepare as module
+from lang3dxl_ns.preparation.dense_map import build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
 from lang3dxl_ns.preparation.prepare import TargetReader, prepare
 from lang3dxl_ns.preparation.pyramid import build_clip_target
@@ -73,7 +73,7 @@ def calls(monkeypatch):
 
     count(module, "build_clip_target", "clip")
     count(DenseEncoder, "encode", "dense")
-    count(Photo, "read", "read")
+    count(Photo, "read_uint8", "read")
     count(FelzenszwalbRegions, "labels", "regions")
     count(module, "load_image_text_encoder", "clip loaded")
     count(module, "load_dense_encoder", "dense loaded")
@@ -257,7 +257,7 @@ def test_a_disk_that_fills_up_keeps_what_was_written_and_nothing_half_written(
 
     def full_after_two(handle):
         written.append(handle)
-        if len(written) > 2:
+        if len(written) > 3:  # the first are the photos' hashes
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(handle)
 
@@ -267,6 +267,25 @@ def test_a_disk_that_fills_up_keeps_what_was_written_and_nothing_half_written(
     assert set(entries(store)) == {store.path(kind, NAMES[0]).name for kind in ("clip", "dense")}
     monkeypatch.undo()
     assert run(photos, config, store).encoded == 2
+
+
+def test_dense_clip_features_take_the_place_of_crops(photos, config, store, calls, models):
+    crops = run(photos, config, store).reader.clip("north/b.png")
+    dense = replace(config, clip_features="dense")
+    calls.clear()
+    reader = run(photos, dense, store).reader
+    assert calls == {"clip loaded": 1, "read": 3}  # no crop, and DINO's entries stay
+    found = reader.clip("north/b.png")
+    clip = load_image_text_encoder(models["clip"], "cpu")
+    grids = map_grids(80, 100, tokens=4, least=6)
+    expected = build_dense_map(photos[1].read(), grids, clip.encode_patches, 4, clip.patch_size, 1)
+    torch.testing.assert_close(found.features, expected.half(), atol=2e-3, rtol=2e-3)
+    assert found.features.shape[:2] == grids[-1] != crops.features.shape[:2]
+    assert (found.valid == 1).all() and found.crop_fractions == sorted(found.crop_fractions)
+    reader.check(clip)
+    calls.clear()
+    assert run(photos, dense, store).encoded == 0 and not calls
+    assert run(photos, replace(dense, dense_tokens=12), store).encoded == 3
 
 
 def test_without_dense_features_no_dense_entry_is_made_or_read(photos, config, store):
@@ -412,33 +431,6 @@ def test_a_long_run_shows_a_bar(photos, config, store, monkeypatch, capsys):
     assert "checking photos" in printed
     assert "encoding photos" in printed
     assert "2/2" in printed
-
-
-def test_what_another_process_is_making_is_waited_for_and_not_made_twice(
-    photos, config, store, calls, monkeypatch, tmp_path
-):
-    other = FeatureStore(tmp_path / "other")
-    run(photos, config, other)
-    calls.clear()
-    claim, asked = FeatureStore.claim, []
-
-    @contextlib.contextmanager
-    def busy_once(self, name):
-        asked.append(name)
-        if asked.count(NAMES[1]) == 1 and name == NAMES[1]:
-            for kind in ("clip", "dense"):
-                self.path(kind, name).parent.mkdir(exist_ok=True)
-                shutil.copy(other.path(kind, name), self.path(kind, name))
-            yield False
-        else:
-            with claim(self, name) as ours:
-                yield ours
-
-    monkeypatch.setattr(FeatureStore, "claim", busy_once)
-    monkeypatch.setattr(module, "_PATIENCE_S", 0)
-    assert run(photos, config, store).reader.names == NAMES
-    assert (calls["clip"], calls["dense"]) == (2, 2)
-    assert asked == [*NAMES, NAMES[1]]
 
 
 def test_the_configuration_is_a_command_line(models):

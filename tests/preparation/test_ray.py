@@ -12,7 +12,7 @@ from worker_tasks import Squares, prepare, write_photo
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.workers import Workers, _connect
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 @pytest.fixture(scope="module", autouse=True)

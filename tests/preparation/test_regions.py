@@ -22,6 +22,7 @@ from lang3dxl_ns.preparation.regions import (
     region_source,
     stored_labels,
 )
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.photo import Photo
 
@@ -105,7 +106,7 @@ def test_sam_labels_are_made_of_its_masks(sam, monkeypatch):
     for name, value in settings.items():
         monkeypatch.setitem(segmentation._AUTOMATIC, name, value)
     image = torch.rand(60, 90, 3, generator=torch.manual_seed(0))
-    source = region_source("sam", "small", sam, PHOTO.path, "cpu")
+    source = region_source(PreparationConfig(regions="sam", sam=sam), PHOTO.path, "cpu")
     assert isinstance(source, SamRegions)
     masks = torch.stack(source._sam.masks((image * 255).round().byte()))
     assert torch.equal(source.labels(PHOTO, image), label_map(masks, "small"))
@@ -116,7 +117,10 @@ def test_sam_labels_are_made_of_its_masks(sam, monkeypatch):
 
 def test_sam_settings_name_weights_and_level(sam):
     small, large = (
-        region_source("sam", level, sam, None, "cpu").settings(PHOTO) for level in ("small", "large")
+        region_source(PreparationConfig(regions="sam", sam=sam, region_level=level), None, "cpu").settings(
+            PHOTO
+        )
+        for level in ("small", "large")
     )
     assert small != large
     assert small["model"] == large["model"]
@@ -188,7 +192,7 @@ def test_a_file_that_is_not_a_label_map_is_a_user_error(tmp_path, file, content)
 
 def test_the_option_names_the_source(tmp_path):
     def kind(choice):
-        return type(region_source(choice, "small", "no/such-sam", tmp_path, "cpu"))
+        return type(region_source(PreparationConfig(regions=choice, sam="no/such-sam"), tmp_path, "cpu"))
 
     assert kind("none") is kind("auto") is type(None)
     assert kind("felzenszwalb") is FelzenszwalbRegions

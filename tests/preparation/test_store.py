@@ -15,7 +15,10 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation import store as module
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.photo import Photo
 
 SETTINGS = {"encoder": "abc", "crop_sides": [32, 64]}
 
@@ -234,24 +237,37 @@ def test_an_entry_with_a_flipped_bit_or_without_its_checksum_is_damaged(store, c
     assert not store.is_current("clip", "a.jpg", {"made": "before checksums"})
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_a_claim_excludes_other_processes_and_ends_with_its_own(store):
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        with store.claim("a.jpg") as ours:
-            os.write(writing, b"1" if ours else b"0")
-            time.sleep(60)
-        os._exit(0)
-    assert os.read(reading, 1) == b"1"
-    with store.claim("a.jpg") as ours:
-        assert not ours
-    with store.claim("b.jpg") as ours:
-        assert ours
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    with store.claim("a.jpg") as ours:
-        assert ours
+def test_entries_that_nobody_touched_are_not_read_to_know_that_they_are_whole(store, monkeypatch):
+    store.write("clip", "a.jpg", entry(), SETTINGS)
+    path, read = store.path("clip", "a.jpg"), []
+    checksum = module._checksum
+    monkeypatch.setattr(module, "_checksum", lambda tensors: read.append(1) or checksum(tensors))
+    assert store.is_current("clip", "a.jpg", SETTINGS) and not read
+    path.write_bytes(path.read_bytes())  # a copy, say
+    assert store.is_current("clip", "a.jpg", SETTINGS) and len(read) == 1
+    assert store.is_current("clip", "a.jpg", SETTINGS) and len(read) == 1
+
+
+def photo(path, content=b"1"):
+    path.write_bytes(content)
+    return Photo(path.name, path, None, Lens(4, 3, 5.0, 5.0, 2.0, 1.5))
+
+
+def test_photos_are_hashed_once_and_again_only_when_their_files_change(store, tmp_path, monkeypatch):
+    photos = [photo(tmp_path / name, name.encode()) for name in ("a.png", "b.png", "gone.png")]
+    photos[2].path.unlink()
+    read, content_hash = [], Photo.content_hash
+    monkeypatch.setattr(Photo, "content_hash", lambda self: read.append(self.name) or content_hash(self))
+    first = store.photo_hashes(photos)
+    assert (first["a.png"], first["b.png"]) == (content_hash(photos[0]), content_hash(photos[1]))
+    assert "gone.png" in str(first["gone.png"])
+    assert sorted(read) == ["a.png", "b.png"]
+    assert store.photo_hashes(photos).keys() == first.keys() and len(read) == 2
+    photo(tmp_path / "b.png", b"another")
+    assert store.photo_hashes(photos)["b.png"] == content_hash(photos[1]) != first["b.png"]
+    assert read[2:] == ["b.png"]
+    (store.root / "photo_hashes.json").write_text("[damaged")
+    assert store.photo_hashes(photos)["a.png"] == first["a.png"]
 
 
 def test_cleaning_keeps_what_is_named_and_reports_what_went(store):

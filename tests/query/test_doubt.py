@@ -54,6 +54,16 @@ def test_the_best_gaussians_decide_whatever_their_order():
     torch.testing.assert_close(peaks(relevancy[:, torch.randperm(1_000)]), best[None])
 
 
+def test_no_more_than_a_few_words_are_asked_together():
+    """All of them to millions of Gaussians would take gigabytes; the answers are the same."""
+    doubts, asked = scene_of(random(GAUSSIANS, 3), {}), []
+    whole = peaks(doubts._relevancy(doubts._queries(UNRELATED)))
+    relevancy = doubts._relevancy
+    doubts._relevancy = lambda queries: asked.append(len(queries.vectors)) or relevancy(queries)
+    torch.testing.assert_close(doubts._unrelated, whole, rtol=1e-5, atol=1e-6)
+    assert max(asked) <= 8 and sum(asked) >= len(UNRELATED)
+
+
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_hardly_any_gaussians_are_no_trouble(count):
     (doubt,) = scene_of(random(count, 3), {"thing": torch.ones(CHANNELS)}).ask("thing")

@@ -6,6 +6,7 @@ import pytest
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.find_run import find_config
+from lang3dxl_ns.query.run_file import SCENE_FILE
 
 
 @pytest.fixture
@@ -17,6 +18,7 @@ def runs(tmp_path, monkeypatch):
         (tmp_path / name).mkdir(parents=True)
         path = tmp_path / name / "config.yml"
         path.touch()
+        path.with_name(SCENE_FILE).touch()
         os.utime(path, (1000 + i, 1000 + i))
         made.append(path)
     return made
@@ -32,6 +34,16 @@ def test_a_folder_names_its_own_runs(runs, tmp_path):
         assert find_config(place).resolve() == runs[0]
     (tmp_path / "outputs" / "config.yml").touch()
     assert find_config(tmp_path / "outputs") == tmp_path / "outputs" / "config.yml"
+
+
+def test_newer_runs_of_other_methods_are_skipped(runs, tmp_path):
+    other = tmp_path / "outputs" / "b" / "splatfacto" / "2025"
+    other.mkdir(parents=True)
+    (other / "config.yml").touch()
+    assert find_config().resolve() == runs[1]
+    assert find_config(other).resolve() == other / "config.yml"  # named, so that the error can say why
+    with pytest.raises(UserError, match=r"no run of this method \(1 of others\)"):
+        find_config(other.parent)
 
 
 @pytest.mark.parametrize("place", ["nowhere", "nowhere/config.yml", "\0"])

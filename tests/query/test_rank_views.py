@@ -34,7 +34,7 @@ def ranks(pictures: dict[str, torch.Tensor], threshold: float = 0.5) -> list[str
     means = torch.cat([part[0] for part in parts.values()])
     scores = torch.cat([part[2] for part in parts.values()])
     views = {
-        name: VisibleGaussians(seen.camera, seen.rows + i * SIDE * SIDE, seen.pixels)
+        name: VisibleGaussians(seen.camera, seen.rows + i * SIDE * SIDE, seen.shares)
         for i, (name, (_, seen, _)) in enumerate(parts.items())
     }
     found = rank_views(views, means, scores, threshold)
@@ -65,7 +65,7 @@ def test_a_stray_pixel_is_no_peak():
 def test_what_is_hidden_does_not_count():
     means, seen, scores = view(spot(16))
     shown = scores < 0.5
-    hidden = VisibleGaussians(seen.camera, seen.rows[shown], seen.pixels[shown])
+    hidden = VisibleGaussians(seen.camera, seen.rows[shown], seen.shares[shown])
     found = rank_views({"seen": seen, "hidden": hidden}, means, scores, 0.5)
     assert found["hidden"].area == 0 and found["seen"].rank > found["hidden"].rank
 
@@ -74,3 +74,12 @@ def test_without_a_match_the_view_that_comes_closest_is_first():
     assert ranks({"far": spot(16, 0.25), "near": spot(16, 0.4)})[0] == "near"
     means, seen, scores = view(spot(16, 0.4))
     assert rank_views({"near": seen}, means, scores, 0.5)["near"].area == 0
+
+
+def test_a_gaussian_that_fills_a_large_view_has_a_rank():
+    """More pixels than half precision can count."""
+    camera = Camera(torch.eye(4), torch.tensor([[300.0, 0, 150], [0, 300, 150], [0, 0, 1]]), 300, 300)
+    wall = VisibleGaussians.of(camera, torch.tensor([90_000.0, 3e-3]))
+    torch.testing.assert_close(wall.pixels, torch.tensor([90_000.0, 3e-3]))
+    found = rank_views({"wall": wall}, torch.tensor([[0.0, 0, 1]] * 2), torch.tensor([0.9, 0.1]), 0.5)
+    assert 0 < found["wall"].rank <= 1 and found["wall"].area == pytest.approx(1)

@@ -86,6 +86,16 @@ def asdict_of(photo):
     return photo.name, photo.split, photo.camera_to_world, photo.lens, photo.size
 
 
+def test_common_words_need_no_clip(written):
+    """The CLIP that this scene names is nowhere."""
+    scene, path = written
+    found = read_scene(path, "cpu")
+    for word in ("dome", "windows", "pilasters"):
+        np.testing.assert_allclose(found.relevancy(word), scene.relevancy(word), atol=2e-3)
+    with pytest.raises(UserError, match="clip"):
+        found.relevancy("a word that nobody stored")
+
+
 def test_unknown_gaussians_stay_unknown(written):
     scene, path = written
     assert torch.equal(read_scene(path, "cpu").codes.isnan(), scene.codes.isnan())
@@ -108,7 +118,7 @@ def test_colors_alone_make_a_scene(tmp_path):
 def test_a_gaussian_of_one_color_takes_at_most_48_bytes(tmp_path):
     small, large = painted_scene(**decoded("lang3dxl")), painted_scene(**decoded("lang3dxl"))
     rows = torch.arange(len(large.splats)).repeat(4)
-    large = Scene(large.splats.select(rows), large.file, large.decoder, large.codes[rows])
+    large = painted_scene(splats=large.splats.select(rows), decoder=large.decoder, codes=large.codes[rows])
     sizes = [write_scene(tmp_path / "a.scene", scene) for scene in (small, large)]
     assert (sizes[1] - sizes[0]) / (3 * len(small.splats)) <= 48
 
@@ -118,7 +128,8 @@ def test_the_file_tells_what_it_is_without_paths_of_its_machine(written, tmp_pat
     told = describe_scene_file(path)
     assert told["provenance"].credit == "Painters" and told["gaussians"] == 5185 and told["photos"] == 4
     scene.file.photos[0] = replace(scene.file.photos[0], mask=str(tmp_path / "somewhere" / "mask.png"))
-    scene = Scene(scene.splats, replace(scene.file, data="/home/somebody/wall"), scene.decoder, scene.codes)
+    file = replace(scene.file, data="/home/somebody/wall")
+    scene = painted_scene(file=file, decoder=scene.decoder, codes=scene.codes)
     write_scene(path, scene)
     assert b"/home" not in path.read_bytes() and b"somewhere" not in path.read_bytes()
 

@@ -2,12 +2,12 @@
 
 from functools import partial
 
+import pytest
 import torch
 
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
-from lang3dxl_ns.plugin.lift_features import pixel_features
 from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.gathering import filled_pixels, gather
+from lang3dxl_ns.rendering.gathering import Pixels, filled_pixels, gather, lift_masks
 from lang3dxl_ns.scene.camera import Camera
 
 SIZE = 24
@@ -35,6 +35,11 @@ def cameras() -> list[Camera]:
     return views
 
 
+def whole(values: torch.Tensor) -> Pixels:
+    """Of values at every pixel, whose last channel is the foreground."""
+    return Pixels([values[..., :-1]], values[..., -1])
+
+
 def composite(camera: Camera, carried: torch.Tensor) -> torch.Tensor:
     scene = gaussians()
     rendering = rasterize(scene, camera, torch.zeros(len(carried), 1).double(), features=carried)
@@ -49,7 +54,7 @@ def test_a_lifted_feature_is_the_mean_of_the_pixels_weighted_by_the_contribution
         view[..., -1] = 1
         view[:, :3] = 0  # masked
     views = [
-        (lambda carried, camera=camera: composite(camera, carried), view)
+        (lambda carried, camera=camera: composite(camera, carried), whole(view))
         for camera, view in zip(cameras(), pixels, strict=True)
     ]
     lifted, mass = gather(5, views, 3, torch.zeros(1, dtype=torch.float64))
@@ -73,7 +78,10 @@ def test_the_memory_given_changes_nothing():
     views = [
         (
             lambda carried, camera=camera: composite(camera, carried),
-            torch.rand(SIZE, SIZE, 8, generator=generator, dtype=torch.float64),
+            Pixels(
+                [torch.rand(SIZE, SIZE, k, generator=generator, dtype=torch.float64) for k in (2, 5)],
+                torch.ones(SIZE, SIZE).double(),
+            ),
         )
         for camera in cameras()
     ]
@@ -98,7 +106,7 @@ def test_where_all_pixels_agree_the_rendered_feature_is_theirs_at_any_coverage()
     pixels = torch.cat([feature, torch.ones(1).double()]).expand(SIZE, SIZE, 4)
     camera = cameras()[0]
     encoder = LiftedFeatures(2, 1)
-    lifted = gather(5, [(lambda carried: composite(camera, carried), pixels)], 3, feature)
+    lifted = gather(5, [(lambda carried: composite(camera, carried), whole(pixels))], 3, feature)
     rendered = composite(camera, encoder.learn_gaussians(*lifted))
     clip, dense = encoder(rendered)
     seen = rendered[..., -1] > 1e-3
@@ -111,13 +119,22 @@ def test_pixels_have_the_targets_at_their_places_and_nothing_off_the_mask():
     ramp = ((torch.arange(8) + 0.5) / 8).expand(6, 8)[..., None]
     mask = torch.zeros(12, 16, dtype=torch.bool)
     mask[:, 8:] = True
-    pixels = pixel_features(ramp, torch.full((3, 3, 2), 5.0), mask, (12, 16))
+    pixels = Pixels.of([ramp, torch.full((3, 3, 2), 5.0)], (12, 16), mask).channels(0, 9)
     assert pixels.shape == (12, 16, 4)
     assert (pixels[:, :8] == 0).all()
     torch.testing.assert_close(pixels[:, 8:15, 0], ((torch.arange(16) + 0.5) / 16)[8:15].expand(12, 7))
     assert (pixels[:, 8:, 1:3] == 5).all() and (pixels[:, 8:, 3] == 1).all()
-    everywhere = pixel_features(ramp, None, None, (12, 16))
+    everywhere = Pixels.of([ramp], (12, 16)).channels(0, 9)
     assert (everywhere[..., -1] == 1).all() and everywhere.shape == (12, 16, 2)
+
+
+@pytest.mark.parametrize("step", [1, 2, 3, 5])
+def test_channels_a_few_at_a_time_are_all_channels(step):
+    draw = torch.Generator().manual_seed(5)
+    maps = [torch.rand(4, 5, 3, generator=draw), torch.rand(6, 6, 2, generator=draw)]
+    pixels = Pixels.of(maps, (9, 11), torch.rand(9, 11, generator=draw) > 0.3)
+    parts = [pixels.channels(first, first + step) for first in range(0, 6, step)]
+    torch.testing.assert_close(torch.cat(parts, dim=-1), pixels.channels(0, 6), rtol=0, atol=0)
 
 
 def test_the_order_of_photos_does_not_matter_and_a_photo_that_counts_nowhere_adds_nothing():
@@ -126,10 +143,10 @@ def test_the_order_of_photos_does_not_matter_and_a_photo_that_counts_nowhere_add
     for view in pixels:
         view[..., -1] = 1
     views = [
-        (lambda carried, camera=camera: composite(camera, carried), view)
+        (lambda carried, camera=camera: composite(camera, carried), whole(view))
         for camera, view in zip(cameras(), pixels, strict=True)
     ]
-    nothing = (views[0][0], torch.zeros(SIZE, SIZE, 4).double())
+    nothing = (views[0][0], whole(torch.zeros(SIZE, SIZE, 4).double()))
     there = gather(5, views, 3, torch.zeros(1, dtype=torch.float64))
     back = gather(5, [*views[::-1], nothing], 3, torch.zeros(1, dtype=torch.float64))
     torch.testing.assert_close(there[0], back[0])
@@ -148,7 +165,7 @@ def test_a_gaussians_feature_is_that_of_the_pixels_that_show_it():
             everything = composite(camera, torch.ones(5, 1, dtype=torch.float64))
             only = (weight > 0.5 * everything) & (weight > 1e-6)  # little else shows here
             pixels = torch.cat([features[index].expand(SIZE, SIZE, 3), torch.ones(SIZE, SIZE, 1)], dim=-1)
-            views.append((lambda carried, camera=camera: composite(camera, carried), only * pixels))
+            views.append((lambda carried, camera=camera: composite(camera, carried), whole(only * pixels)))
         found, mass = gather(5, views, 3, features)
         assert mass[index] > 0
         torch.testing.assert_close(found[index], features[index])
@@ -157,7 +174,7 @@ def test_a_gaussians_feature_is_that_of_the_pixels_that_show_it():
 def test_pixels_that_are_not_finite_do_not_count():
     target = torch.ones(4, 4, 2)
     target[0, 0, 1] = torch.nan
-    pixels = pixel_features(target, None, None, (4, 4))
+    pixels = Pixels.of([target], (4, 4)).channels(0, 3)
     assert pixels.isfinite().all() and (pixels[0, 0] == 0).all() and pixels[..., -1].sum() == 15
 
 
@@ -170,3 +187,17 @@ def test_pixels_that_a_gaussian_fills_are_its_weights():
         alone[index] = 1
         expected = (composite(camera, alone)[..., 0] * weight).sum()
         torch.testing.assert_close(filled[index], expected)
+
+
+def test_masks_vote_for_the_gaussians_that_they_show():
+    """A vote is the share of a Gaussian's pixels in masks, by sums over pixels; unseen ones get none."""
+    weights = torch.rand(2, 5, 7, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights[..., 3] = 0
+    masks = torch.rand(2, 5, 7, generator=torch.Generator().manual_seed(1)) > 0.6
+    views = [(lambda carried, w=w: w @ carried, mask) for w, mask in zip(weights, masks, strict=True)]
+    votes = lift_masks(4, views, torch.zeros(1, dtype=torch.float64))
+    expected = (weights * masks[..., None]).sum((0, 1, 2)) / weights.sum((0, 1, 2)).clamp_min(1e-9)
+    torch.testing.assert_close(votes, expected)
+    assert votes[3] == 0 and (votes[:3] > 0).all()
+    everything = [(composite, torch.ones_like(mask)) for composite, mask in views]
+    torch.testing.assert_close(lift_masks(4, everything, weights)[:3], torch.ones(3, dtype=torch.float64))

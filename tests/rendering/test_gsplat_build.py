@@ -55,7 +55,7 @@ def fake_compiler(monkeypatch):
     return install
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(TOOLKIT is None, reason="needs pip install 'lang3dxl-ns[cuda]'")
 def test_cub_is_compiled_linked_and_loaded(tiny, tmp_path):
     """About 20 seconds of processor time."""
@@ -207,3 +207,21 @@ def test_many_sources_are_united_once(tmp_path):
     assert all(f'"{source}"' in named for source in sources[:-1])
     before = [unit.stat().st_mtime_ns for unit in units]
     assert [unit.stat().st_mtime_ns for unit in gsplat_build._united(sources, tmp_path)] == before
+
+
+def test_a_toolkit_with_the_whole_chain_of_links_is_linked(tmp_path):
+    """conda and systems have libcudart.so.13 and libcudart.so.13.2.51; pip has one of them."""
+    (tmp_path / "lib").mkdir()
+    for name in ("libcudart.so.13", "libcudart.so.13.2.51"):
+        (tmp_path / "lib" / name).touch()
+    tree = gsplat_build._link_tree(Toolkit(tmp_path, "13.2", True), tmp_path / "tree")
+    assert (tree / "lib64" / "libcudart.so").resolve().parent == tmp_path / "lib"
+
+
+@pytest.mark.parametrize(("gpus", "arch"), [(0, "7.0;8.0;9.0"), (1, "8.6")])
+def test_an_images_list_of_architectures_counts_only_without_a_gpu(monkeypatch, gpus, arch):
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "7.0;8.0;9.0")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: ["sm_86"])
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (8, 6))
+    assert gsplat_build.device_arch() == arch

@@ -81,7 +81,7 @@ def test_float64_equals_the_reference_in_every_map_and_gradient(mode):
 
 @pytest.mark.parametrize("size", [0.015, 0.5])
 def test_float64_equals_the_reference_for_small_splats_and_for_dense_fog(size):
-    # Small splats take the smaller tiles; in fog nearly every pixel stops before its last Gaussian.
+    # In fog nearly every pixel stops before its last Gaussian.
     cloud = make_cloud(300, 34, 26, size=size)
     ours, theirs = cloud.leaves(), cloud.leaves()
     expected, found = cloud.render(rasterize_reference, theirs), cloud.render(rasterize, ours)

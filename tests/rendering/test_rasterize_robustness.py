@@ -4,7 +4,7 @@ import pytest
 import torch
 from splat_clouds import gaussians, gradients, make_cloud, maps, relative_error
 
-from lang3dxl_ns.rendering import Gaussians, rasterize, tile_plan
+from lang3dxl_ns.rendering import Gaussians, rasterize, torch_rasterizer
 from lang3dxl_ns.rendering.reference import rasterize_reference
 from lang3dxl_ns.scene.camera import Camera
 
@@ -143,12 +143,14 @@ def test_a_long_needle_is_as_exact_in_float32_far_from_its_center():
 
 
 @pytest.mark.parametrize("backend", ["torch"], indirect=True)
-def test_cutting_the_depth_order_into_segments_changes_nothing(monkeypatch):
+def test_the_size_of_a_chunk_changes_nothing(monkeypatch):
     cloud = make_cloud(500, 60, 40, size=0.15)
     whole = cloud.leaves()
     expected = cloud.render(rasterize, whole)
     expected_gradients = gradients(expected, whole)
-    monkeypatch.setattr(tile_plan.Footprints.segments, "__defaults__", (300,))
+    monkeypatch.setattr(torch_rasterizer, "ROWS_AT_A_TIME", 300)
+    monkeypatch.setattr(torch_rasterizer, "DEPTH", 5)
+    monkeypatch.setattr(torch_rasterizer, "TILES", {"cpu": 3})
     leaves = cloud.leaves()
     rendering = cloud.render(rasterize, leaves)
     torch.testing.assert_close(rendering.image, expected.image, atol=1e-12, rtol=0)
@@ -158,21 +160,27 @@ def test_cutting_the_depth_order_into_segments_changes_nothing(monkeypatch):
 
 @pytest.mark.parametrize("backend", ["torch"], indirect=True)
 def test_gaussians_close_to_the_camera_do_not_blow_up_the_memory(monkeypatch):
-    expand, expanded = tile_plan._expand, []
+    make_rows, made = torch_rasterizer._rows, []
+    composite, pixels = torch_rasterizer._composite, []
 
-    def counting(*arguments):
-        found = expand(*arguments)
-        expanded.append(len(found[0]))
-        return found
+    def counting(boxes, *rest):
+        made.append(int((boxes[:, 2:] - boxes[:, :2] + 1).prod(1).sum()))
+        return make_rows(boxes, *rest)
 
-    monkeypatch.setattr(tile_plan, "_expand", counting)
+    def measuring(rows, *rest):
+        pixels.append(rows[..., 0].numel() * torch_rasterizer.TILE**2)
+        return composite(rows, *rest)
+
+    monkeypatch.setattr(torch_rasterizer, "_rows", counting)
+    monkeypatch.setattr(torch_rasterizer, "_composite", measuring)
     cloud = make_cloud(3000, 320, 240, size=0.02)
     cloud.tensors["means"] *= 0.02
     cloud.tensors["view_matrix"][:3, 3] *= 0.02
     leaves = cloud.leaves(torch.float32)
     cloud.render(rasterize, leaves).image.sum().backward()
-    assert len(expanded) > 2
-    assert max(expanded) <= tile_plan.ROWS_PER_SEGMENT
+    assert len(made) > 2
+    assert max(made) <= torch_rasterizer.ROWS_AT_A_TIME
+    assert max(pixels) <= 64 * 32 * torch_rasterizer.TILE**2
     assert bool(leaves["means"].grad.isfinite().all())
 
 

@@ -105,7 +105,7 @@ def test_of_an_animation_the_first_picture_is_read(tmp_path, ending):
     assert make_photo(tmp_path / f"a.{ending}").read().min() > 0.95
 
 
-def test_exif_rotation_is_ignored(tmp_path):
+def test_without_a_model_that_was_turned_pixels_are_read_as_stored(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6  # "turn by 90 degrees"
     Image.new("RGB", (40, 30)).save(tmp_path / "a.jpg", exif=exif)

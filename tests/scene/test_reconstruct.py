@@ -1,5 +1,6 @@
 """From photos to a COLMAP model: poses are right, what is left out is named, a stopped one goes on."""
 
+import os
 import shutil
 
 import numpy as np  # before pycolmap
@@ -13,6 +14,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene import reconstruct as module
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.photo_folder import find_photos
+from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
 
 
@@ -66,9 +68,41 @@ def test_poses_are_those_that_the_photos_were_taken_from(reconstructed):
     assert distances.max() < 0.15  # of about 4 to the box
 
 
+def test_what_matches_measure_agrees_with_the_model(reconstructed):
+    """Else an honest model would be doubted; and a photo that is turned in it is."""
+    data, model, _ = reconstructed
+    model, database = pycolmap.Reconstruction(model), data / "lang3dxl_cache/reconstruction/database.db"
+    db = pycolmap.Database.open(database)
+    pairs = matched_pairs(db, model)
+    db.close()
+    rotations = rotations_of(model)
+    assert len(pairs) > 6 and doubtful_placements(rotations, pairs) == {}
+    rotations[1] = np.diag([-1.0, 1, -1]) @ rotations[1]
+    assert doubtful_placements(rotations, pairs) == {
+        1: "most of its matches are with photos that stand elsewhere"
+    }
+
+
 def test_all_photos_share_the_camera(reconstructed):
     _, model, _ = reconstructed
     assert pycolmap.Reconstruction(model).num_cameras() == 1
+
+
+def test_names_with_spaces_formats_of_the_web_and_odd_bytes(photos):
+    """As phones and messengers name photos. COLMAP's list of pairs separates names by spaces."""
+    folder = photos / "images"
+    for i in range(6):
+        (folder / f"photo_{i:03d}.jpg").rename(folder / f"Foto {i} (ä).jpg")
+    with Image.open(folder / "photo_006.jpg") as image:
+        image.save(folder / "one more.webp", quality=95)
+    os.rename(folder / "photo_006.jpg", os.fsencode(folder) + b"/caf\xe9.jpg")
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    assert report.registered == 7
+    (odd,) = (name for name, why in report.left_out.items() if "rename" in why)
+    assert odd.startswith("caf")
+    names = set(read_reconstruction(photos / "sparse" / "0").photos)
+    assert names == {*(f"Foto {i} (ä).jpg" for i in range(6)), "one more.webp"}
+    assert all(line.isprintable() for line in report.lines())
 
 
 def test_a_model_that_is_there_is_left_as_it_is(photos):
@@ -116,7 +150,7 @@ def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch):
         ),
     )
     reconstruct_scene(photos)
-    assert sorted(extracted) == [f"photo_{i:03d}.jpg" for i in range(7)]  # each once
+    assert sorted(extracted) == [f"{i:06d}.jpg" for i in range(7)]  # each once
     assert len(matched) == 7 * 6 // 2 - 10
 
 

@@ -26,8 +26,6 @@ class DemoScene:
     """Pixels of a landscape photo; wild photos are smaller."""
     height: int = 360
     """Pixels of a landscape photo."""
-    contact_sheet: bool = False
-    """Also write contact_sheet.jpg: six photos with their ground truth."""
     test_views: int = 24
     """Novel views for scoring (test_views/): cameras like the photos', plain light, no people. 0: none."""
     workers: int | None = None

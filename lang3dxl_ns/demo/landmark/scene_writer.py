@@ -17,7 +17,6 @@ from PIL import Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.landmark.contact_sheet import contact_sheet
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
 from lang3dxl_ns.demo.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
 from lang3dxl_ns.demo.landmark.landmark import Landmark
@@ -105,8 +104,6 @@ def write_scene(scene: DemoScene) -> Path:
         geometries = [_tracked(view, similarity) for view in views]
         write_novel_cameras(unfinished, geometries, same_light=not scene.wild)
     _write_description(unfinished, landmark, scene, similarity)
-    if scene.contact_sheet:
-        contact_sheet(unfinished).save(unfinished / "contact_sheet.jpg", quality=88)
     if out.exists():
         out.rmdir()  # it is empty: checked above
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -60,7 +60,7 @@ class Guard(Access):
         if refused is not None or _is_handshake(headers):
             return refused
         file = self.file(path)
-        if file is None:
+        if file is None or len(headers.get_all("Upgrade")) > 1:
             return HTTPStatus.NOT_FOUND, {}, b"404"
         if file != "/index.html" or self.root is None:
             return None

@@ -20,7 +20,7 @@ from lang3dxl_ns.query.negatives import competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.scene_file import Provenance
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.query.vocabulary import shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
 from lang3dxl_ns.query.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
@@ -60,7 +60,7 @@ class Page:
     def __init__(
         self,
         scene: Scene,
-        texts: Sequence[str] = (),
+        texts: Sequence[str | Prompt] = (),
         words: Sequence[str] = (),
         more: Sequence[str] = (),
         provenance: Provenance | None = None,
@@ -130,7 +130,7 @@ class Page:
         negatives = list(self.scene.text.config.negatives)
         asked = [plain(phrase) for prompt in self.prompts for phrase in (prompt.text, *prompt.negatives)]
         naming = list(dict.fromkeys(filter(None, map(plain, [*shipped_vocabulary(), *self._words, *asked]))))
-        words = list(dict.fromkeys([*naming, *filter(None, map(plain, self._more))]))
+        words = list(dict.fromkeys([*naming, *common_words(), *filter(None, map(plain, self._more))]))
         own = torch.cat([*self._encoded(meaning, negatives), *self._encoded(meaning, words)])
         special, extra = {}, [own]
         for i, word in enumerate(words):

@@ -1,0 +1,86 @@
+"""Settings without effect: hidden if they are nerfstudio's and never read, an error if they are set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, fields
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+
+import tyro
+
+from lang3dxl_ns.common.errors import UserError
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+
+Class = TypeVar("Class", bound=type)
+
+OF_SPLATFACTO = (
+    *("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt"),
+    *("warmup_length", "refine_every", "reset_alpha_every", "stop_split_at", "n_split_samples"),
+    *("cull_scale_thresh", "cull_screen_size", "split_screen_size", "stop_screen_size_at"),
+    *("use_scale_regularization", "max_gauss_ratio", "use_bilateral_grid", "grid_shape"),
+    *("color_corrected_metrics", "resolution_schedule"),
+)
+"""Splatfacto's own schedule and parts that this model does not have."""
+OF_IMAGE_CACHES = (
+    *("masks_on_gpu", "images_on_gpu", "cache_images", "cache_images_type", "max_thread_workers"),
+    *("eval_num_images_to_sample_from", "eval_num_times_to_repeat_images", "eval_image_indices"),
+)
+"""nerfstudio's caches of photos; here one bounded cache takes their place."""
+OF_COLMAP = (
+    *("downscale_rounding_mode", "depths_path", "depth_unit_scale_factor", "max_2D_matches_per_3D_point"),
+    "load_3D_points",
+)
+"""nerfstudio's reader of COLMAP models; this package's reads points always, and depths never."""
+_OF_RENDERINGS = (
+    *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up"),
+    "feature_gradient_to_geometry",
+)
+"""Settings of semantics that are trained with the scene."""
+
+
+def without(*names: str) -> Callable[[Class], Class]:
+    """A dataclass decorator that takes inherited settings off the command line."""
+
+    def hide(kind: Class) -> Class:
+        hints = get_type_hints(kind, include_extras=True)
+        for name in names:
+            kind.__annotations__[name] = tyro.conf.Fixed[hints[name]]  # type: ignore[valid-type, misc]
+        return kind
+
+    return hide
+
+
+def check_inert(config: Lang3DXLTrainerConfig) -> None:
+    """Raises UserError if a setting that has no effect in this run differs from its default."""
+    model, data = config.pipeline.model, config.pipeline.datamanager
+    changed = [
+        *(f"--pipeline.model.{name}" for name in _changed(model, OF_SPLATFACTO)),
+        *(f"--pipeline.datamanager.{name}" for name in _changed(data, OF_IMAGE_CACHES)),
+    ]
+    if changed:
+        raise UserError(
+            f"{_option(changed[0])} has no effect on lang3dxl, which never reads it: leave it off"
+        )
+    if model.encoder.learns_from_renderings:
+        return
+    changed = [f"--pipeline.model.{name}" for name in _changed(model, _OF_RENDERINGS)]
+    if data.regions not in ("auto", "none"):
+        changed.append("--pipeline.datamanager.regions")
+    if changed:
+        raise UserError(
+            f"{_option(changed[0])} has no effect where semantics are learned after training, as with "
+            f"--pipeline.model.encoder.name {model.encoder.name}: leave it off, or choose paper"
+        )
+
+
+def _changed(settings: Any, names: tuple[str, ...]) -> Iterator[str]:
+    for field in fields(settings):
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        if field.name in names and getattr(settings, field.name) != default:
+            yield field.name
+
+
+def _option(name: str) -> str:
+    return name.replace("_", "-")

@@ -1,0 +1,93 @@
+"""Crop budget: sizes and spacing of a photo's crops that an encoder can use, in a bounded number."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from lang3dxl_ns.preparation.physical_scale import SMALLEST_CROP, crop_sides, fine_crops
+from lang3dxl_ns.preparation.pyramid import HALF, THIRD, crop_count
+from lang3dxl_ns.preparation.settings import Quality
+
+MOST_CROPS: dict[Quality, float] = {"fast": 700, "normal": 2_500, "fine": math.inf}
+"""Crops of a photo for an encoder of 224 pixels. An encoder of half the side may have four times as many,
+which take about as long."""
+_USUAL_INPUT = 224
+_LEAST_SHARE = 1 / 4
+"""Side of the smallest crop, as a share of the encoder's input: enlarged more than that, a crop is a blur."""
+_GROWTH = 1.05
+"""Factor by which crops grow until they are few enough."""
+
+
+@dataclass(frozen=True)
+class Crops:
+    """The crops of a photo."""
+
+    sides: list[int]
+    """Pixels, ascending."""
+    sizes: list[float]
+    """Sides in world units, or in photo widths."""
+    steps: int
+    """Crops per side of the smallest; others have two."""
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of the smallest crops, in a photo of `height` × `width` pixels."""
+        return _grid(height, width, self.sides[0], self.steps)
+
+    def count(self, height: int, width: int) -> int:
+        """Number of crops in a photo of `height` × `width` pixels."""
+        larger = sum(math.prod(_grid(height, width, side, HALF)) for side in self.sides[1:])
+        return math.prod(self.grid(height, width)) + larger
+
+
+def choose_crops(
+    scales: Sequence[float],
+    pixel_size: float,
+    size: tuple[int, int],
+    is_fine: bool,
+    input_side: int,
+    quality: Quality,
+) -> Crops:
+    """The crops of a photo: those of the scales, but none that the encoder can't use, and no more than the
+    quality allows. They first move apart, from a third to half of their side, and then grow.
+
+    Args:
+        scales: sides in world units, or in photo widths.
+        pixel_size: world units per pixel of the photo; 1 / width for relative scales.
+        size: width and height of the photo in pixels.
+        is_fine: small crops alone (`fine_crops`) instead of the whole pyramid.
+        input_side: pixels of the encoder's input.
+        quality: bound of the number; "fine" has none, and crops down to 32 pixels.
+    """
+    width, height = size
+    most = MOST_CROPS[quality] * (_USUAL_INPUT / input_side) ** 2
+    least = 0.0 if quality == "fine" else _LEAST_SHARE * input_side
+    smallest = float(SMALLEST_CROP)
+    while True:
+        sides, sizes = crop_sides(scales, pixel_size, width, smallest)
+        if is_fine:
+            sides, sizes = fine_crops(sides[0], sizes[0])
+        if sides[0] >= min(least, width):
+            for steps in (THIRD, HALF) if is_fine else (HALF,):
+                crops = Crops(sides, sizes, steps)
+                if crops.count(height, width) <= most or smallest >= width:
+                    return crops
+        if smallest >= width:
+            return Crops(sides, sizes, HALF)
+        smallest = max(smallest, sides[-1] if is_fine else sides[0]) * _GROWTH
+
+
+def input_side(folder: Path) -> int:
+    """Pixels of the input of an encoder, by the configuration in its folder; 224 if that doesn't say."""
+    try:
+        side = json.loads((folder / "config.json").read_text())["vision_config"]["image_size"]
+        return side if isinstance(side, int) and side > 0 else _USUAL_INPUT
+    except (OSError, ValueError, LookupError, TypeError):
+        return _USUAL_INPUT
+
+
+def _grid(height: int, width: int, side: int, steps: int) -> tuple[int, int]:
+    return crop_count(height, side, steps), crop_count(width, side, steps)

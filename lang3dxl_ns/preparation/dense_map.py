@@ -1,0 +1,107 @@
+"""A photo's map of patch features from overlapping windows at two sizes, for small things as well."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lang3dxl_ns.common.memory import with_less_memory
+
+RULE = 1
+"""Increased when maps are made in another way, so that older ones are made again."""
+Grid = tuple[int, int]
+"""Rows and columns of patches."""
+EncodePatches = Callable[[Float[Tensor, "n 3 h w"]], Float[Tensor, "n rows columns c"]]
+
+_FINER = 1.75
+"""Of the second size to the first: two windows a quarter of which overlaps."""
+_OVERLAP = 0.25
+
+
+def map_grids(height: int, width: int, tokens: int, least: int) -> tuple[Grid, Grid]:
+    """The patches of a photo at both sizes, coarse and fine.
+
+    At the coarse size the photo's shorter side is one window; the fine one has 1.75 times as many patches, or
+    `least` along the longer side if those are more.
+
+    Args:
+        tokens: patches per side of a window.
+        least: patches along the longer side.
+    """
+    longer = tokens * max(height, width) / min(height, width)
+    factors = (1.0, max(_FINER, least / longer))
+    sides = [[round(f * tokens * side / min(height, width)) for side in (height, width)] for f in factors]
+    (a, b), (c, d) = sides
+    return (a, b), (c, d)
+
+
+@torch.no_grad()
+def build_dense_map(
+    photo: Float[Tensor, "h w 3"],
+    grids: Sequence[Grid],
+    encode: EncodePatches,
+    tokens: int,
+    patch_size: int,
+    batch_size: int,
+) -> Float[Tensor, "rows columns c"]:
+    """Mean over the sizes of the unit patch features, on the finest grid.
+
+    Args:
+        photo: RGB in 0…1.
+        grids: the patches of each size, the last one the finest: `map_grids`.
+        encode: features of windows of `tokens` patches per side, of `patch_size` pixels: `encode_patches`.
+        batch_size: windows encoded at once; fewer if memory runs out.
+    """
+    total = torch.zeros(())
+    for grid in grids:
+        one_size = partial(_one_size, photo, grid, encode, tokens, patch_size)
+        features = with_less_memory(one_size, batch_size)
+        total = total + F.interpolate(features[None], grids[-1], mode="bilinear", align_corners=False)[0]
+    return (total / len(grids)).permute(1, 2, 0).contiguous()
+
+
+def _one_size(
+    photo: Float[Tensor, "h w 3"],
+    grid: Grid,
+    encode: EncodePatches,
+    tokens: int,
+    patch_size: int,
+    batch_size: int,
+) -> Float[Tensor, "c rows columns"]:
+    """The map at one size: windows that overlap, each weighing less towards its edge."""
+    pixels = (grid[0] * patch_size, grid[1] * patch_size)
+    planes = photo.permute(2, 0, 1)[None]
+    image = F.interpolate(planes, pixels, mode="bicubic", antialias=True).clamp(0, 1)[0]
+    places = torch.cartesian_prod(*(window_starts(length, tokens) for length in grid))
+    side, tent = tokens * patch_size, _tent(tokens)
+    total, weight = torch.zeros(()), torch.zeros(grid)
+    for part in places.split(batch_size):
+        corners = (part * patch_size).tolist()
+        windows = torch.stack([image[:, y : y + side, x : x + side] for y, x in corners])
+        for (row, column), features in zip(part.tolist(), encode(windows), strict=True):
+            if not total.dim():
+                total = features.new_zeros(*grid, features.shape[-1])
+                tent, weight = tent.to(features), weight.to(features)
+            place = slice(row, row + tokens), slice(column, column + tokens)
+            total[place] += tent[..., None] * F.normalize(features, dim=-1)
+            weight[place] += tent
+    return (total / weight[..., None]).permute(2, 0, 1)
+
+
+def window_starts(length: int, tokens: int) -> Int[Tensor, " n"]:
+    """First patches of windows that cover `length` patches evenly and overlap by a quarter or more."""
+    shared = round(_OVERLAP * tokens)
+    count = max(math.ceil((length - shared) / (tokens - shared)), 1)
+    return torch.linspace(0, max(length - tokens, 0), count).round().long()
+
+
+def _tent(tokens: int) -> Float[Tensor, "t t"]:
+    rising = torch.arange(1.0, tokens + 1)
+    side = torch.minimum(rising, rising.flip(0))
+    return torch.outer(side, side)

@@ -1,0 +1,208 @@
+"""Finding and loading the files of pretrained models: local folders, the Hugging Face cache, downloads.
+
+Code that comes with a model is never run, and weights are read as plain tensors.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
+
+CLIP_OPTION = "--pipeline.datamanager.clip"
+DENSE_OPTION = "--pipeline.datamanager.dense"
+
+BUILTIN = "builtin"
+"""Name of the small encoders that ship with this package."""
+_PREFIX = "--pipeline.datamanager."
+option_prefix: ContextVar[str] = ContextVar("option_prefix", default=_PREFIX)
+"""Prefix of the options in the current command: `lang3dxl prepare` has none."""
+_DEMO = Path(__file__).parents[1] / "demo"
+_BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
+_WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
+_FILES = ("*.json", "*.txt", "*.model")
+"""Configuration, vocabularies, and SentencePiece models."""
+
+
+@dataclass(frozen=True)
+class ModelFiles:
+    """A model's local folder and a fingerprint of its contents."""
+
+    name: str
+    folder: Path
+    identity: str
+    """Of configuration and weights, not of the name: targets stay valid if the model is moved."""
+    option: str
+    """The option that chose the model, for messages."""
+
+
+def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
+    """A model's files: a local folder, a Hugging Face name (downloaded once), or "builtin", the CLIP
+    or dense encoder that ships with this package, depending on the option.
+
+    Raises UserError if there is no such folder, the model can't be downloaded, or files are missing.
+    """
+    name = str(name_or_dir)
+    local = expanded(name)
+    if name == BUILTIN:
+        folder = _BUILTIN_FOLDERS[option]
+    else:
+        folder = local if local.is_dir() else _download(name, option)
+    return ModelFiles(name, folder, _fingerprint(folder, option), option)
+
+
+class _NotDownloaded(UserError):
+    """A model is neither on disk nor can it be downloaded."""
+
+
+def check_encoders(clip: str, dense: str) -> None:
+    """Find both encoders, downloading missing ones; "none" and "auto" are skipped. Raises a single UserError
+    that names all unavailable ones and the remedy."""
+    wanted = {CLIP_OPTION: clip, DENSE_OPTION: dense}
+    missing: dict[str, str] = {}
+    for option, name in wanted.items():
+        try:
+            if name not in ("none", "auto"):
+                find_model(name, option)
+        except _NotDownloaded:
+            missing[option] = name
+    if missing:
+        folders = {option: f"DIR/{name.split('/')[-1]}" for option, name in missing.items()}
+        fetch = "; ".join(f"hf download {missing[o]} --local-dir {folders[o]}" for o in missing)
+        use = " ".join(f"{spoken(option)} {folder}" for option, folder in folders.items())
+        small = f"use the small encoders that come with this package: {spoken(CLIP_OPTION)} {BUILTIN}"
+        without = f"do without dense features, which makes words less sharp: {spoken(DENSE_OPTION)} none"
+        way_out = small if CLIP_OPTION in missing else without
+        raise UserError(
+            f"{' and '.join(missing.values())}: neither folders here nor in the Hugging Face cache, and "
+            f"the download fails. Either {way_out}. Or, on a machine with Internet: {fetch}; copy DIR here, "
+            f"and use {use}"
+        )
+
+
+def spoken(option: str) -> str:
+    """An option as spelled in the current command."""
+    return option.replace(_PREFIX, option_prefix.get())
+
+
+def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
+    """The model, frozen and in float32. Missing weights are an error, not random numbers."""
+    from safetensors import SafetensorError
+    from transformers.utils import logging
+
+    logging.disable_progress_bar()  # a second's work, and it would draw over ours
+    try:
+        model, report = model_class.from_pretrained(
+            files.folder,
+            local_files_only=True,
+            trust_remote_code=False,
+            dtype=torch.float32,
+            output_loading_info=True,
+        )
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
+        raise UserError(
+            f"{files.name}: the model in {files.folder} can't be loaded ({error}): download it again, or "
+            f"give {spoken(files.option)} another folder"
+        ) from error
+    missing = sorted(name for name in report["missing_keys"] if "pooler" not in name)  # poolers are not used
+    if missing:
+        raise UserError(
+            f"{files.name}: the weights in {files.folder} lack {len(missing)} tensors, the first being "
+            f"{missing[0]}: give {spoken(files.option)} a complete model"
+        )
+    return model.to(device).eval().requires_grad_(False)
+
+
+def load_processor(processor_class: Any, files: ModelFiles) -> Any:
+    """Preprocessor of a network's images and texts. Raises UserError if its files are missing."""
+    try:
+        return processor_class.from_pretrained(files.folder, local_files_only=True)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise UserError(
+            f"{files.folder} lacks files that preprocess the input of {files.name} ({error}): copy its "
+            "preprocessor_config.json and tokenizer files there, or download the model again"
+        ) from error
+
+
+def model_type(files: ModelFiles) -> str:
+    """The model type in its configuration ("clip"). Raises UserError if there is none."""
+    return read_config(files).model_type
+
+
+def read_config(files: ModelFiles) -> Any:
+    """A model's configuration. Raises UserError if its file isn't one."""
+    from transformers import AutoConfig
+
+    try:
+        return AutoConfig.from_pretrained(files.folder, trust_remote_code=False)
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"{files.folder / 'config.json'} is not a model's configuration: {error}") from error
+
+
+def _download(name: str, option: str) -> Path:
+    """The folder of a model in the Hugging Face cache, downloaded on first use."""
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import GatedRepoError
+
+    try:
+        for weights in _WEIGHTS:
+            folder = Path(snapshot_download(name, allow_patterns=[*_FILES, weights]))
+            if _weight_files(folder):
+                return folder
+    except GatedRepoError as error:
+        raise UserError(
+            f"{name} is gated: accept its license at https://huggingface.co/{name}, log in here with "
+            "`hf auth login`, and run the same command again"
+        ) from error
+    except (OSError, ValueError) as error:  # no network, no such model, not a name
+        raise _NotDownloaded(
+            f"the model {name} is neither a folder here nor in the Hugging Face cache, and it can't be "
+            f"downloaded ({type(error).__name__}). On a machine with Internet: "
+            f"hf download {name} --local-dir DIR; then {spoken(option)} DIR"
+        ) from error
+    raise UserError(f"the model {name} has no PyTorch weights ({' or '.join(_WEIGHTS)}): choose another")
+
+
+def _weight_files(folder: Path) -> list[Path]:
+    found = (sorted(folder.glob(pattern)) for pattern in _WEIGHTS)
+    return next((files for files in found if files), [])
+
+
+def _fingerprint(folder: Path, option: str) -> str:
+    """16 hex digits of everything that affects an image's embedding."""
+    config = folder / "config.json"
+    weights = _weight_files(folder)
+    if not config.is_file() or not weights:
+        raise UserError(
+            f"{folder} is not a model in Hugging Face format: it needs config.json and "
+            f"{' or '.join(_WEIGHTS)}; give {spoken(option)} the folder that holds them"
+        )
+    preprocessing = sorted(folder.glob("p*processor_config.json"))
+    digests = []
+    for path in [config, *preprocessing, *weights]:
+        status = path.stat()
+        digests.append(_digest(path, status.st_size, status.st_mtime_ns))
+    return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
+
+
+@lru_cache(maxsize=64)
+def _digest(path: Path, size: int, modified_ns: int) -> str:
+    """A file's SHA-256 (about a second per gigabyte), cached by size and modification time."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def has_files(folder: Path, *names: str) -> bool:
+    """Whether a folder has all of these files."""
+    return all((folder / name).is_file() for name in names)

@@ -1,0 +1,121 @@
+"""Photos at working size: decoded, turned upright, undistorted and shrunk once, kept beside the targets."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, UInt8
+from PIL import Image, PngImagePlugin
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import NoPictureError, open_picture
+from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene.camera import scaled_size
+from lang3dxl_ns.scene.photo import Photo
+
+PHOTOS, PHOTO_MASKS = "photos", "photo_masks"
+"""Kinds of entries in the store."""
+_QUALITY = 95
+"""Of JPEG: 46 dB, a tenth of the bytes of the pixels, 12 ms to decode 1,600 × 1,200 of them on one core."""
+_SMALL = 1_000_000
+"""Pixels of a file that is decoded as fast as a copy."""
+_RULE = 1
+"""Increased when photos are decoded in another way, so that older copies are made again."""
+
+
+class WorkingPhotos:
+    """Reads photos as `Photo.read_uint8` and `Photo.read_mask` do, from copies that it keeps in a store.
+
+    A copy is made when a photo is first read, if its file is large, and has to be shrunk, turned or
+    undistorted; again when the file or the lens has changed. Safe from several threads and processes.
+    """
+
+    def __init__(self, store: FeatureStore) -> None:
+        self._store = store
+
+    def read(self, photo: Photo, scale: float = 1.0) -> UInt8[Tensor, "h w 3"]:
+        """As `Photo.read_uint8`; raises like it, also if a copy is there but the file is gone."""
+        path = self._store.path(PHOTOS, photo.name).with_suffix(".jpg")
+        made_with = _made_with(photo, photo.path)
+        image = _kept(path, made_with, lambda copy: copy.info.get("comment"), "RGB")
+        if image is None:
+            if not _is_slow(photo, photo.path):
+                return photo.read_uint8(scale)
+            image = Image.fromarray(photo.read_uint8().numpy())
+            content = io.BytesIO()
+            image.save(content, "JPEG", quality=_QUALITY, comment=made_with)
+            self._keep(path, content)
+        return torch.from_numpy(np.array(_resized(image, photo, scale, Image.Resampling.BILINEAR)))
+
+    def mask(self, photo: Photo, scale: float = 1.0) -> Bool[Tensor, "h w"] | None:
+        """As `Photo.read_mask`; raises like it."""
+        source = photo.mask_path or photo.path
+        if (photo.mask_path is None and not photo.lens.distorts) or not _is_slow(photo, source):
+            return photo.read_mask(scale)
+        path = self._store.path(PHOTO_MASKS, photo.name).with_suffix(".png")
+        made_with = _made_with(photo, source)
+        image = _kept(path, made_with, lambda copy: copy.info.get("settings"), "1")
+        if image is None:
+            mask = photo.read_mask()
+            assert mask is not None
+            image = Image.fromarray(mask.numpy())
+            text, content = PngImagePlugin.PngInfo(), io.BytesIO()
+            text.add_text("settings", made_with)
+            image.save(content, "PNG", pnginfo=text)
+            self._keep(path, content)
+        return torch.from_numpy(np.array(_resized(image, photo, scale, Image.Resampling.NEAREST)))
+
+    def _keep(self, path: Path, content: io.BytesIO) -> None:
+        """Write a copy; without room or permission, the photo is decoded anew each time."""
+        try:
+            self._store.write_bytes(path, content.getvalue(), path.name)
+        except UserError:
+            return
+
+
+def _made_with(photo: Photo, source: Path) -> str:
+    """Everything that determines a copy. Raises UserError if the source is missing."""
+    lens = photo.lens
+    camera = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion, lens.fisheye] if lens.distorts else None
+    size = [photo.width, photo.height, photo.quarter_turns]
+    return json.dumps({"file": photo.stamp(source), "size": size, "undistorted": camera, "rule": _RULE})
+
+
+def _is_slow(photo: Photo, source: Path) -> bool:
+    """Whether reading a file takes longer than reading a copy at the photo's size."""
+    try:
+        with open_picture(source) as image:
+            pixels = math.prod(image.size)
+    except (OSError, NoPictureError):
+        return False  # reading it says why
+    shrinks = pixels > 1.2 * photo.width * photo.height
+    return pixels > _SMALL and (shrinks or photo.lens.distorts or photo.quarter_turns > 0)
+
+
+def _kept(path: Path, made_with: str, note: Callable[[Image.Image], Any], mode: str) -> Image.Image | None:
+    """A copy's pixels, if it is whole and was made like this."""
+    if not path.is_file():
+        return None
+    try:
+        with open_picture(path) as copy:
+            written = note(copy)
+            written = written.decode(errors="replace") if isinstance(written, bytes) else written
+            if written != made_with:
+                return None
+            copy.load()
+            return copy if copy.mode == mode else copy.convert(mode)
+    except (OSError, NoPictureError):
+        return None
+
+
+def _resized(image: Image.Image, photo: Photo, scale: float, method: Image.Resampling) -> Image.Image:
+    size = scaled_size(photo.width, photo.height, scale)
+    return image if image.size == size else image.resize(size, method)

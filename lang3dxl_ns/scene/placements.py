@@ -1,0 +1,85 @@
+"""Doubtful placements of photos in a reconstruction, as on a building that looks alike from several sides.
+
+A photo on the wrong side agrees with the photos there, since they look alike, and contradicts its true
+neighbors: the rotation between two photos, measured from their matches alone, then differs from the model's.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+
+if TYPE_CHECKING:
+    import pycolmap
+
+LEAST_MATCHES = 15
+"""Verified matches from which a pair of photos has a say, as in COLMAP's mapper."""
+APART = 20.0
+"""Degrees between the measured and the model's rotation from which they contradict each other."""
+
+
+@dataclass(frozen=True)
+class MatchedPair:
+    """Two photos by their numbers, and what their matches alone say of them."""
+
+    first: int
+    second: int
+    matches: int
+    """Verified ones."""
+    turn: Float[Array, "3 3"]
+    """Rotation from the first camera to the second."""
+
+
+def doubtful_placements(
+    rotations: Mapping[int, Float[Array, "3 3"]], pairs: Iterable[MatchedPair]
+) -> dict[int, str]:
+    """The photos whose matches contradict their place more than they support it, or support it by one other
+    photo alone, with the reason. rotations: world → camera in the model."""
+    supporting, contradicting, supporters = Counter[int](), Counter[int](), Counter[int]()
+    for pair in pairs:
+        modeled = rotations[pair.second] @ rotations[pair.first].T
+        apart = np.degrees(np.arccos(np.clip((np.trace(modeled.T @ pair.turn) - 1) / 2, -1, 1)))
+        for photo in (pair.first, pair.second):
+            (contradicting if apart > APART else supporting)[photo] += pair.matches
+            supporters[photo] += apart <= APART
+    reasons = {}
+    for photo in rotations:
+        if contradicting[photo] > supporting[photo]:
+            reasons[photo] = "most of its matches are with photos that stand elsewhere"
+        elif supporters[photo] < 2 and len(rotations) > 3:
+            reasons[photo] = "only one other photo supports it"
+    return reasons
+
+
+def matched_pairs(database: pycolmap.Database, model: pycolmap.Reconstruction) -> list[MatchedPair]:
+    """The verified pairs among a model's photos; those without depth or with few matches are left out."""
+    pycolmap = load_pycolmap()
+    cameras = {i: model.cameras[image.camera_id] for i, image in model.images.items() if image.has_pose}
+    points = {number: database.read_keypoints(number)[:, :2].astype(float) for number in cameras}
+    found = []
+    for key, matches in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(key)
+        if matches < LEAST_MATCHES or first not in cameras or second not in cameras:
+            continue
+        geometry = database.read_two_view_geometry(first, second)
+        measured = pycolmap.estimate_two_view_geometry_pose(
+            cameras[first], points[first], cameras[second], points[second], geometry
+        )
+        if measured and geometry.cam2_from_cam1 is not None:
+            turn = geometry.cam2_from_cam1.rotation.matrix()
+            found.append(MatchedPair(first, second, int(matches), turn))
+    return found
+
+
+def rotations_of(model: pycolmap.Reconstruction) -> dict[int, Float[Array, "3 3"]]:
+    """World → camera of the model's photos, by number."""
+    posed = (image for image in model.images.values() if image.has_pose)
+    return {image.image_id: image.cam_from_world().rotation.matrix() for image in posed}

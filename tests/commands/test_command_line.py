@@ -1,0 +1,121 @@
+"""Mistakes on the command line, and what a terminal can do: hints at once, never a traceback."""
+
+import io
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from lang3dxl_ns import cli
+from lang3dxl_ns.commands.demo import Demo
+from lang3dxl_ns.commands.query import file_names, parse_texts
+from lang3dxl_ns.common.console import accept_any_console
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.text import Prompt
+
+
+def shell(line: str, **environment: str) -> subprocess.CompletedProcess:
+    words = f"{sys.executable} -m lang3dxl_ns.cli {line}"
+    return subprocess.run(
+        ["bash", "-c", words], capture_output=True, env={**os.environ, **environment}, timeout=120
+    )
+
+
+def test_the_version_is_told(capsys):
+    cli.main(["--version"])
+    assert capsys.readouterr().out[0].isdigit()
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["qeury"], "did you mean query"),
+        (["benchmark", "rasteriser"], "did you mean rasterizer"),
+        (["xyzzy"], "--help lists all"),
+        (["query", "none", "--out", "found"], "there is no --text"),
+        (["query", "none", "--text", " ; ", "--out", "found"], "the prompt is empty"),
+        (["prepare", "--data", "nowhere", "--clip", "nobody/nothing"], "nowhere is not a folder"),
+        (["prepare", "--data", ".", "--crop-batch", "0", "--clip", "builtin"], "--crop-batch is 0"),
+        (["demo", "--photos", "0"], "--photos is 0"),
+        (["demo", "--steps", "-5"], "--steps is -5"),
+        (["view", "none", "--port", "99999"], "the port is 99999"),
+        (["view", "none", "--port", "-1"], "the port is -1"),
+        (["view", "none", "--host", "no.such.host.invalid"], "is not an address of this machine"),
+        (["view", "none", "--host", "192.0.2.1"], "is not an address of this machine"),
+        (["query", "~nosuchuser/run", "--text", "a", "--out", "found"], "no such user"),
+    ],
+)
+def test_mistakes_are_told_with_the_remedy(words, hint, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=hint):
+        cli.main(words)
+
+
+def test_a_text_without_its_flag_is_told(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["query", "run", "windows", "--out", "found"])
+    assert "Texts follow --text" in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_is_not_replaced_silently():
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        pytest.raises(SystemExit, match="is taken by another program"),
+    ):
+        cli.main(["view", "none", "--port", str(server.getsockname()[1])])
+
+
+def test_negatives_for_all_texts():
+    (first, second) = parse_texts(['"dome" not "roof"; tower'], ["sky"])
+    assert first == Prompt("dome", ("roof", "sky")) and second == Prompt("tower", ("sky",))
+
+
+def test_a_photo_with_a_very_long_name_still_has_files():
+    names = file_names(["ä" * 120 + ".jpg", "ä" * 120 + "b.jpg", "a.jpg"])
+    assert len(set(names)) == 3 and max(len(f"{n}.overlay.png".encode()) for n in names) <= 255
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    done = shell("preset | head -c 1; exit ${PIPESTATUS[0]}")
+    assert b"Traceback" not in done.stderr and b"Exception ignored" not in done.stderr
+
+
+def test_a_full_output_is_one_line():
+    done = shell("preset > /dev/full")
+    assert done.returncode == 1
+    assert done.stderr.decode().strip() == "Error: the output can't be written: No space left on device"
+
+
+def test_consoles_without_a_character_show_it_escaped(monkeypatch):
+    narrow = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", narrow)
+    accept_any_console()
+    print("façade", flush=True)
+    assert narrow.buffer.getvalue() == b"fa\\xe7ade\n"
+
+
+def scene(folder, **figures):
+    folder.mkdir(parents=True)
+    (folder / "scene.json").write_text(json.dumps(figures))
+
+
+def test_another_demo_finds_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene(tmp_path / "lang3dxl-demo" / "scene", seed=2, wild=True, photos=24, test_views=8)
+    assert Demo(quick=True)._folder().name == "lang3dxl-demo"
+    assert Demo()._folder().name == "lang3dxl-demo-2"
+    scene(tmp_path / "lang3dxl-demo-2" / "scene", seed=2, wild=True, photos=48, test_views=24)
+    assert Demo()._folder().name == "lang3dxl-demo-2"
+    with pytest.raises(UserError, match=r"photos 24, not 48"):
+        Demo(out=tmp_path / "lang3dxl-demo")._folder()
+
+
+@pytest.mark.parametrize("text", ["", "3", "[" * 9999])
+def test_a_damaged_description_of_a_demo_is_named(tmp_path, text):
+    scene(tmp_path / "demo" / "scene")
+    (tmp_path / "demo" / "scene" / "scene.json").write_text(text)
+    with pytest.raises(UserError, match=r"scene\.json can't be read"):
+        Demo(out=tmp_path / "demo")._folder()

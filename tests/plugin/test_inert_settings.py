@@ -1,0 +1,65 @@
+"""Settings without effect are not offered, and an error if they are set."""
+
+from copy import deepcopy
+
+import pytest
+import tyro
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.plugin.inert_settings import OF_COLMAP, OF_IMAGE_CACHES, OF_SPLATFACTO, check_inert
+
+
+def changed(path, value):
+    config = deepcopy(lang3dxl.config)
+    *owners, name = path.split(".")
+    owner = config
+    for part in owners:
+        owner = getattr(owner, part)
+    assert hasattr(owner, name)
+    setattr(owner, name, value)
+    return config
+
+
+def test_the_help_does_not_offer_them(capsys):
+    with pytest.raises(SystemExit):
+        tyro.cli(
+            tyro.conf.SuppressFixed[type(lang3dxl.config)], default=deepcopy(lang3dxl.config), args=["--help"]
+        )
+    said = "".join(capsys.readouterr().out.split()).replace("│", "")
+    for owner, names in (("model", OF_SPLATFACTO), ("datamanager", OF_IMAGE_CACHES)):
+        options = [f"--pipeline.{owner}.{name.replace('_', '-')}" for name in names if name != "prompt"]
+        assert not [option for option in options if option in said]
+    assert "model.densify-from" in said and "manager.clip" in said
+    assert OF_COLMAP
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("pipeline.model.stop_split_at", 0),
+        ("pipeline.model.refine_every", 7),
+        ("pipeline.model.use_bilateral_grid", True),
+        ("pipeline.datamanager.cache_images", "cpu"),
+        ("pipeline.model.clip_weight", 0.0),
+        ("pipeline.model.dense_weight", 0.5),
+        ("pipeline.model.decode_size", (80, 120)),
+        ("pipeline.model.warm_up", 0.5),
+        ("pipeline.model.feature_gradient_to_geometry", True),
+        ("pipeline.datamanager.regions", "felzenszwalb"),
+    ],
+)
+def test_setting_one_is_an_error_that_names_it(path, value, tmp_path):
+    config = changed(path, value)
+    config.output_dir = tmp_path
+    with pytest.raises(UserError, match=f"--{path.replace('_', '-')} has no effect"):
+        config.set_timestamp()
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_trained_with_the_scene_may_set_its_weights():
+    config = changed("pipeline.model.encoder.name", "paper")
+    config.pipeline.model.clip_weight = 0.0
+    config.pipeline.datamanager.regions = "felzenszwalb"
+    check_inert(config)
+    check_inert(changed("pipeline.datamanager.regions", "none"))
