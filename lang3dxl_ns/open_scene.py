@@ -9,6 +9,7 @@ import torch
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.query.find_run import OUTPUTS, find_config
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.scene import Scene, text_encoder
@@ -55,7 +56,7 @@ def find_scene_file(path: str | Path | None = None) -> Path | None:
 
     Raises UserError if there is neither a scene nor a run.
     """
-    place = OUTPUTS if path is None else Path(path).expanduser()
+    place = OUTPUTS if path is None else expanded(path)
     if place.suffix == SUFFIX or place.is_file():
         return None if place.suffix == ".yml" else place
     folder = place if any(place.glob(f"*{SUFFIX}")) else find_config(path).parent

@@ -9,10 +9,10 @@ import pytest
 from painted_scene import painted_scene
 from PIL import Image
 
-from lang3dxl_ns import together
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.text import parse_prompts
 
 
@@ -51,7 +51,7 @@ COMMANDS = {
     "evaluate pool --out report --reports silent.json": "it does not say what was scored",
     "evaluate pool --out report --reports none.json": "there is no none.json",
     "evaluate split --ground-truth label --out list --per-category 0": "--per-category is 0: give 1 or more",
-    "export": "give one of --out FILE.ply and --web FOLDER",
+    "export": "give one of --out FILE.ply, --web FOLDER",
     "export --out a.ply --text dome --text tower": "a splat file is of one --text",
     "doctor --build": "name a compute capability, such as --arch 8.6",
     "benchmark gpu --out report": "lang3dxl doctor says why",
@@ -106,9 +106,9 @@ def test_ground_truth(write, message, tmp_path):
     ("wrong", "message"),
     [
         (lambda scene: scene.query("dome", threshold=1.5), "give a relevancy from 0 to 1"),
-        (lambda scene: scene.query_gaussians("dome; window"), "score Gaussians for one at a time"),
+        (lambda scene: scene.relevancy("dome; window"), "ask for one at a time"),
         (lambda scene: scene.query('not "dome"'), "put what to find first"),
-        (lambda scene: scene.query("dome")[0].save("dome.txt"), "end it in .png or .jpg"),
+        (lambda scene: scene.query("dome").save("dome.txt"), "end it in .png or .jpg"),
         (lambda scene: together([]), "pass the matches of a single query"),
         (lambda scene: scene.render(np.eye(3)), r"a pose has shape \[3, 4\] or \[4, 4\]"),
         (lambda scene: scene.render("none.jpg"), "none.jpg"),

@@ -66,9 +66,10 @@ class EvaluateRun:
     """
 
     run: tyro.conf.Positional[Path | None] = None
-    """Folder of the run, or its config.yml (default: the newest under outputs/)."""
+    """Folder of the run, or its config.yml (default: the newest under outputs/); or a .scene file, whose
+    words are scored with --ground-truth, without its run and its photos."""
     split: Literal["held-out", "seen", "test"] = "held-out"
-    """Photos held out of training, labeled training photos, or the scene's test views."""
+    """Photos held out of training, labeled training photos, or the run's test views."""
     ground_truth: Path | None = None
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
     layout: Layout | Literal["auto"] = "auto"
@@ -79,6 +80,9 @@ class EvaluateRun:
     """Folder for the report."""
 
     def main(self) -> None:
+        if self.run is not None and self.run.suffix == ".scene":
+            self._score_scene(self.run)
+            return
         from lang3dxl_ns.plugin.open_run import open_run
 
         if self.split == "test" and (self.ground_truth is not None or self.layout != "auto"):
@@ -93,6 +97,17 @@ class EvaluateRun:
             pipeline.config.ground_truth_layout = self.layout
         results = pipeline.evaluation.scored(get_std=True)
         write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
+
+    def _score_scene(self, file: Path) -> None:
+        from lang3dxl_ns.evaluation.score_scene import score_scene
+        from lang3dxl_ns.open_scene import load_scene
+
+        if self.ground_truth is None or self.split == "test":
+            raise UserError(f"{file} is scored with --ground-truth FOLDER, --split held-out or seen")
+        truth = GroundTruth(self.ground_truth, self.layout)
+        photos, protocol = score_scene(load_scene(file), truth, self.split)
+        results = average(list(photos.values()), with_deviation=True)
+        write_scores(self.out, self.scene or file.stem, results | {"protocol": protocol, "photos": photos})
 
 
 @dataclass(kw_only=True)

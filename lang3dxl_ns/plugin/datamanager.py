@@ -75,9 +75,9 @@ class Lang3DXLDataManager(FullImageDatamanager):
         config.check()
         self._left_out: set[int] = set()
         self._gone = 0
+        if config.data is not None:
+            config.dataparser.data = Path(config.data)
         if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
-            if config.data is not None:
-                config.dataparser.data = Path(config.data)
             # a run's own cameras are never found anew: its Gaussians would not fit them
             config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
             config.data = config.dataparser.data

@@ -37,10 +37,11 @@ def bytes_of(model: Lang3DXLModel, pixels: int) -> tuple[float, float]:
     numbers = sum(p.numel() for p in model.gauss_params.values()) / count
     others = sum(p.numel() for p in model.parameters()) - numbers * count
     words = WORDS if model.semantic_field is not None and model.semantic_field.needs_lifting else 0.0
-    codes = PER_CODE * model.gauss_params["codes"].shape[1] if model.learns_from_renderings else 0.0
-    fixed = PER_PARAMETER * others + max((PER_PIXEL + codes) * pixels, words)
+    codes = model.gauss_params.get("codes") if model.learns_from_renderings else None
+    of_codes = 0.0 if codes is None else PER_CODE * codes.shape[1]
+    fixed = PER_PARAMETER * others + max((PER_PIXEL + of_codes) * pixels, words)
     looks = 0.0 if model.appearance is None else PER_LOOK
-    return fixed, PER_PARAMETER * numbers + PER_GAUSSIAN + codes + looks
+    return fixed, PER_PARAMETER * numbers + PER_GAUSSIAN + of_codes + looks
 
 
 def memory_to_plan_with(device: torch.device) -> float:

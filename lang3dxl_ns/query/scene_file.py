@@ -27,7 +27,7 @@ from torch import Tensor
 from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import SemanticEncoder
 from lang3dxl_ns.components.looks import Looks
@@ -194,7 +194,7 @@ def read_scene(
     Raises:
         UserError: the file is missing, damaged, cut short, or of a newer version.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     with _reported(path):
         return _read(path, torch.device(device or best_device()), config, encode_texts)
 
@@ -205,7 +205,7 @@ def describe_scene_file(path: str | Path) -> dict[str, Any]:
 
     Raises UserError as `read_scene` does; no tensor is read.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     with _reported(path), _opened(path) as file:
         described, sizes = _description(file), _sizes(file)
         return {

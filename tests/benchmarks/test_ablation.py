@@ -275,7 +275,7 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
 def test_labels_of_held_out_photos_alone_are_enough():
     photos = [SimpleNamespace(name="a.jpg"), SimpleNamespace(name="b.jpg")]
     pipeline = SimpleNamespace(
-        scorer=SimpleNamespace(truth=SimpleNamespace(key=lambda name: None)),
+        evaluation=SimpleNamespace(scorer=SimpleNamespace(truth=SimpleNamespace(key=lambda name: None))),
         datamanager=SimpleNamespace(train_dataset=SimpleNamespace(photos=photos), test_views=None),
     )
     assert _beside(pipeline) == {}

@@ -48,6 +48,9 @@ def test_a_named_colmap_model_that_is_not_there(start, folder):
 def test_neither_colmap_model_nor_photos(start, folder):
     shutil.rmtree(folder / "sparse")
     shutil.rmtree(folder / "images")
+    with pytest.raises(UserError, match="is empty: give the folder with your photos"):
+        start(folder)
+    (folder / "notes.txt").write_text("no photo")
     with pytest.raises(UserError, match=r"no COLMAP model.*lang3dxl reconstruct"):
         start(folder)
 

@@ -41,6 +41,8 @@ class Conversation:
         watch: called with a short description of slow work.
     """
 
+    look: str | None = None
+
     def __init__(
         self,
         model: Lang3DXLModel,
