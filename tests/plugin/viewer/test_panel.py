@@ -191,13 +191,19 @@ def test_renders_answer_the_query_of_the_environment_and_nothing_without(trainer
 def test_while_the_model_learns_its_words_are_gathered_when_they_are_asked_for(trainer, viewer):
     """The model in training, with its trainer's lock and state."""
     model, learned = trainer.pipeline.model.train(), []
+    codes = model.gauss_params["codes"]
+
+    def learn():
+        learned.append(model.step)
+        model.gauss_params["codes"] = codes
+
     conversation = session.Conversation(
         model,
         trainer.pipeline.scene_file,
         trainer.base_dir,
         trainer.train_lock,
         learning=lambda: True,
-        learn=lambda: learned.append(model.step),
+        learn=learn,
         shown=lambda: {"rgb"},
         watch=lambda _: None,
     )
