@@ -95,9 +95,10 @@ def _is_handshake(headers: Headers) -> bool:
 
 def is_camera(message: _messages.ViewerCameraMessage) -> bool:
     """Whether one can render from this camera: a minimized window has no aspect ratio, for example."""
-    numbers = (*message.wxyz, *message.position, *message.look_at, *message.up_direction)
+    vectors = (message.wxyz, message.position, message.look_at, message.up_direction)
     return (
-        all(abs(x) < _FAR for x in numbers)
+        [len(vector) for vector in vectors] == [4, 3, 3, 3]
+        and all(abs(x) < _FAR for vector in vectors for x in vector)
         and 0.5 < math.hypot(*message.wxyz) < 2
         and math.dist(message.position, message.look_at) > 0
         and 0.01 < message.fov < math.pi - 0.01
