@@ -19,7 +19,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.common.reports import progress_bar
-from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.coco import CocoLabels
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Match, save_picture, together
@@ -29,7 +29,8 @@ from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.scene_file import Provenance, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
 from lang3dxl_ns.query.text import Prompt, parse_prompts
-from lang3dxl_ns.query.web.write_page import write_page
+from lang3dxl_ns.query.vocabulary import read_vocabulary, whole_words
+from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
 
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
@@ -182,24 +183,27 @@ def _view_report(name: str, matches: list[Match]) -> dict:
 @dataclass(kw_only=True)
 class Export:
     """Write a scene in another form: a splat file of the Gaussians that match a text, in the model's frame,
-    which ordinary viewers open (--out); a web page to walk through it (--web); or the scene itself, in one
-    file to share, that can be queried without its run and its photos (--scene-file).
+    which ordinary viewers open (--out); a web page that answers words by itself (--web); or the scene itself,
+    in one file to share, that can be queried without its run and its photos (--scene-file).
     """
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Text to look for (default: write everything); with --web, repeat the flag or separate with `;`."""
+    """Text to look for (default: write everything); with --web, prompts that the page opens with."""
     not_: _Not = field(default_factory=list)
     """What all texts are told apart from; repeat the flag for more."""
     out: Path | None = None
     """The .ply or .spz file to write."""
     web: Path | None = None
     """Folder for a web page that any static server can serve."""
+    vocabulary: Path | None = None
+    """Words that may name a place on the page, one per line, besides the shipped ones; it also knows those of
+    the CLIP's tokenizer."""
     scene_file: Path | None = None
     """The .scene file to write."""
     title: str = ""
-    """Heading of page and scene (default: name of the photos' folder)."""
+    """Heading of page and scene (default: the scene's own, or the name of the photos' folder)."""
     credit: str = ""
     """Line about the photos: who took them."""
     license: str = ""
@@ -228,13 +232,28 @@ class Export:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         if self.scene_file is not None:
-            told = Provenance(self.title, self.credit, self.license, f"lang3dxl-ns {__version__}")
-            size = write_scene(self.scene_file, scene, told)
+            size = write_scene(self.scene_file, scene, self._told())
             say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: lang3dxl query {self.scene_file}")
         if self.web is not None:
-            size = write_page(scene, self.web, prompts, self.title, self.credit, self.look)
+            own = read_vocabulary(self.vocabulary) if self.vocabulary else ()
+            page = Page(scene, prompts, own, self._clip_words(scene.file.clip), self._told(), self.look)
+            size = write_page(page, self.web)
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
             text = prompts[0] if prompts else None
             count = scene.export(self.out, text, everything=self.all, look=self.look, index=self.index)
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
+
+    def _clip_words(self, clip: str | None) -> tuple[str, ...]:
+        """The words of the CLIP's tokenizer; none on a machine without that CLIP."""
+        try:
+            return whole_words(self.clip or clip or "")
+        except UserError as error:
+            say(f"The page knows the shipped words alone: {error}")
+            return ()
+
+    def _told(self) -> Provenance:
+        """What the scene's own file tells of its origin, unless told otherwise."""
+        own, program = provenance_of(self.scene), f"lang3dxl-ns {__version__}"
+        title, credit = self.title or own.title, self.credit or own.credit
+        return Provenance(title, credit, self.license or own.license, program, own.made_how)
