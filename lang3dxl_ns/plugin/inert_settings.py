@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields
-from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import tyro
 
 from lang3dxl_ns.common.errors import UserError
-
-if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 
 Class = TypeVar("Class", bound=type)
 
@@ -52,9 +49,11 @@ def without(*names: str) -> Callable[[Class], Class]:
     return hide
 
 
-def check_inert(config: Lang3DXLTrainerConfig) -> None:
-    """Raises UserError if a setting that has no effect in this run differs from its default."""
-    model, data = config.pipeline.model, config.pipeline.datamanager
+def check_inert(model: Any, data: Any) -> None:
+    """Raises UserError if a setting that has no effect in this run differs from its default.
+
+    model, data: settings of the model and of the data manager.
+    """
     changed = [
         *(f"--pipeline.model.{name}" for name in _changed(model, OF_SPLATFACTO)),
         *(f"--pipeline.datamanager.{name}" for name in _changed(data, OF_IMAGE_CACHES)),

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
@@ -46,10 +46,6 @@ from lang3dxl_ns.plugin.step_guard import StepGuard
 from lang3dxl_ns.preparation.needs import write_needs
 from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
-
-if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
-
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 6.0}
 """Time of an iteration in renderings of its photo, by whether semantics are trained with the scene: measured
@@ -90,7 +86,8 @@ class Lang3DXLTrainer(Trainer):
     """nerfstudio's trainer with atomic checkpoints, a resumed run that ends at the requested iteration, and a
     guard against steps that are not finite."""
 
-    config: Lang3DXLTrainerConfig
+    config: Any
+    """`Lang3DXLTrainerConfig`, whose module knows this class."""
     pipeline: Lang3DXLPipeline
     optimizers: GuardedOptimizers
     stages: Stages
@@ -104,7 +101,7 @@ class Lang3DXLTrainer(Trainer):
     _is_ending = False
     _run_state: dict[str, Any] | None = None
 
-    def __init__(self, config: Lang3DXLTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+    def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
         """Mixed precision means bfloat16 where the GPU has it: it has float32's range, so that gradients need
         no scale, and no step is lost or waits for one. Older GPUs (before Ampere) take float16 with a
         scale."""

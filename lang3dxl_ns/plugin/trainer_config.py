@@ -83,7 +83,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             check_address(self.viewer.websocket_host, self.viewer.websocket_port)
         fresh = self.timestamp == "{timestamp}"
         if fresh:  # a run's config.yml has what these settings came to
-            check_inert(self)
+            check_inert(self.pipeline.model, self.pipeline.datamanager)
         super().set_timestamp()
         self.fit_to_run()
         data = self.pipeline.datamanager

@@ -61,5 +61,6 @@ def test_what_is_trained_with_the_scene_may_set_its_weights():
     config = changed("pipeline.model.encoder.name", "paper")
     config.pipeline.model.clip_weight = 0.0
     config.pipeline.datamanager.regions = "felzenszwalb"
-    check_inert(config)
-    check_inert(changed("pipeline.datamanager.regions", "none"))
+    check_inert(config.pipeline.model, config.pipeline.datamanager)
+    plain = changed("pipeline.datamanager.regions", "none")
+    check_inert(plain.pipeline.model, plain.pipeline.datamanager)
