@@ -108,11 +108,11 @@ def train(tiny_clip, tiny_dense, tmp_path):
     return run
 
 
-def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, **changes):
-    """A trainer of the registered method, configured as the command line would."""
-    from lang3dxl_ns.methods import lang3dxl
+def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, method="lang3dxl", **changes):
+    """A trainer of a registered method, configured as the command line would."""
+    from lang3dxl_ns.methods import METHODS
 
-    config = deepcopy(lang3dxl.config)
+    config = deepcopy(METHODS[method].config)
     config.data = config.pipeline.datamanager.data = data
     config.output_dir, config.vis, config.max_num_iterations = output_dir, "tensorboard", iterations
     config.pipeline.datamanager.clip = str(clip) if semantics else "none"

@@ -34,8 +34,8 @@ OF_COLMAP = (
 )
 """nerfstudio's reader of COLMAP models; this package's reads points always, and depths never."""
 _OF_RENDERINGS = (
-    *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up"),
-    "feature_gradient_to_geometry",
+    *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up", "semantic_ramp"),
+    *("dense_compare", "mask_dense", "feature_gradient_to_geometry"),
 )
 """Settings of semantics that are trained with the scene."""
 

@@ -197,7 +197,7 @@ class Lang3DXLModel(RenderingModel):
     ) -> dict[str, Tensor]:
         c = self.config
         assert c.dense_weight is not None
-        ramp = schedules.semantic_ramp(self.step / c.total_steps)
+        ramp = schedules.semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
         size = fitted_size(codes, self._random_size())
         clip, dense, small_mask = self._decode_small(codes, mask, size)
         with part("downsample"):
@@ -207,7 +207,8 @@ class Lang3DXLModel(RenderingModel):
             weight = None if small_mask is None else weight
             loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, target, weight)}
             if dense is not None and "dense_target" in batch:
-                difference = losses.dense_loss(dense, batch["dense_target"], small_mask)
+                shown = small_mask if c.mask_dense else None
+                difference = losses.dense_loss(dense, batch["dense_target"], shown, c.dense_compare)
                 loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
                 labels = resize_nearest(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()

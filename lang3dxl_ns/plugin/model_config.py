@@ -42,11 +42,18 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     decode_size: tuple[int, int] | None = None
     """The code map is decoded at one of five sizes in this range: pixels of its longer side, inclusive.
     None: 56 to 72 in short runs, growing to 80 to 120 (the paper's) in long ones."""
+    dense_compare: Literal["auto", "target"] = "auto"
+    """Grid on which dense features are compared: the target's, as published, or `auto`, the coarser of the two
+    within a factor of two, which costs a fraction."""
+    mask_dense: bool = True
+    """Whether the dense loss leaves out the background, like the other losses; as published it doesn't."""
+    semantic_ramp: float = 0.5
+    """Fraction of the run over which the weight of the CLIP and dense losses rises from 0.1 to 1."""
     warm_up: float = 0.0
     """Fraction of the run that trains colors only, before the semantic losses start."""
     feature_gradient_to_geometry: bool = False
-    """Let the semantic losses also move Gaussians and change opacities. In the authors' code they move
-    Gaussians too, but their gradient stops at the opacity."""
+    """Let the semantic losses also move Gaussians, as in the authors' code; opacities belong to the colors
+    alone. Costs a second rendering."""
     view_dependence: Literal["auto", "on", "off"] = "auto"
     """Colors that depend on the viewing direction (spherical harmonics of `sh_degree`); off leaves one
     color and a quarter of the numbers per Gaussian. `auto`: by the scene's measured needs."""

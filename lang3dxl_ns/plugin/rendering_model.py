@@ -288,11 +288,11 @@ class RenderingModel(SplatfactoModel):
                 colors, in_photo = self.appearance(gaussians, colors, vector, visible, self.step)
         settings: dict[str, Any] = {"backend": self.backend, "antialiased": self.antialiased}
         absgrad, depth = self.strategy.absgrad, self.config.output_depth_during_training
-        detach = not self.config.feature_gradient_to_geometry
-        if in_photo is gaussians:
+        moves = self.config.feature_gradient_to_geometry and features is not None
+        if in_photo is gaussians and not moves:
             raster = rasterize(
                 gaussians, view, colors, background,
-                features=features, detach_features=detach, render_depth=depth, absgrad=absgrad, **settings,
+                features=features, render_depth=depth, absgrad=absgrad, **settings,
             )  # fmt: skip
             return raster, background
         photo = rasterize(in_photo, view, colors, background, absgrad=absgrad, **settings)
@@ -300,7 +300,9 @@ class RenderingModel(SplatfactoModel):
             return photo, background
         # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
         carried = colors.detach()[:, :1] if features is None else features
-        if detach:
+        if moves:
+            gaussians = replace(gaussians, opacities=gaussians.opacities.detach())
+        else:
             gaussians, view = gaussians.detach(), view.detach()
         scene = rasterize(gaussians, view, carried, render_depth=depth, **settings)
         image = None if features is None else scene.image
