@@ -1,4 +1,4 @@
-"""`lang3dxl preset`: flags of `ns-train lang3dxl-paper` for a benchmark's scene, or as the authors' release."""
+"""`lang3dxl preset`: flags of `ns-train lang3dxl-paper` for a benchmark, or as the authors' release."""
 
 from __future__ import annotations
 

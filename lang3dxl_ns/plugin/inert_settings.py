@@ -35,7 +35,7 @@ OF_COLMAP = (
 """nerfstudio's reader of COLMAP models; this package's reads points always, and depths never."""
 _OF_RENDERINGS = (
     *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up", "semantic_ramp"),
-    *("dense_compare", "mask_dense", "feature_gradient_to_geometry"),
+    *("dense_compare", "mask_dense", "feature_gradient_to_geometry", "downsampler"),
 )
 """Settings of semantics that are trained with the scene."""
 
@@ -61,7 +61,7 @@ def check_inert(config: Lang3DXLTrainerConfig) -> None:
     ]
     if changed:
         raise UserError(
-            f"{_option(changed[0])} has no effect on lang3dxl, which never reads it: leave it off"
+            f"{_option(changed[0])} has no effect here: no method of this package reads it; leave it off"
         )
     if model.encoder.learns_from_renderings:
         return
@@ -71,7 +71,7 @@ def check_inert(config: Lang3DXLTrainerConfig) -> None:
     if changed:
         raise UserError(
             f"{_option(changed[0])} has no effect where semantics are learned after training, as with "
-            f"--pipeline.model.encoder.name {model.encoder.name}: leave it off, or choose paper"
+            f"--pipeline.model.encoder.name {model.encoder.name}: leave it off, or train with ns-train lang3dxl-paper"
         )
 
 

@@ -43,8 +43,8 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     """The code map is decoded at one of five sizes in this range: pixels of its longer side, inclusive.
     None: 56 to 72 in short runs, growing to 80 to 120 (the paper's) in long ones."""
     dense_compare: Literal["auto", "target"] = "auto"
-    """Grid on which dense features are compared: the target's, as published, or `auto`, the coarser of the two
-    within a factor of two, which costs a fraction."""
+    """Grid on which dense features are compared: the target's, as published; `auto`: the prediction's,
+    which costs a fraction, unless the target is much coarser."""
     mask_dense: bool = True
     """Whether the dense loss leaves out the background, like the other losses; as published it doesn't."""
     semantic_ramp: float = 0.5
