@@ -19,7 +19,7 @@ SMALL = {
 """The published network at a fraction of its costs per step."""
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_words_are_found_far_above_chance_and_half_as_well_as_by_the_teacher(tmp_path):
     shape = {"photos": 14, "test_views": 6, "width": 288, "height": 216}
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=620, family="cathedral", wild=False, **shape))
