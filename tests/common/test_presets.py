@@ -43,9 +43,8 @@ def test_training_takes_the_flags_of_every_scene(capsys):
         if path.stem in ("milano", "badshahi"):  # parsing takes seconds; the other four have milano's flags
             cli.main(["preset", "official"])
             flags += capsys.readouterr().out.split()
-            config = tyro.cli(
-                type(lang3dxl_paper.config), args=flags, default=deepcopy(lang3dxl_paper.config)
-            )
+            settings = tyro.conf.FlagConversionOff[type(lang3dxl_paper.config)]
+            config = tyro.cli(settings, args=flags, default=deepcopy(lang3dxl_paper.config))
             iterations = config.max_num_iterations
             assert iterations == (200_000 if path.stem == "badshahi" else 70_000)
             assert config.pipeline.datamanager.scale_preset == f"holyscenes/{path.stem}"
