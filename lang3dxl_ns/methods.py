@@ -114,7 +114,7 @@ def _paper_config() -> Lang3DXLTrainerConfig:
     config = _config("lang3dxl-paper", 70_000)
     x = 1 / 70_000
     model, data, groups = config.pipeline.model, config.pipeline.datamanager, config.optimizers
-    model.encoder.name, model.semantic_field.preset = "paper", "paper"
+    model.decoder.name, model.semantic_field.preset = "paper", "paper"
     model.decode_size, model.dense_weight = (80, 120), 0.5
     model.dense_compare, model.mask_dense = "target", False
     model.feature_gradient_to_geometry, model.semantic_ramp = True, 15_000 * x

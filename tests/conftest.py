@@ -6,7 +6,7 @@
   look at the same run.
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
   `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
-  told `--pipeline.model.encoder.compression.steps 40`.
+  told `--pipeline.model.decoder.compression.steps 40`.
 - `wheel`: the package's wheel, built once per session.
 - `worker_tasks`: work for several processes; tests that need a Ray cluster belong into test_ray.py, which
   has one.
@@ -118,7 +118,7 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, meth
     config.pipeline.datamanager.clip = str(clip) if semantics else "none"
     config.pipeline.datamanager.dense = str(dense) if semantics else "none"
     config.viewer.quit_on_train_completion = True
-    compression = config.pipeline.model.encoder.compression
+    compression = config.pipeline.model.decoder.compression
     compression.steps, compression.batch = 40, 512
     for path, value in changes.items():
         *owners, name = path.split("__")

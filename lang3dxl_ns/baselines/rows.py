@@ -45,11 +45,11 @@ class Row:
         return any(path.removeprefix(_DATA) in OF_TARGETS for path in self.changes)
 
 
-def _encoder(name: str, label: str, published: str = "") -> Row:
-    return Row(name, "encoder", label, {"pipeline.model.encoder.name": name}, published=published)
+def _decoder(name: str, label: str, published: str = "") -> Row:
+    return Row(name, "decoder", label, {"pipeline.model.decoder.name": name}, published=published)
 
 
-_PAPER = {"pipeline.model.encoder.name": "paper"}
+_PAPER = {"pipeline.model.decoder.name": "paper"}
 """Codes trained with the scene, by downsampler, dense features and regions: compare with row "paper"."""
 ROWS = (
     Row(FULL, "method", "Lang3D-XL", published="mAP .59; windows AP .69; L1 .146, PSNR 13.9"),
@@ -60,12 +60,12 @@ ROWS = (
     Row(CHANCE, "2-D", "a map without information"),
     Row(CLIPSEG, "2-D", "CLIPSeg", published="mAP .56"),
     Row(LANGSAM, "2-D", "LangSAM: GroundingDINO's boxes, masks by SAM", published="mAP .25"),
-    _encoder("feature3dgs", "Feature 3DGS: wide codes, linear layer", "L1 .149, PSNR 13.3"),
-    _encoder("fmgs", "FMGS: hash grid over places, whole features rendered", "mAP .51; L1 .180, PSNR 11.6"),
-    _encoder("langsplat", "LangSplat: per-scene autoencoder to 3 numbers", "mAP .19"),
-    _encoder("direct", "whole feature on every Gaussian"),
-    _encoder("lifting", "training-free lifting"),
-    _encoder("paper", "as published: codes composited, then decoded"),
+    _decoder("feature3dgs", "Feature 3DGS: wide codes, linear layer", "L1 .149, PSNR 13.3"),
+    _decoder("fmgs", "FMGS: hash grid over places, whole features rendered", "mAP .51; L1 .180, PSNR 11.6"),
+    _decoder("langsplat", "LangSplat: per-scene autoencoder to 3 numbers", "mAP .19"),
+    _decoder("direct", "whole feature on every Gaussian"),
+    _decoder("lifting", "training-free lifting"),
+    _decoder("paper", "as published: codes composited, then decoded"),
     Row("hash", "field", "hash grid alone", {f"{_FIELD}fourier_frequencies": 0}),
     Row("fourier", "field", "Fourier features alone",
         {f"{_FIELD}levels": 0, f"{_FIELD}fourier_frequencies": 4, f"{_FIELD}coarse_to_fine": 0.0}),

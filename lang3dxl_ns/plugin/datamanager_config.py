@@ -33,7 +33,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     read_ahead: int = 16
     """Photos read ahead of the training step, in addition to that memory."""
     targets_in_steps: tyro.conf.Suppress[bool] = True
-    """Whether training steps learn from the targets; settled with the encoder."""
+    """Whether training steps learn from the targets; settled with the decoder."""
     run: tyro.conf.Suppress[Path | None] = None
     """Folder of the run whose config.yml this comes from; set when that is read."""
 

@@ -63,12 +63,12 @@ def check_inert(config: Lang3DXLTrainerConfig) -> None:
         raise UserError(
             f"{_option(changed[0])} has no effect here: no method of this package reads it; leave it off"
         )
-    if model.encoder.start != "noise" and model.encoder.name != "paper":
+    if model.decoder.start != "noise" and model.decoder.name != "paper":
         raise UserError(
-            f"--pipeline.model.encoder.start has no effect with --pipeline.model.encoder.name "
-            f"{model.encoder.name}: leave it off, or train with ns-train lang3dxl-paper"
+            f"--pipeline.model.decoder.start has no effect with --pipeline.model.decoder.name "
+            f"{model.decoder.name}: leave it off, or train with ns-train lang3dxl-paper"
         )
-    if model.encoder.learns_from_renderings:
+    if model.decoder.learns_from_renderings:
         return
     changed = [f"--pipeline.model.{name}" for name in _changed(model, _OF_RENDERINGS)]
     if data.regions not in ("auto", "none"):
@@ -76,7 +76,7 @@ def check_inert(config: Lang3DXLTrainerConfig) -> None:
     if changed:
         raise UserError(
             f"{_option(changed[0])} has no effect where semantics are learned after training, as with "
-            f"--pipeline.model.encoder.name {model.encoder.name}: leave it off, or train with "
+            f"--pipeline.model.decoder.name {model.decoder.name}: leave it off, or train with "
             "ns-train lang3dxl-paper"
         )
 

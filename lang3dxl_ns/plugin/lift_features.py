@@ -32,18 +32,18 @@ def learn_from_photos(
     advance: Callable[[], None] = lambda: None,
 ) -> None:
     """Gather the photos' target features onto the Gaussians, sharpen them where there are dense features, and
-    let the encoder make codes of them.
+    let the decoder make codes of them.
 
     model: in training mode, so that it renders its photos as in training. photos: cameras and batches, with
-    targets. advance: called as the encoder learns, `learning_steps` times.
+    targets. advance: called as the decoder learns, `learning_steps` times.
     """
-    encoder, facts = model.semantic_field, model.facts
-    assert encoder is not None
+    decoder, facts = model.semantic_field, model.facts
+    assert decoder is not None
     basis = fine_basis = None
     width = channels = len(model.clip_mean)
-    if encoder.gathered_channels is not None and encoder.gathered_channels < width:
+    if decoder.gathered_channels is not None and decoder.gathered_channels < width:
         assert facts.clip_targets is not None
-        width = channels = encoder.gathered_channels
+        width = channels = decoder.gathered_channels
         basis = PrincipalBasis.of(facts.clip_targets(), width)
     if facts.dense_targets is not None:
         fine_basis = PrincipalBasis.of(map(_unit, facts.dense_targets()), DENSE_AXES)
@@ -63,7 +63,7 @@ def learn_from_photos(
     features, mass = gather(model.num_points, views(), channels, model.means.detach())
     if fine_basis is not None:
         features = sharpen(features[:, :width], features[:, width:], mass)
-    codes = encoder.learn_gaussians(features, mass, advance, basis)
+    codes = decoder.learn_gaussians(features, mass, advance, basis)
     # Features that are many lie on the CPU, and those that are codes themselves come from there.
     model.gauss_params["codes"] = Parameter(codes.to(model.device), requires_grad=False)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from lang3dxl_ns.baselines.encoders import EncoderConfig
+from lang3dxl_ns.baselines.decoders import DecoderConfig
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
@@ -25,7 +25,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     """Splatfacto's settings, with the method's schedule and the semantic components."""
 
     _target: type = field(default_factory=lambda: _model_class())
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
     """The feature decoder: the semantic field, or a baseline."""
     semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
     """Decoder from a 3-number code to CLIP and dense features."""
@@ -97,7 +97,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
         self.total_steps = iterations
         if self.semantic_field.preset == "auto":
             # Compression is a direct regression of a thousand steps, whatever the run's length.
-            compressed = self.encoder.name == "lang3dxl"
+            compressed = self.decoder.name == "gathered"
             self.semantic_field.preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "default"
         self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
         if self.densify_grad_thresh is None:

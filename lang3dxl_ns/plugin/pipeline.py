@@ -109,7 +109,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         """Outputs, losses and metrics of the next photo; before it, where semantics begin, their start."""
         config = self.config.model
         begins = step == math.ceil(config.warm_up * config.total_steps)
-        if begins and config.encoder.start == "gathered" and self.model.learns_from_renderings:
+        if begins and config.decoder.start == "gathered" and self.model.learns_from_renderings:
             start_codes(self.model, self.datamanager.train_photos())
         outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
         return outputs, self.last_losses, metrics
@@ -155,8 +155,8 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""
-        encoder = self.model.semantic_field
-        assert encoder is not None
+        decoder = self.model.semantic_field
+        assert decoder is not None
         training = self.model.training
         self.model.train()
         photos = self.datamanager.train_photos()
@@ -164,12 +164,12 @@ class Lang3DXLPipeline(VanillaPipeline):
             with progress_bar() as bar:
                 total = len(self.datamanager.train_dataset)
                 gathering = bar.track(photos, total=total, description="gathering features")
-                learning = bar.add_task("learning codes", total=encoder.learning_steps or None)
+                learning = bar.add_task("learning codes", total=decoder.learning_steps or None)
                 learn_from_photos(self.model, gathering, lambda: bar.advance(learning))
         finally:
             self.model.train(training)
-        if encoder.learned is not None:
-            CONSOLE.log(escape(encoder.learned))
+        if decoder.learned is not None:
+            CONSOLE.log(escape(decoder.learned))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""

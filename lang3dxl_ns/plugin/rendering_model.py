@@ -18,7 +18,7 @@ from torch import Tensor
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
@@ -63,7 +63,7 @@ class RenderingModel(SplatfactoModel):
     """
 
     config: Lang3DXLModelConfig
-    semantic_field: SemanticEncoder | None
+    semantic_field: Decoder | None
     appearance: AppearanceField | None
     sky: Sky | None
     """The first Gaussians' colors; None: there is no sky, or it was trained like all Gaussians."""
@@ -164,7 +164,7 @@ class RenderingModel(SplatfactoModel):
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
         """Render a camera: `rgb`, `accumulation`, `background`; in training `codes` [H, W, d] if the
-        encoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
+        decoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
         if self.training:
             return self._training_outputs(camera)
         return self._shown(camera, None, None, self._code_colors())[1]

@@ -15,7 +15,7 @@ from lang3dxl_ns.common.reports import write_atomically
 from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
-SMALL = {"clip": "builtin", "scale": 1.0, "ns_train": "--pipeline.model.encoder.compression.steps 40"}
+SMALL = {"clip": "builtin", "scale": 1.0, "ns_train": "--pipeline.model.decoder.compression.steps 40"}
 """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
 

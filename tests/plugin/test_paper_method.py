@@ -73,7 +73,7 @@ def test_weights_sizes_and_schedules_are_the_published_ones(fitted):
 def test_the_default_is_another_method_with_settings_of_its_own():
     default = METHODS["lang3dxl"].config
     assert default.method_name == "lang3dxl" and lang3dxl_paper.config.method_name == "lang3dxl-paper"
-    assert default.pipeline.model.encoder.name != "paper"
+    assert default.pipeline.model.decoder.name != "paper"
     assert default.optimizers["codes"]["scheduler"].end == 0.05
 
 
@@ -152,7 +152,7 @@ def test_they_do_when_the_warm_up_ends(scene, tiny_clip, tiny_dense, tmp_path, m
     monkeypatch.setattr(pipeline, "start_codes", lambda model, photos: steps.append(model.step))
     changes = {
         "pipeline__datamanager__regions": "none",
-        "pipeline__model__encoder__start": "gathered",
+        "pipeline__model__decoder__start": "gathered",
         "pipeline__model__warm_up": 0.3,
         "pipeline__model__downsampler__hidden": 0,
     }
