@@ -277,12 +277,12 @@ class Lang3DXLTrainer(Trainer):
                 synchronize()
             rendering = perf_counter() - start
             model.train()
-        count, encoder = self.config.max_num_iterations, model.semantic_field
+        count, decoder = self.config.max_num_iterations, model.semantic_field
         seconds = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings]
         line, words = f"training: {roughly(seconds)} for {count:,} iterations", 0.0
-        if encoder is not None and self.pipeline.has_words_to_learn:
+        if decoder is not None and self.pipeline.has_words_to_learn:
             words = rendering * len(cameras) * RENDERINGS_PER_PHOTO
-            words += encoder.learning_seconds(model.num_points)
+            words += decoder.learning_seconds(model.num_points)
             line += f", then {roughly(words)} to learn words"
         self.stages.weigh("words", "train", words / seconds if seconds else 1.0)
         CONSOLE.log(f"{line}, more if Gaussians multiply")
@@ -371,7 +371,7 @@ class Lang3DXLTrainer(Trainer):
         """Write the trained scene as one file into the run's folder, to ask and to share."""
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
-        how = f"{self.config.method_name}, {config.encoder.name}, {self.config.max_num_iterations} iterations"
+        how = f"{self.config.method_name}, {config.decoder.name}, {self.config.max_num_iterations} iterations"
         scene = self.pipeline.model.scene(self.pipeline.scene_file)
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
         size = write_scene(path, scene, told)

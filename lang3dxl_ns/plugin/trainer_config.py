@@ -156,7 +156,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.pipeline.model.fit_to_run(iterations)
         self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
         datamanager = self.pipeline.datamanager
-        datamanager.settle_targets(learned=self.pipeline.model.encoder.learns_from_renderings)
+        datamanager.settle_targets(learned=self.pipeline.model.decoder.learns_from_renderings)
         datamanager.data = _absolute(datamanager.data or self.data)
         self.data = datamanager.data
         self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)
