@@ -5,6 +5,7 @@ On a fake GPU (fake_gpu.py), and with `-m cuda` on the machine's own, where wait
 Runs are a few steps on a tiny scene; they are made once and shared.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -299,7 +300,7 @@ def test_words_on_the_gpu_are_those_on_the_cpu(default, gpu):
         found = gathered("cuda")
         scene = load_scene(default.base_dir / "config.yml")
         queries = scene.queries(scene.prompts("tower; window"))
-        relevancy = scene.engine.of_gaussians(queries).cpu()
+        relevancy, temperature = scene.engine.of_gaussians(queries).cpu(), scene.engine.temperature
         codes = default.pipeline.model.gauss_params["codes"].detach().cpu()
         field = default.pipeline.model.semantic_field
         state = {name: value.cpu() for name, value in field.state_dict().items()}
@@ -314,7 +315,7 @@ def test_words_on_the_gpu_are_those_on_the_cpu(default, gpu):
     from lang3dxl_ns.query.relevancy import Queries
 
     asked = Queries(vectors, queries.positive, queries.negative)
-    there = make_engine(here, codes).of_gaussians(asked)
+    there = make_engine(here, codes, temperature).of_gaussians(asked)
     torch.testing.assert_close(relevancy, there, rtol=0, atol=5e-3)
 
 
@@ -392,25 +393,34 @@ def test_numerics(gpu):
 # ── the fake finds bugs ─────────────────────────────────────────────────────────────────────────────────
 
 
+def changed(model, change):
+    """Lets every rendering, in training or not, have other opacities."""
+    activated = model.activated
+
+    def planted(g):
+        shapes = activated(g)
+        return replace(shapes, opacities=change(shapes))
+
+    model.activated = planted
+
+
 def bug_tensor_on_the_cpu(model):
-    colors = model.colors_from
-    model.colors_from = lambda g, center: colors(g, center) * torch.ones(3)
+    changed(model, lambda shapes: shapes.opacities * torch.ones(3)[:1])
 
 
 def bug_index_of_a_cpu_tensor(model):
-    means = torch.zeros(model.num_points, 3)
-    model.colors_from = lambda g, center: means[(g["means"][:, 0] > 0).nonzero()[:, 0]]
+    table = torch.zeros(model.num_points)
+    changed(model, lambda shapes: table[(shapes.means[:, 0] > 0).nonzero()[:, 0]])
 
 
 def bug_numpy(model):
-    colors = model.colors_from
-    model.colors_from = lambda g, center: torch.as_tensor(colors(g, center).detach().numpy())
+    changed(model, lambda shapes: torch.as_tensor(shapes.opacities.detach().numpy()))
 
 
 def bug_cpu_generator(model):
-    generator, colors = torch.Generator(), model.colors_from
-    noise = lambda: torch.rand(model.num_points, 3, generator=generator, device=model.device)  # noqa: E731
-    model.colors_from = lambda g, center: colors(g, center) + noise()
+    generator = torch.Generator()
+    noise = lambda: torch.rand(model.num_points, generator=generator, device=model.device)  # noqa: E731
+    changed(model, lambda shapes: shapes.opacities + noise())
 
 
 @pytest.mark.parametrize(
@@ -424,23 +434,23 @@ def bug_cpu_generator(model):
 )
 def test_planted_bugs_are_found(default, fake, monkeypatch, plant, error):
     model = default.pipeline.model
-    monkeypatch.setattr(model, "colors_from", model.colors_from)  # so that it is restored
+    monkeypatch.setattr(model, "activated", model.activated)  # so that it is restored
     plant(model)
     with fake_gpu(), pytest.raises((RuntimeError, TypeError), match=error):
         model.get_outputs_for_camera(default.pipeline.datamanager.train_dataset.cameras[0:1])
 
 
 def test_a_planted_wait_is_counted(default, monkeypatch, fake):
-    model, colors = default.pipeline.model.eval(), default.pipeline.model.colors_from
+    model, activated = default.pipeline.model.eval(), default.pipeline.model.activated
     camera = default.pipeline.datamanager.train_dataset.cameras[0:1]
 
-    def impatient(g, center):
+    def impatient(g):
         assert float(g["means"].sum()) < 1e9
-        return colors(g, center)
+        return activated(g)
 
     found = []
-    for planted in (colors, impatient):
-        monkeypatch.setattr(model, "colors_from", planted)
+    for planted in (activated, impatient):
+        monkeypatch.setattr(model, "activated", planted)
         with fake_gpu() as gpu, gpu.counting() as waits:
             model.get_outputs_for_camera(camera)
         found.append(own(waits))

@@ -9,10 +9,10 @@ import pytest
 from painted_scene import painted_scene
 from PIL import Image
 
-from lang3dxl_ns.query.match import together
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.text import parse_prompts
 
 
@@ -51,7 +51,7 @@ COMMANDS = {
     "evaluate pool --out report --reports silent.json": "it does not say what was scored",
     "evaluate pool --out report --reports none.json": "there is no none.json",
     "evaluate split --ground-truth label --out list --per-category 0": "--per-category is 0: give 1 or more",
-    "export": "give one of --out FILE.ply and --web FOLDER",
+    "export": "give one of --out FILE.ply, --web FOLDER",
     "export --out a.ply --text dome --text tower": "a splat file is of one --text",
     "doctor --build": "name a compute capability, such as --arch 8.6",
     "benchmark gpu --out report": "lang3dxl doctor says why",

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.components.code_search import nearest, settle
+from lang3dxl_ns.components.hash_grid import MOST_DIMENSIONS
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
@@ -316,7 +317,8 @@ class CompressedField(SemanticField):
 
     def fit_codes(self, codes: Float[Tensor, "n code"]) -> None:
         """Make room for the weights of a field of such codes, to be loaded."""
-        if codes.dim() == 2 and codes.shape[1] != self.code_dim:
+        wide = codes.shape[1] if codes.dim() == 2 else 0
+        if wide != self.code_dim and 2 <= wide <= MOST_DIMENSIONS:
             self.take(SemanticField(replace(self.config, code_dim=codes.shape[1]), self.clip_dim))
 
 

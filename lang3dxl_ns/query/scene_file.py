@@ -114,7 +114,7 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
     file = replace(scene.file, photos=[replace(photo, mask=None) for photo in scene.photos])
     described["scene"] = asdict(replace(file, data=Path(file.data).name))
-    data = save(content, {_KEY: json.dumps(described)})
+    data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
     write_atomically(path, data)
     return len(data)
 

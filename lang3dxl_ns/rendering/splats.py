@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.rendering.gaussians import Gaussians
 from lang3dxl_ns.rendering.spherical_harmonics import BAND_0, rotated_harmonics, spherical_harmonics
 
@@ -54,7 +55,7 @@ class Splats:
 
     def colors(self, center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
         """Red, green and blue, 0 and above, as seen from a point in the world frame."""
-        directions = self.means - center.to(self.means)
+        directions = self.means - to_device(center.to(self.means.dtype), self.means.device)
         return (spherical_harmonics(self.degree, directions, self.harmonics) + 0.5).clamp_min(0.0)
 
     def with_colors(self, colors: Float[Tensor, "n 3"]) -> Splats:
