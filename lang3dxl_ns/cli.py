@@ -32,6 +32,10 @@ BENCHMARKS = {
     "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
+    "typed-words": (
+        "benchmarks.typed_words:TypedWords",
+        "Fifty prompts as people type them, judged by labels.",
+    ),
     "ablation": (
         "benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",

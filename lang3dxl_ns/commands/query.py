@@ -24,7 +24,7 @@ from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.scene_file import Provenance, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
-from lang3dxl_ns.query.text import Prompt, parse_prompts
+from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
 from lang3dxl_ns.query.web.write_page import write_page
 from lang3dxl_ns.scene.camera import Camera
 
@@ -90,7 +90,7 @@ class Query:
         for prompt, doubt, level, folder, score, place in found:
             closest = "" if score > level else " (no match; this view comes closest)"
             say(f"{prompt.text}: {score:.2f} at {place}; {folder}{closest}")
-            if advice := doubtful(prompt.text, doubt):
+            for advice in filter(None, (caution(prompt.text), doubtful(prompt.text, doubt))):
                 say(f"  {advice}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:

@@ -93,7 +93,7 @@ def doubtful(text: str, doubt: float) -> str | None:
     if doubt <= DOUBTFUL:
         return None
     if doubt == 1.0:
-        return f"doubtful: {text!r} fits no place here: it may not be here, or the run's CLIP may not know the word"
+        return f"doubtful: {text!r} fits no place: it may be absent, or the run's CLIP may not know the word"
     return (
         f"doubtful: {doubt:.0%} of unrelated words fit this scene as well as {text!r}: it may not be here, "
         f"or the run's CLIP may not know the word"

@@ -29,12 +29,14 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "door": ("portal", "doorway", "entrance", "entry", "gate", "gateway", "archway"),
     "tower": (
         "belfry", "steeple", "campanile", "minaret", "turret",
-        "window", "pane", "oculus", "lancet", "door", "portal", "doorway", "entrance", "entry", "gate", "gateway",
+        "window", "pane", "oculus", "lancet",
+        "door", "portal", "doorway", "entrance", "entry", "gate", "gateway",
     ),
     "spire": ("steeple", "fleche", "pinnacle", "finial"),
     "dome": ("cupola",),
 }  # fmt: skip
-"""The same for parts of buildings. A part doesn't compete with its whole: windows and doors not with towers."""
+"""The same for parts of buildings; a part doesn't compete with its whole: windows and doors not with
+towers."""
 _NAMED = {
     phrase: frozenset((*_SURROUNDINGS.get(phrase, ()), *_PARTS.get(phrase, ())))
     for phrase in (*_SURROUNDINGS, *_PARTS)

@@ -20,7 +20,7 @@ from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import QueryConfig, Scene, text_encoder
-from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 
 
@@ -178,7 +178,8 @@ class Conversation:
     def advice(self) -> str | None:
         """Advice about the answer, if something is odd about it."""
         found = self.found or []
-        lines = [plain(line) for f in found if (line := doubtful(shortened(f.prompt.text), f.doubt))]
+        told = [(caution(f.prompt.text), doubtful(shortened(f.prompt.text), f.doubt)) for f in found]
+        lines = [plain(line) for both in told for line in both if line]
         if found and not any(f.views for f in found):
             words = " or ".join(plain(shortened(f.prompt.text)) for f in found)
             asked = self.display.threshold
