@@ -10,6 +10,7 @@ from typing import Any
 
 _PUBLIC = {
     "load_scene": "open_scene",
+    "attach": "attachment.attach",
     "Scene": "query.scene",
     "Match": "query.match",
     "Found": "query.match",

@@ -36,6 +36,11 @@ BENCHMARKS = {
         "benchmarks.typed_words:TypedWords",
         "Fifty prompts as people type them, judged by labels.",
     ),
+    "teaching": (
+        "benchmarks.teaching:TeachingBenchmark",
+        "Words taught by example, beside the text alone.",
+    ),
+    "attach": ("benchmarks.attach:AttachBenchmark", "Words attached to a splat, scored beside its run's."),
     "ablation": (
         "benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",
@@ -51,6 +56,7 @@ COMMANDS = {
         "COLMAP model from photos, or a video.",
     ),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
+    "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),
     "needs": ("commands.needs:Needs", "Which optional components a scene needs, and why."),
     "query": ("commands.query:Query", "Search a trained scene for texts: heat maps, masks, relevancy maps."),
@@ -58,10 +64,12 @@ COMMANDS = {
         "commands.query:Export",
         "Write a scene, or what matches a text, as a splat file or a web page.",
     ),
+    "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
+    "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
     "info": ("commands.info:Info", "Tell what a scene file holds, and where it comes from."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (
-        "demo.landmark.demo_scene:DemoScene",
+        "commands.demo_scene:GenerateScene",
         "Generate a demo scene: photos of a procedural landmark.",
     ),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),

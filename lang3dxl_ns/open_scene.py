@@ -13,7 +13,7 @@ from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.query.find_run import OUTPUTS, find_config
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.scene import Scene, text_encoder
-from lang3dxl_ns.query.scene_file import SUFFIX, describe_scene_file, read_scene
+from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, describe_scene_file, read_scene
 
 
 def load_scene(
@@ -65,3 +65,9 @@ def find_scene_file(path: str | Path | None = None) -> Path | None:
         names = ", ".join(file.name for file in scenes[:5])
         raise UserError(f"{place} holds several scenes ({names}): name one of them")
     return scenes[-1] if scenes else None
+
+
+def provenance_of(path: str | Path | None = None) -> Provenance:
+    """Title, credit and license of the scene that `load_scene` opens; empty for a run without a file."""
+    file = find_scene_file(path)
+    return Provenance() if file is None else describe_scene_file(file)["provenance"]

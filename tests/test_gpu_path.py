@@ -348,7 +348,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
             model, pipeline.scene_file, default.base_dir, nullcontext(), lambda: False, lambda: None,
             lambda: {"rgb"}, lambda _: None,
         )  # fmt: skip
-        session.ask("tower", foreground="window")
+        session.ask("tower")
         model.answers = session
         camera = pipeline.scene_file.photos[0].camera
         outputs = model.get_outputs_for_camera(view_of(camera))

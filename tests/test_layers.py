@@ -46,7 +46,7 @@ ORDER = (
     {"components", "rendering"},
     {"preparation"},
     {"baselines", "query", "evaluation"},
-    {"demo", "numerics"},
+    {"attachment", "demo", "numerics"},
     {"plugin"},
     {"methods", "open_scene"},
     {"train_scene"},
@@ -149,7 +149,15 @@ def top_level_imports(source: str, modules) -> set[str]:
 
 def test_rooms_below_the_plugin_load_neither_nerfstudio_nor_cuda_code():
     below = modules(
-        "common", "scene", "components", "rendering", "preparation", "query", "evaluation", "baselines"
+        "common",
+        "scene",
+        "components",
+        "rendering",
+        "preparation",
+        "query",
+        "evaluation",
+        "baselines",
+        "attachment",
     )
     loaded = json.loads(run(IMPORT_ALL.format(names=below)))
     assert not {"nerfstudio", "gsplat", "tinycudann"} & set(loaded)

@@ -50,7 +50,7 @@ class Prepare(PreparationConfig):
 def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:
     """The data manager for a folder of photos with these settings; prepares nothing yet."""
     from lang3dxl_ns.common.device import best_device
-    from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
+    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
     from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
     from lang3dxl_ns.preparation.model_files import option_prefix
 

@@ -10,13 +10,17 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from jaxtyping import Bool
+from numpy import ndarray as Array
+from PIL import Image
 
 from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.common.reports import progress_bar
-from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.open_scene import load_scene, provenance_of
+from lang3dxl_ns.query.coco import CocoLabels
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Match, save_picture, together
 from lang3dxl_ns.query.question import Question
@@ -25,7 +29,8 @@ from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.scene_file import Provenance, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
 from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
-from lang3dxl_ns.query.web.write_page import write_page
+from lang3dxl_ns.query.vocabulary import read_vocabulary, whole_words
+from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
 
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
@@ -55,11 +60,17 @@ class Query:
     """Use the views of all photos, including held-out ones."""
     camera_path: Path | None = None
     """Use the views of a camera path saved by the viewer."""
+    coco: Path | None = None
+    """With --all, also write the masks to this file as labels in COCO's format, for all photos and texts."""
+    without_taught: bool = False
+    """Ask for the texts alone, leaving out what the scene was taught by example (lang3dxl teach)."""
     clip: str | None = None
     """Name or folder of the scene's CLIP, if it is not where the scene says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
+        if self.coco is not None and not self.all:
+            raise UserError("--coco labels all photos: give --all too")
         if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
             raise UserError("--image, --all and --camera-path exclude each other: give one of them")
         prompts = parse_texts(self.text, self.not_)  # fail now rather than after the work
@@ -67,8 +78,11 @@ class Query:
             raise UserError("there is no --text: say what to look for, such as --text windows")
         make_folder(self.out)
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        scene = scene.with_words(()) if self.without_taught else scene
         question = scene.ask(prompts)
+        prompts = list(question.prompts)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
+        labels = CocoLabels([prompt.text for prompt in prompts])
         views, best = [], [-1.0] * len(prompts)
         where = [""] * len(prompts)
         with progress_bar() as bar:
@@ -79,9 +93,13 @@ class Query:
                     write_match(match, folders[i] / name)
                     if match.score > best[i]:
                         best[i], where[i] = match.score, f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
+                if self.coco is not None and isinstance(place, str):
+                    labels.add(place, [of_file(scene, place, match.mask) for match in matches])
                 if len(matches) > 1:
                     save_picture(together(matches), shared / f"{name}.png")
                 views.append(_view_report(name, matches))
+        if self.coco is not None:
+            write_atomically(self.coco, json.dumps(labels.content) + "\n")
         doubts, levels = question.doubts, question.thresholds
         texts = zip(prompts, doubts, levels, folders, strict=True)
         report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
@@ -89,8 +107,10 @@ class Query:
         found = zip(prompts, doubts, levels, folders, best, where, strict=True)
         for prompt, doubt, level, folder, score, place in found:
             closest = "" if score > level else " (no match; this view comes closest)"
-            say(f"{prompt.text}: {score:.2f} at {place}; {folder}{closest}")
-            for advice in filter(None, (caution(prompt.text), doubtful(prompt.text, doubt))):
+            by = "" if prompt.taught is None else " (taught)"
+            say(f"{prompt.text}{by}: {score:.2f} at {place}; {folder}{closest}")
+            told = (caution(prompt.text), doubtful(prompt.text, doubt, prompt.taught is not None))
+            for advice in filter(None, told):
                 say(f"  {advice}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
@@ -129,6 +149,13 @@ def file_names(photos: list[str]) -> list[str]:
     return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
 
 
+def of_file(scene: Scene, photo: str, mask: Bool[Array, "h w"]) -> Bool[Array, "H W"]:
+    """A view's mask at the size of the photo's file."""
+    found = scene.file.photo(photo)
+    size = found.size or (found.lens.width, found.lens.height)
+    return np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST))
+
+
 def write_match(match: Match, stem: Path) -> None:
     """Write `stem`.overlay.png, .mask.png and .npy."""
     match.save(stem.with_name(f"{stem.name}.overlay.png"))
@@ -141,6 +168,7 @@ def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, f
         "text": prompt.text,
         "negatives": list(prompt.negatives),
         "synonyms": scene.synonyms(prompt),
+        "taught": prompt.taught is not None,
         "doubt": doubt,
         "threshold": threshold,
         "folder": folder.name,
@@ -156,30 +184,36 @@ def _view_report(name: str, matches: list[Match]) -> dict:
 @dataclass(kw_only=True)
 class Export:
     """Write a scene in another form: a splat file of the Gaussians that match a text, in the model's frame,
-    which ordinary viewers open (--out); a web page to walk through it (--web); or the scene itself, in one
-    file to share, that can be queried without its run and its photos (--scene-file).
+    which ordinary viewers open (--out); a web page that answers words by itself (--web); or the scene itself,
+    in one file to share, that can be queried without its run and its photos (--scene-file).
     """
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Text to look for (default: write everything); with --web, repeat the flag or separate with `;`."""
+    """Text to look for (default: write everything); with --web, prompts that the page opens with."""
     not_: _Not = field(default_factory=list)
     """What all texts are told apart from; repeat the flag for more."""
     out: Path | None = None
     """The .ply or .spz file to write."""
     web: Path | None = None
     """Folder for a web page that any static server can serve."""
+    vocabulary: Path | None = None
+    """Words that may name a place on the page, one per line, besides the shipped ones; it also knows those of
+    the CLIP's tokenizer."""
     scene_file: Path | None = None
     """The .scene file to write."""
     title: str = ""
-    """Heading of page and scene (default: name of the photos' folder)."""
+    """Heading of page and scene (default: the scene's own, or the name of the photos' folder)."""
     credit: str = ""
     """Line about the photos: who took them."""
     license: str = ""
     """Terms under which photos and scene may be used."""
     all: bool = False
     """Write all Gaussians; with --text a .ply has their relevancy as a property."""
+    index: Path | None = None
+    """With --text and --out: file (.npy or .txt) for the numbers of the matching Gaussians, in the scene's
+    order, which is that of the splat it was attached to."""
     look: str | None = None
     """Light of this training photo, by name (default: of the photo that shows the scene as a whole)."""
     clip: str | None = None
@@ -189,6 +223,8 @@ class Export:
     def main(self) -> None:
         if sum(target is not None for target in (self.out, self.web, self.scene_file)) != 1:
             raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
+        if self.index is not None and (self.out is None or not self.text):
+            raise UserError("--index lists the Gaussians that match: give --text and --out with it")
         prompts = parse_texts(self.text, self.not_)
         if self.out is not None:
             make_folder(self.out.parent)
@@ -197,13 +233,28 @@ class Export:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         if self.scene_file is not None:
-            told = Provenance(self.title, self.credit, self.license, f"lang3dxl-ns {__version__}")
-            size = write_scene(self.scene_file, scene, told)
+            size = write_scene(self.scene_file, scene, self._told())
             say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: lang3dxl query {self.scene_file}")
         if self.web is not None:
-            size = write_page(scene, self.web, prompts, self.title, self.credit, self.look)
+            own = read_vocabulary(self.vocabulary) if self.vocabulary else ()
+            page = Page(scene, prompts, own, self._clip_words(scene.file.clip), self._told(), self.look)
+            size = write_page(page, self.web)
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
             text = prompts[0] if prompts else None
-            count = scene.export(self.out, text, everything=self.all, look=self.look)
+            count = scene.export(self.out, text, everything=self.all, look=self.look, index=self.index)
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
+
+    def _clip_words(self, clip: str | None) -> tuple[str, ...]:
+        """The words of the CLIP's tokenizer; none on a machine without that CLIP."""
+        try:
+            return whole_words(self.clip or clip or "")
+        except UserError as error:
+            say(f"The page knows the shipped words alone: {error}")
+            return ()
+
+    def _told(self) -> Provenance:
+        """What the scene's own file tells of its origin, unless told otherwise."""
+        own, program = provenance_of(self.scene), f"lang3dxl-ns {__version__}"
+        title, credit = self.title or own.title, self.credit or own.credit
+        return Provenance(title, credit, self.license or own.license, program, own.made_how)

@@ -1,50 +1,53 @@
-"""`lang3dxl view`: a trained scene in the viewer, on this machine only."""
+"""`lang3dxl view`: a scene in the browser, asked with any words."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, replace
+import contextlib
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from lang3dxl_ns.common.checks import check_address
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.query.query_config import QueryConfig
 
 
 @dataclass(kw_only=True)
 class View:
-    """Explore and query a trained scene in a browser on this machine.
+    """Explore and ask a scene in a browser.
 
-    The browser draws the Gaussians (WebGL) at its own frame rate, whatever this machine can render; a prompt
-    sends colors. No code in config.yml is run. (`ns-viewer` shows server renderings in nerfstudio's
-    viewer; it is open to the whole network by default, and trusts the file.)
+    The browser draws the Gaussians (WebGL) and answers words; this machine encodes texts. It is the page of
+    `lang3dxl export --web`, which answers the words of a vocabulary without any server.
     """
 
-    run: tyro.conf.Positional[Path | None] = None
-    """Folder of the run, or its config.yml (default: the newest under outputs/)."""
-    text: str = ""
-    """Initial prompt."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
+    text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """Prompt to start with; repeat the flag, or separate with `;`."""
+    vocabulary: Path | None = None
+    """Words that may name a place, one per line, besides the shipped ones."""
     host: str = "127.0.0.1"
     """Address to serve at; 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
     """Port to serve at; by default a free one from 7007 on."""
-    share: bool = False
-    """Make the viewer public through viser's share tunnel, to anyone with the token."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene says."""
+    settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
-        from lang3dxl_ns.plugin.open_run import open_run
-        from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
+        from lang3dxl_ns.open_scene import load_scene, provenance_of
+        from lang3dxl_ns.query.vocabulary import read_vocabulary
+        from lang3dxl_ns.query.web.serve import PageServer
+        from lang3dxl_ns.query.web.write_page import Page
 
-        check_address(self.host, self.port)
-        if self.text:
-            os.environ[QUERY_VARIABLE] = self.text
-        config, pipeline, _ = open_run(self.run)
-        viewer = replace(
-            config.viewer,
-            websocket_host=self.host,
-            websocket_port=self.port,
-            make_share_url=self.share,
-        )
-        from lang3dxl_ns.plugin.viewer.browser import BrowserViewer
-
-        BrowserViewer(pipeline, viewer, config.get_base_dir()).serve()
+        check_address(self.host, self.port)  # fail now rather than after the work
+        words = read_vocabulary(self.vocabulary) if self.vocabulary else ()
+        scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        page = Page(scene, self.text, words, provenance=provenance_of(self.scene), live=True)
+        server = PageServer(page, self.host, self.port)
+        who = "anyone with this address" if server.access.needs_token else "this machine only"
+        say(f"Open {server.access.address} ({who}). Ctrl-C ends it.")
+        with contextlib.suppress(KeyboardInterrupt), server:
+            server.serve_forever()

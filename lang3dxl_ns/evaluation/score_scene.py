@@ -14,6 +14,7 @@ from lang3dxl_ns.evaluation.language import LanguageScorer
 from lang3dxl_ns.evaluation.scores import map_size
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.teach import known_word
 from lang3dxl_ns.scene.photo import Photo
 
 SceneSplit = Literal["held-out", "seen", "all"]
@@ -37,6 +38,8 @@ def score_scene(
     """
     photos = labeled_photos(scene, truth, split)
     scorer = LanguageScorer(truth, scene.text.vectors)
+    words = [scene.words.get(known_word(category)) for category in truth.categories]
+    queries_shown = scorer.queries.taught(words)
     figures: dict[str, dict[str, float]] = {}
     with progress_bar() as bar:
         for photo in bar.track(photos, description="evaluating"):
@@ -45,7 +48,7 @@ def score_scene(
             keep = None if keep is None else keep.to(scene.device)
             raw, published = (
                 scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
-                for queries in (scorer.queries, scorer.published_queries)
+                for queries in (queries_shown, scorer.published_queries)
             )
             of_published = None if scorer.smooths else published
             variants = scorer.variants(raw, keep, scene.engine.temperature, of_published)
@@ -56,6 +59,7 @@ def score_scene(
     protocol = {
         "split": split,
         "evaluated_photos": len(photos),
+        "taught_words": [word.name for word in words if word is not None],
         **scorer.protocol(mask if masked else "none"),
     }
     return figures, protocol

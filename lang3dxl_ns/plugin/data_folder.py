@@ -10,12 +10,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.plugin.dataparser import MODEL_FOLDERS, OWN_MODEL, PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.preparation.photo_collection import MODEL_FOLDERS, OWN_MODEL, TRANSFORMS
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
-
-TRANSFORMS = "transforms.json"
 
 
 def check_data(data: Path | None) -> None:

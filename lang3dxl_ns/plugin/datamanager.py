@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import torch
+import tyro
 from jaxtyping import Bool
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanager,
+    FullImageDatamanagerConfig,
 )
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -22,6 +25,7 @@ from rich.markdown import Markdown
 from rich.markup import escape
 from torch import Tensor
 
+from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
@@ -30,6 +34,7 @@ from lang3dxl_ns.plugin.data_folder import parser_for
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.handover import Batch, SceneFacts
+from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES, without
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
@@ -37,9 +42,11 @@ from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.plugin.run_dataparser import recorded_scene
 from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
+from lang3dxl_ns.preparation.model_files import BUILTIN
 from lang3dxl_ns.preparation.needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
+from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
@@ -48,8 +55,47 @@ from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.novel_views import NovelViews, read_novel_views
 from lang3dxl_ns.scene.photo import Photo
 
-if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
+
+@without(*OF_IMAGE_CACHES)
+@dataclass
+class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
+    """Photos and their targets. `--pipeline.datamanager.clip none` trains colors only."""
+
+    _target: type = field(default_factory=lambda: Lang3DXLDataManager)
+    dataparser: AnnotatedDataParserUnion = field(default_factory=PhotoCollectionDataParserConfig)
+    """Source of photos and cameras."""
+    cache_dir: Path | None = None
+    """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
+    cache_gb: float | None = None
+    """Memory for decoded photos and their targets, in gigabytes: the first that fit are kept, the others read
+    ahead of their use. Default: a quarter of the machine's memory."""
+    read_ahead: int = 16
+    """Photos read ahead of the training step, in addition to that memory."""
+    targets_in_steps: tyro.conf.Suppress[bool] = True
+    """Whether training steps learn from the targets; settled with the encoder."""
+    run: tyro.conf.Suppress[Path | None] = None
+    """Folder of the run whose config.yml this comes from; set when that is read."""
+
+    def check(self) -> None:
+        """Raises UserError for invalid options, before any work."""
+        super().check()
+        check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
+
+    def settle_targets(self, learned: bool) -> None:
+        """Regions and targets in every step are for semantics `learned` with the scene; others have finer
+        crops."""
+        self.targets_in_steps = learned
+        if self.crops == "auto":
+            self.crops = "pyramid" if learned else "fine"
+        if not learned or self.clip == "none":
+            self.regions = "none"
+        if self.clip == "none":
+            self.dense = "none"
+        elif self.dense == "auto":
+            self.dense = BUILTIN if self.clip == BUILTIN else DENSE_MODEL
+
+
+_BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
 
 
 class PhotosGoneError(UserError):

@@ -19,14 +19,10 @@ from lang3dxl_ns.common.errors import UserError, printable
 from lang3dxl_ns.common.files import expanded, read_names
 from lang3dxl_ns.plugin.inert_settings import OF_COLMAP, without
 from lang3dxl_ns.preparation.foreground import find_mask
+from lang3dxl_ns.preparation.photo_collection import MODEL_FOLDERS, OWN_MODEL, images_path, usable_photos
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
-from lang3dxl_ns.scene.companions import inside
-from lang3dxl_ns.scene.photo import Photo, upright_in_model
-from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
-
-MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
-OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
-"""Folder for a model of ours if sparse is taken."""
+from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.photo_folder import photos_below
 
 
 @without(*OF_COLMAP)
@@ -78,7 +74,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         self.config.colmap_path = _first_folder(
             data, (self.config.colmap_path, *MODEL_FOLDERS, OWN_MODEL), "*.*"
         )
-        self.config.images_path = _images_path(data, self.config.images_path)
+        self.config.images_path = images_path(data, self.config.images_path)
         if self.reconstruction is None:
             self._read_collection()
             self._mention_what_is_not_used()
@@ -200,17 +196,9 @@ class PhotoCollectionDataParser(ColmapDataParser):
     def _read_collection(self) -> None:
         """The model's usable photos; logs which are left out, and why."""
         reconstruction = read_reconstruction(self.config.data / self.config.colmap_path)
-        left_out: dict[str, UserError] = {}
-        kept: dict[str, TrackedPhoto] = {}
-        for name, tracked in reconstruction.photos.items():
-            path = self._image_path(name)
-            try:
-                if not inside(self._images_folder, name, self.config.follow_links).is_file():
-                    raise UserError(f"there is no {path}")
-                kept[name] = upright_in_model(tracked, path)
-                self.photos[path] = Photo.from_model(kept[name], path, self._mask_path(name))
-            except UserError as reason:
-                left_out[name] = reason
+        self.photos, kept, left_out = usable_photos(
+            reconstruction, self._images_folder, self._mask_path, self.config.follow_links
+        )
         self._left_out = left_out
         if len(self.photos) == 1:
             raise UserError(
@@ -255,13 +243,6 @@ class PhotoCollectionDataParser(ColmapDataParser):
                 f"{len(unknown)} photos of {self._images_folder} are not in the COLMAP model and not used: "
                 f"{escape(some(unknown))}"
             )
-
-
-def _images_path(data: Path, named: Path) -> Path:
-    """The photos' folder relative to the scene's: the configured one if it exists, else one with photos."""
-    if (data / named).is_dir() and any((data / named).iterdir()):
-        return named
-    return find_photos(data).folder.relative_to(data) if any(find_photos(data).names) else named
 
 
 def _models_beside(model: Path) -> list[Path]:

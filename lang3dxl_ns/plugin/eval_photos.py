@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -14,8 +14,18 @@ from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.scene.photo import Photo
 
-if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+
+class Reader(Protocol):
+    """What reads photos: the data manager."""
+
+    eval_dataset: PhotoDataset
+
+    @property
+    def targets(self) -> Any:
+        """Targets of the photos, prepared at first use."""
+
+    def read(self, dataset: PhotoDataset, index: int) -> tuple[Cameras, Batch]:
+        """Camera and batch of a photo. Raises UserError if it can't be used."""
 
 
 class EvalPhotos:
@@ -29,7 +39,7 @@ class EvalPhotos:
 
     def __init__(
         self,
-        datamanager: Lang3DXLDataManager,
+        datamanager: Reader,
         dataset: PhotoDataset | None = None,
         names: Collection[str] | None = None,
     ):

@@ -7,17 +7,12 @@ from copy import deepcopy
 from functools import partial
 
 import torch
-import torch.nn.functional as F
-from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
-from torch import Tensor
 from torch.nn import Parameter
 
-from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
-from lang3dxl_ns.components.principal_basis import PrincipalBasis
+from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.rendering.gathering import Pixels, gather
 
 LONGER_SIDE = 1_600
 """Pixels of the longer side at which larger photos are gathered: a CLIP crop covers hundreds of pixels, and
@@ -29,41 +24,29 @@ def learn_from_photos(
     photos: Iterable[tuple[Cameras, Batch]],
     advance: Callable[[], None] = lambda: None,
 ) -> None:
-    """Gather the photos' target features onto the Gaussians, sharpen them where there are dense features, and
-    let the encoder make codes of them.
+    """Give the model's Gaussians codes of the photos' targets; see `learn_codes`.
 
     model: in training mode, so that it renders its photos as in training. photos: cameras and batches, with
     targets. advance: called as the encoder learns, `learning_steps` times.
     """
     encoder, facts = model.semantic_field, model.facts
-    assert encoder is not None
-    basis = fine_basis = None
-    width = channels = len(model.clip_mean)
-    if encoder.gathered_channels is not None and encoder.gathered_channels < width:
-        assert facts.clip_targets is not None
-        width = channels = encoder.gathered_channels
-        basis = PrincipalBasis.of(facts.clip_targets(), width)
-    if facts.dense_targets is not None:
-        fine_basis = PrincipalBasis.of(map(_unit, facts.dense_targets()), DENSE_AXES)
-        channels += fine_basis.axes.shape[1]
-
-    def views():
-        for camera, batch in photos:
-            camera = working_camera(camera)
-            clip = batch["clip_target"]
-            maps = [clip if basis is None else basis.to(clip).coordinates(clip)]
-            if fine_basis is not None:
-                maps.append(fine_basis.to(clip).coordinates(_unit(batch["dense_target"])))
-            size = int(camera.height.item()), int(camera.width.item())
-            mask = batch["mask"][..., 0] if "mask" in batch else None
-            yield partial(model.composite, camera), Pixels.of(maps, size, mask)
-
-    features, mass = gather(model.num_points, views(), channels, model.means.detach())
-    if fine_basis is not None:
-        features = sharpen(features[:, :width], features[:, width:], mass)
-    codes = encoder.learn_gaussians(features, mass, advance, basis)
-    # Features that are many lie on the CPU, and those that are codes themselves come from there.
+    assert encoder is not None and facts.clip_targets is not None
+    views = (_view(model, camera, batch) for camera, batch in photos)
+    codes = learn_codes(
+        encoder, views, model.means.detach(), facts.clip_targets, facts.dense_targets, advance
+    )
     model.gauss_params["codes"] = Parameter(codes.to(model.device), requires_grad=False)
+
+
+def _view(model: Lang3DXLModel, camera: Cameras, batch: Batch) -> TargetView:
+    camera = working_camera(camera)
+    return TargetView(
+        partial(model.composite, camera),
+        (int(camera.height.item()), int(camera.width.item())),
+        batch["clip_target"],
+        batch.get("dense_target"),
+        batch["mask"][..., 0] if "mask" in batch else None,
+    )
 
 
 def working_camera(camera: Cameras) -> Cameras:
@@ -73,7 +56,3 @@ def working_camera(camera: Cameras) -> Cameras:
         camera = deepcopy(camera)
         camera.rescale_output_resolution(LONGER_SIDE / longer)
     return camera
-
-
-def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:
-    return F.normalize(dense.float(), dim=-1)

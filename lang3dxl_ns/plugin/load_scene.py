@@ -8,7 +8,7 @@ import zipfile
 import zlib
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import torch
 from nerfstudio.data.scene_box import SceneBox
@@ -21,15 +21,11 @@ from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.plugin.saved_config import read_model_config
-from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.find_run import find_config
 from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, ScenePhoto
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import EncodeTexts
-
-if TYPE_CHECKING:  # training's
-    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 
 NOT_A_CHECKPOINT = (
     *(OSError, EOFError, RuntimeError, pickle.UnpicklingError),
@@ -38,38 +34,6 @@ NOT_A_CHECKPOINT = (
 )
 """Exceptions raised on reading a file that is not a checkpoint."""
 NOT_FINISHED = "this run has no semantics yet: they are learned when training ends; resume it (--load-dir)"
-
-
-def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
-    """The scene description kept in a run's folder."""
-    outputs, clip = datamanager.train_dataparser_outputs, datamanager.config.clip
-    known = None if clip == "none" else find_model(clip, CLIP_OPTION)
-    local = Path(clip).expanduser()
-    return SceneFile(
-        photos=[*_photos(datamanager, "train"), *_photos(datamanager, "eval")],
-        clip=None if known is None else str(local.absolute()) if local.is_dir() else clip,
-        clip_identity=None if known is None else known.identity,
-        scale=float(outputs.dataparser_scale),
-        transform=outputs.dataparser_transform.tolist(),
-        data=str(Path(datamanager.config.dataparser.data).expanduser().absolute()),
-    )
-
-
-def _photos(datamanager: Lang3DXLDataManager, split: Literal["train", "eval"]) -> list[ScenePhoto]:
-    masked = datamanager.photos
-    dataset = datamanager.train_dataset if split == "train" else datamanager.eval_dataset
-    cameras, photos = dataset.cameras, [masked[photo.name] for photo in dataset.photos]
-    return [
-        ScenePhoto(
-            name=photo.name,
-            split=split,
-            camera_to_world=cameras.camera_to_worlds[i].tolist(),
-            lens=photo.lens.scaled(dataset.scale),
-            mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
-            size=(photo.lens.width, photo.lens.height),
-        )
-        for i, photo in enumerate(photos)
-    ]
 
 
 def load_run(

@@ -18,11 +18,10 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.evaluation.ground_truth import Layout
-from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
-from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
+from lang3dxl_ns.plugin.describe_scene import describe_scene
 from lang3dxl_ns.plugin.evaluation import Evaluation, Split
 from lang3dxl_ns.plugin.lift_features import learn_from_photos
-from lang3dxl_ns.plugin.load_scene import describe_scene
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly

@@ -25,6 +25,13 @@ if TYPE_CHECKING:  # with nerfstudio's trainer, which takes two seconds to load 
 TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
 _PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
 _PYTHON = "tag:yaml.org,2002:python/"
+_MOVED = {
+    f"lang3dxl_ns.plugin.{old}": f"lang3dxl_ns.plugin.{new}"
+    for old, new in {
+        "datamanager_config.Lang3DXLDataManagerConfig": "datamanager.Lang3DXLDataManagerConfig",
+    }.items()
+}
+"""Where settings are that earlier versions kept elsewhere."""
 _UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
 """nerfstudio's classes that unpickle what they read."""
 
@@ -268,6 +275,7 @@ class _SettingsLoader(yaml.UnsafeLoader):
 
     def find_python_name(self, name: str, mark: Any) -> Any:  # type: ignore[override]
         """A class from the packages that define settings."""
+        name = _MOVED.get(name, name)
         if not name.startswith(tuple(f"{package}." for package in _PACKAGES)):
             raise yaml.constructor.ConstructorError(None, None, f"it asks for {name}", mark)
         found = super().find_python_name(name, mark)

@@ -33,10 +33,10 @@ from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
 from lang3dxl_ns.plugin.checkpoint import restore_run_state, run_state
 from lang3dxl_ns.plugin.datamanager import PhotosGoneError
+from lang3dxl_ns.plugin.describe_scene import describe_scene
 from lang3dxl_ns.plugin.load_scene import (
     NOT_A_CHECKPOINT,
     check_checkpoint,
-    describe_scene,
     read_checkpoint,
 )
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state

@@ -88,10 +88,14 @@ def peaks(relevancy: Float[Tensor, "q n"]) -> Float[Tensor, " q"]:
     return relevancy.topk(math.ceil(_BEST * relevancy.shape[1]), dim=1).values.mean(1)
 
 
-def doubtful(text: str, doubt: float) -> str | None:
-    """A sentence about a doubtful prompt; None for the others."""
+def doubtful(text: str, doubt: float, taught: bool = False) -> str | None:
+    """A sentence about a doubtful prompt; None for the others. taught: whether it was taught by example."""
     if doubt <= DOUBTFUL:
         return None
+    if taught:
+        return (
+            f"doubtful: {doubt:.0%} of what was not marked as {text!r} fits as well: mark it in more photos"
+        )
     if doubt == 1.0:
         return f"doubtful: {text!r} fits no place: it may be absent, or the run's CLIP may not know the word"
     return (

@@ -48,6 +48,10 @@ class QueryEngine(Protocol):
     def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
         """Unit CLIP features of some Gaussians; 0 for those visible in no photo."""
 
+    @property
+    def head(self) -> Float[Tensor, "r c"] | None:
+        """Vectors that all features are combinations of, if they are fewer than CLIP's channels."""
+
     def calibrated(self, words: Queries) -> QueryEngine:
         """The same with a temperature that suits the encoder: `relevancy.calibrated`.
 
@@ -75,6 +79,10 @@ class PerGaussian:
     def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
         return self.decoded.features(rows)
 
+    @property
+    def head(self) -> Float[Tensor, "r c"] | None:
+        return self.decoded.head
+
     def calibrated(self, words: Queries) -> PerGaussian:
         cosines = self.decoded.some(_SAMPLE).cosines(words)
         return replace(self, temperature=calibrated(self.temperature, cosines))
@@ -87,6 +95,7 @@ class PerPixel:
     decode: Decode
     codes: Float[Tensor, "n d"]
     temperature: float = TEMPERATURE
+    head = None
 
     def channels(self, queries: Queries) -> Float[Tensor, "n d"]:
         return self.codes

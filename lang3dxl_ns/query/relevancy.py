@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 import torch.nn.functional as F
@@ -26,6 +27,36 @@ _CPU_CHUNK = 8192
 """Codes decoded at a time on a CPU."""
 
 
+class Learned(Protocol):
+    """A word learned from examples: a linear score of unit features, and a share of its text."""
+
+    @property
+    def vector(self) -> Float[Tensor, " c"]:
+        """Of any length."""
+
+    @property
+    def bias(self) -> float:
+        """Margin of a feature that is orthogonal to the vector."""
+
+    @property
+    def text(self) -> float:
+        """Weight of the text's own margin, from 0."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A linear score of features, learned from examples, that joins a prompt's own margin."""
+
+    row: int
+    """Of its direction among the vectors."""
+    length: float
+    """Margin per unit of the cosine with that direction."""
+    bias: float
+    """Margin where the cosine is 0."""
+    text: float
+    """Share of the text's own margin, from 0."""
+
+
 @dataclass(frozen=True)
 class Queries:
     """Several prompts as vectors: each has synonyms, any of which may fit, and phrases to compete with.
@@ -39,6 +70,8 @@ class Queries:
     """For every prompt, the rows of its synonyms."""
     negative: tuple[tuple[int, ...], ...]
     """For every prompt, the rows it competes with: canonical phrases and its own negatives."""
+    probes: tuple[Probe | None, ...] = ()
+    """For every prompt, what was learned from examples; empty: nothing for any."""
 
     @classmethod
     def of(
@@ -67,12 +100,29 @@ class Queries:
             rows += len(extra)
         return cls(F.normalize(torch.cat(blocks), dim=-1), tuple(positive), tuple(negative))
 
+    def taught(self, words: Sequence[Learned | None]) -> Queries:
+        """The same prompts; those with a learned word have the margin vector · feature + bias + text · (their
+        own margin).
+
+        Args:
+            words: one per prompt; None for prompts of texts alone.
+        """
+        rows, probes = [self.vectors], list[Probe | None]()
+        for word in words:
+            probe = None
+            if word is not None:
+                vector = word.vector.to(self.vectors)
+                probe = Probe(len(self.vectors) + len(rows) - 1, float(vector.norm()), word.bias, word.text)
+                rows.append(F.normalize(vector, dim=0)[None])
+            probes.append(probe)
+        return replace(self, vectors=torch.cat(rows), probes=tuple(probes))
+
     def __len__(self) -> int:
         return len(self.positive)
 
     def to(self, device: torch.device | str) -> Queries:
         """The same on another device."""
-        return Queries(self.vectors.to(device), self.positive, self.negative)
+        return replace(self, vectors=self.vectors.to(device))
 
     def cosines(self, features: Float[Tensor, "... c"]) -> Float[Tensor, "... v"]:
         """Cosine of every feature with every vector; 0 for a zero feature."""
@@ -82,11 +132,16 @@ class Queries:
         self, cosines: Float[Tensor, "... v"], temperature: float = TEMPERATURE
     ) -> Float[Tensor, "q ..."]:
         """sigmoid(τ (max over synonyms − max over competitors)), the smallest softmax of the best synonym
-        against each competitor (LERF, Kerr et al. 2023): 0…1, above 0.5 where it wins."""
+        against each competitor (LERF, Kerr et al. 2023): 0…1, above 0.5 where it wins. Prompts learned from
+        examples have the margin of their `Probe`."""
         margins = [
             _largest(cosines, mine) - _largest(cosines, theirs)
             for mine, theirs in zip(self.positive, self.negative, strict=True)
         ]
+        for i, probe in enumerate(self.probes):
+            if probe is not None:
+                learned = probe.length * cosines[..., probe.row] + probe.bias
+                margins[i] = learned + probe.text * margins[i]
         return torch.sigmoid(temperature * torch.stack(margins))
 
 

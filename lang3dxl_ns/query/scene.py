@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -31,12 +32,13 @@ from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.rank_views import rank_views
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.query.splat_file import write_index, write_splats
+from lang3dxl_ns.query.teach import MARK_SIDE, Example, TaughtWord, Weights, known_word, learn, marks
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts
 from lang3dxl_ns.query.threshold import match_thresholds
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
-from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.rendering.gathering import filled_parts, filled_pixels
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import Rendering, composite
 from lang3dxl_ns.rendering.splats import Splats
@@ -75,6 +77,7 @@ class Scene:
         cache: file to keep which Gaussians the photos show; None: they are measured in every process.
         backend: the rasterizer, see `rasterize`.
         watch: called with a short description of slow work; None: a progress bar.
+        words: words taught by example, see `teach`.
     """
 
     def __init__(
@@ -92,7 +95,10 @@ class Scene:
         cache: Path | None = None,
         backend: Backend = "auto",
         watch: Callable[[str], None] | None = None,
+        words: Iterable[TaughtWord] = (),
     ) -> None:
+        self.words: Mapping[str, TaughtWord] = {known_word(word.name): word for word in words}
+        """Taught words, by their names in lower case."""
         self.splats, self.file, self.decoder, self.codes = splats, file, decoder, codes
         self.looks, self.background, self.backend = looks, background, backend
         self.config = config or QueryConfig()
@@ -230,7 +236,9 @@ class Scene:
         queries = self.queries(everything)
         relevancy = self.engine.of_gaussians(queries)
         doubts = self.doubts.of(relevancy)
-        own = match_thresholds(relevancy, doubts, [bool(prompt.negatives) for prompt in everything])
+        doubts = [p.taught.doubt if p.taught else d for p, d in zip(everything, doubts, strict=True)]
+        strict = [bool(prompt.negatives or prompt.taught) for prompt in everything]
+        own = match_thresholds(relevancy, doubts, strict)
         count, requested = len(prompts), self.config.threshold if threshold is None else threshold
         if requested is not None and not 0 <= requested <= 1:
             raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
@@ -349,8 +357,9 @@ class Scene:
         threshold: float | None = None,
         everything: bool = False,
         look: str | None = None,
+        index: str | Path | None = None,
     ) -> int:
-        """Write the Gaussians as a .ply or .spz file for splat viewers.
+        """Write the Gaussians as a .ply or .spz file for splat viewers, in the scene's order.
 
         Args:
             path: the file.
@@ -358,6 +367,8 @@ class Scene:
             threshold: see `ask`.
             everything: with a text, write all Gaussians; a PLY has their relevancy as a property.
             look: training photo whose lighting is baked into the colors; default: of the overview photo.
+            index: with a text, a .npy or .txt file for the numbers of the matching Gaussians: their places in
+                the scene, and so in the splat that it was attached to, from 0.
 
         Returns:
             How many were written.
@@ -375,6 +386,8 @@ class Scene:
                     f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
                     f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
                 )
+            if index is not None:
+                write_index(Path(index), keep)
             if not everything:
                 splats, relevancy = splats.select(keep), relevancy[keep]
         return write_splats(Path(path), splats, relevancy)
@@ -445,6 +458,74 @@ class Scene:
         best = scores.topk(min(most, len(words)))
         return [(words[int(i)], float(score)) for score, i in zip(best.values, best.indices, strict=True)]
 
+    # ── words taught by example ─────────────────────────────────────────────────────────────────────
+
+    def teach(self, word: str, examples: Example | Sequence[Example]) -> Scene:
+        """A scene that knows a word from examples, as `scene.words[word]`; this one doesn't change.
+
+        `query`, `find`, `relevancy` and `export` of the new scene use what it learned wherever the word is
+        a prompt. Examples that the word had before are replaced.
+
+        Args:
+            word: the word, of any case.
+            examples: marks in photos of the scene.
+
+        Raises:
+            UserError: the marks show nothing or everything, or lie outside their photos.
+        """
+        (prompt,) = parse_prompts(f'"{word}"')
+        listed = [examples] if isinstance(examples, Example) else list(examples)
+        queries = self.text.plain_queries([prompt.text]).to(self.device)
+
+        def margin(features: Float[Tensor, "m c"]) -> Float[Tensor, " m"]:
+            return queries.relevancy_of_cosines(queries.cosines(features), 1.0)[0].logit()
+
+        weights = [self._marked(example) for example in listed]
+        engine = self.engine
+        learned = learn(
+            prompt.text, listed, weights, engine.features, margin, engine.head, engine.temperature
+        )
+        learned = replace(learned, clip=self.file.clip_identity, scene=Path(self.file.data).name)
+        return self.with_words([*self.words.values(), learned])
+
+    def with_words(self, words: Iterable[TaughtWord]) -> Scene:
+        """The same scene with these taught words; of equal names the last one. It shares what is computed."""
+        changed = copy.copy(self)
+        changed.words = {known_word(word.name): word for word in words}
+        return changed
+
+    def unsure(self, word: str) -> str:
+        """The training photo in which a taught word is least sure: the next one to mark.
+
+        Raises:
+            UserError: the word was not taught.
+        """
+        taught = self.words.get(known_word(word))
+        if taught is None:
+            raise UserError(f"{word!r} was not taught: see lang3dxl words")
+        chance = self._one(taught.name).relevancy[0]
+        open_question = chance * (1 - chance)
+        marked = {self.file.photo(example.photo).name for example in taught.examples}
+        views = {name: view for name, view in self.visible.items() if name not in marked} or self.visible
+        return max(
+            views, key=lambda name: float(open_question[views[name].rows.long()] @ views[name].pixels.float())
+        )
+
+    def _marked(self, example: Example) -> Weights:
+        photo = self.file.photo(example.photo)
+        camera = resized(photo.full_camera, MARK_SIDE)
+        size = (camera.height, camera.width)
+        foreground = photo.foreground(size)
+        shown = torch.ones(size) if foreground is None else foreground.float()
+        pixels = torch.cat([marks(example, photo, size) * shown, shown[None]]).permute(1, 2, 0)
+        drawn = partial(composite, self.splats, camera, backend=self.backend)
+        word, other, seen = filled_parts(drawn, pixels.to(self.device), len(self.splats)).unbind(1)
+        return Weights(word, other, seen)
+
+    def _with_taught(self, prompt: Prompt) -> Prompt:
+        taught = self.words.get(known_word(prompt.text))
+        return prompt if taught is None or prompt.vector is not None else replace(prompt, taught=taught)
+
     # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
 
     def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
@@ -452,9 +533,9 @@ class Scene:
         prompts: list[Prompt] = []
         for text in _listed(texts):
             if isinstance(text, Prompt):
-                prompts.append(text)
+                prompts.append(self._with_taught(text))
             elif isinstance(text, str):
-                prompts += parse_prompts(text)
+                prompts += map(self._with_taught, parse_prompts(text))
             else:
                 prompts.append(Prompt("vector", vector=self._vector(text)))
         return prompts or parse_prompts("")
@@ -467,7 +548,8 @@ class Scene:
 
     def synonyms(self, prompt: Prompt) -> list[str]:
         """Synonyms searched along with a prompt."""
-        synonyms = [] if prompt.vector is not None else self.text.synonyms(prompt.text)
+        fixed = prompt.vector is not None or prompt.taught is not None
+        synonyms = [] if fixed else self.text.synonyms(prompt.text)
         if not synonyms or self.config.text.combine != "fallback":
             return synonyms
         if prompt.text not in self._doubt_alone:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from math import prod
@@ -36,6 +36,7 @@ from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
+from lang3dxl_ns.query.teach import TaughtWord, words_from_json
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering.splats import Splats
@@ -102,21 +103,44 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         described["decoder"] = _described(scene.decoder)
         content["codes"] = _stored_codes(scene.codes, scene.decoder.bounded)
         content |= _stored_state("decoder", scene.decoder)
+        described["words"] = list(common_words())
+        content["words"] = _array(scene.text.vectors(described["words"]), np.float16)
     if scene.looks is not None:
         field = scene.looks.field
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
-        if scene.file.clip is not None:
-            words = common_words()
-            described["words"] = list(words)
-            content["words"] = _array(scene.text.vectors(words), np.float16)
     masks = {i: _mask_of(photo) for i, photo in enumerate(scene.photos) if photo.mask is not None}
     content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
+    described["taught"] = [word.to_json() for word in scene.words.values()]
     file = replace(scene.file, photos=[replace(photo, mask=None) for photo in scene.photos])
     described["scene"] = asdict(replace(file, data=Path(file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
     write_atomically(path, data)
     return len(data)
+
+
+def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
+    """Replace the taught words in a scene file, atomically; nothing else in it changes.
+
+    Args:
+        path: the scene file.
+        words: those that it holds from now on.
+
+    Raises:
+        UserError: as `read_scene`.
+    """
+    with _reported(path):
+        with _opened(path) as file:
+            _description(file)
+        content = path.read_bytes()
+        begin = 8 + int.from_bytes(content[:8], "little")
+        header = json.loads(content[8:begin])
+        described = json.loads(header["__metadata__"][_KEY])
+        described["taught"] = [word.to_json() for word in words]
+        header["__metadata__"][_KEY] = json.dumps(described)
+        start = json.dumps(header).encode()
+        start += b" " * (-len(start) % 8)  # tensors stay aligned
+    write_atomically(path, len(start).to_bytes(8, "little") + start + content[begin:])
 
 
 def _splat_tensors(splats: Splats) -> dict[str, Shaped[Array, "..."]]:
@@ -255,6 +279,7 @@ class _Description:
     decoder: dict[str, Any] | None
     looks: dict[str, Any] | None
     words: list[str] | None
+    taught: list[TaughtWord]
 
 
 def _read(
@@ -278,7 +303,7 @@ def _read(
     return Scene(
         splats, replace(about.scene, photos=photos), decoder, codes,
         looks=looks, background=background, config=config, encode_texts=encode_texts,
-        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
+        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"), words=about.taught,
     )  # fmt: skip
 
 
@@ -309,6 +334,7 @@ def _description(file: Any) -> _Description:
         content.get("decoder"),
         content.get("looks"),
         content.get("words"),
+        words_from_json(content.get("taught", [])),
     )
 
 

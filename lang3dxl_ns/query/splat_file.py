@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray as Array
 from torch import Tensor
 
@@ -39,6 +40,22 @@ def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | No
     splats, relevancy = splats.select(sound), None if relevancy is None else relevancy[sound]
     write_atomically(path, _ply(splats, relevancy) if path.suffix.lower() == ".ply" else _spz(splats))
     return len(splats)
+
+
+def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
+    """Write the numbers of the selected Gaussians, from 0: an array (.npy), or a line each (.txt).
+
+    Raises UserError for another ending.
+    """
+    numbers = selected.nonzero()[:, 0].cpu().numpy()
+    if path.suffix.lower() == ".npy":
+        content = io.BytesIO()
+        np.save(content, numbers)
+        write_atomically(path, content.getvalue())
+    elif path.suffix.lower() == ".txt":
+        write_atomically(path, "".join(f"{number}\n" for number in numbers))
+    else:
+        raise UserError(f"{path.name} names no kind of list: end it in .npy or .txt")
 
 
 def check_splat_name(path: Path) -> None:

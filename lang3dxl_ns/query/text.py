@@ -20,6 +20,7 @@ from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.teach import TaughtWord
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """`ImageTextEncoder.encode_texts`."""
@@ -41,6 +42,8 @@ class Prompt:
     """Phrases it competes with, besides the configured ones."""
     vector: Float[Tensor, " c"] | None = field(default=None, compare=False, repr=False)
     """What to search for, in the space of CLIP, in place of the text's own vector."""
+    taught: TaughtWord | None = field(default=None, compare=False, repr=False)
+    """What the scene has learned of this word from examples."""
 
 
 def parse_prompts(typed: str) -> list[Prompt]:
@@ -194,7 +197,7 @@ class TextEncoder:
                 self._against_all_but(p.vector) if p.vector is not None else self._against(p.text)
                 for p in prompts
             ],
-        )
+        ).taught([prompt.taught for prompt in prompts])
 
     def plain_queries(self, texts: Sequence[str]) -> Queries:
         """Vectors of texts without synonyms, against the negatives."""

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import re
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
+from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.negatives import NEGATIVES
 from lang3dxl_ns.query.relevancy import CANONICAL
@@ -14,6 +20,8 @@ _COMMON = (
     "fence", "sign", "lamp", "bench", "flag", "water", "mountain", "flower",
 )  # fmt: skip
 """Things around buildings that the table of architectural terms doesn't list."""
+_WHOLE = re.compile(r"(?P<end>[a-z]{3,})</w>|[▁Ġ](?P<start>[a-z]{3,})")
+"""Tokens that are words: marked at their end in CLIP's tables, at their start in others'."""
 
 
 @lru_cache(maxsize=1)
@@ -36,3 +44,33 @@ def _plural(word: str) -> str:
     if word.endswith(("s", "x", "ch", "sh")):
         return f"{word}es"
     return f"{word[:-1]}ies" if word.endswith("y") and word[-2] not in "aeiou" else f"{word}s"
+
+
+def whole_words(clip: str | Path) -> tuple[str, ...]:
+    """Lower-case words of three letters or more that a CLIP's tokenizer knows as a whole, by its table.
+
+    Args:
+        clip: folder or name of the CLIP.
+
+    Raises:
+        UserError: there is no such CLIP here.
+    """
+    folder = find_model(clip, CLIP_OPTION).folder
+    tokens: Any = {}
+    if (folder / "tokenizer.json").is_file():
+        tokens = json.loads((folder / "tokenizer.json").read_text(encoding="utf-8"))["model"]["vocab"]
+    elif (folder / "vocab.json").is_file():
+        tokens = json.loads((folder / "vocab.json").read_text(encoding="utf-8"))
+    # Unigram models list pairs of token and score; byte-pair ones map tokens to numbers.
+    names = [token if isinstance(token, str) else token[0] for token in tokens]
+    words = (_WHOLE.fullmatch(name) for name in names)
+    return tuple(sorted({found["end"] or found["start"] for found in words if found}))
+
+
+def read_vocabulary(path: Path) -> tuple[str, ...]:
+    """Words or phrases from a text file, one per line. Raises UserError if it can't be read."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} can't be read as a list of words ({error}): give one per line") from error
+    return tuple(dict.fromkeys(line.strip() for line in lines if line.strip()))

@@ -114,7 +114,12 @@ def lift_masks(
 
 def filled_pixels(composite: Composite, weight: Float[Tensor, "h w"], count: int) -> Float[Tensor, " n"]:
     """Pixels that every Gaussian fills in a view, with a weight per pixel."""
+    return filled_parts(composite, weight[..., None], count)[:, 0]
+
+
+def filled_parts(composite: Composite, weights: Float[Tensor, "h w k"], count: int) -> Float[Tensor, "n k"]:
+    """Pixels that every Gaussian fills in each of several parts of a view, with weights per pixel."""
     with torch.enable_grad():
-        probe = nn.Parameter(weight.new_zeros(count, 1))
-        (gradient,) = torch.autograd.grad(composite(probe), probe, weight[..., None])
-    return gradient[:, 0]
+        probe = nn.Parameter(weights.new_zeros(count, weights.shape[-1]))
+        (gradient,) = torch.autograd.grad(composite(probe), probe, weights)
+    return gradient

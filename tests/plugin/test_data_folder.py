@@ -14,7 +14,7 @@ from scenes import speckled, write_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.data_folder import parser_for
-from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.scene.video import _sharpest, extract_frames
 

@@ -10,7 +10,7 @@ import torch
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.datamanager_config import Lang3DXLDataManagerConfig
+from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.preparation import encoders
 from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
 from lang3dxl_ns.preparation.model_files import check_encoders, find_model, option_prefix

@@ -86,9 +86,11 @@ def asdict_of(photo):
     return photo.name, photo.split, photo.camera_to_world, photo.lens, photo.size
 
 
-def test_common_words_need_no_clip(written):
+@pytest.mark.parametrize("looks", [None, looks()], ids=["one lighting", "looks"])
+def test_common_words_need_no_clip(tmp_path, looks):
     """The CLIP that this scene names is nowhere."""
-    scene, path = written
+    scene, path = painted_scene(**decoded("lang3dxl"), looks=looks), tmp_path / "wall.scene"
+    write_scene(path, scene)
     found = read_scene(path, "cpu")
     for word in ("dome", "windows", "pilasters"):
         np.testing.assert_allclose(found.relevancy(word), scene.relevancy(word), atol=2e-3)

@@ -1,4 +1,4 @@
-"""`lang3dxl demo-scene`: its settings, separate from the work so that its help starts fast."""
+"""Settings of a demo scene, separate from the work so that the help of `lang3dxl demo-scene` starts fast."""
 
 from __future__ import annotations
 
@@ -30,14 +30,3 @@ class DemoScene:
     """Novel views for scoring (test_views/): cameras like the photos', plain light, no people. 0: none."""
     workers: int | None = None
     """Number of processes; by default one per CPU core."""
-
-    def main(self) -> None:
-        """Write the scene and print where it is."""
-        from rich import get_console
-
-        from lang3dxl_ns.demo.landmark.scene_writer import write_scene
-
-        folder = write_scene(self)
-        get_console().print(
-            f"{self.photos} photos, COLMAP model, masks and ground truth in {folder}", soft_wrap=True
-        )

@@ -6,7 +6,7 @@ import re
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from threading import Lock
 
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.query.answer import Display, pictures
+from lang3dxl_ns.query.answer import pictures
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import Question
@@ -22,16 +22,6 @@ from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import QueryConfig, Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
-
-
-@dataclass
-class Seconds:
-    """Durations of the latest answer."""
-
-    text: float | None = None
-    """Encoding the text."""
-    frame: float | None = None
-    """Rendering, matches included."""
 
 
 class Conversation:
@@ -51,6 +41,8 @@ class Conversation:
         watch: called with a short description of slow work.
     """
 
+    look: str | None = None
+
     def __init__(
         self,
         model: Lang3DXLModel,
@@ -62,15 +54,11 @@ class Conversation:
         shown: Callable[[], set[str]],
         watch: Callable[[str], None],
     ) -> None:
-        self.display = Display()
-        self.look: str | None = None
-        """Photo whose lighting is shown; None: by the scene's rule."""
-        self.per_scene = False
-        """Stretch the color map to the highest relevancy in the scene instead of in each view."""
         self.question: Question | None = None
         self.found: list[Found] | None = None
         """None: not searched yet."""
-        self.seconds = Seconds()
+        self.seconds: float | None = None
+        """Duration of the latest frame, matches included."""
         self._model, self._file, self._run, self._lock = model, file, run, lock
         self._learning, self._learn, self._shown, self._watch = learning, learn, shown, watch
         self._making = Lock()
@@ -81,15 +69,10 @@ class Conversation:
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
-    def ask(self, text: str, negatives: str = "", foreground: str = "") -> Question:
-        """Set the question: prompts as for `parse_prompts`; negatives for all of them, separated by commas or
-        semicolons; and prompts that matches must lie on, if any. Raises UserError if there is no prompt, or
-        nothing can be asked."""
-        scene = self._scene_now()
-        phrases = [" ".join(phrase.split()) for phrase in negatives.replace(";", ",").split(",")]
-        start = time.perf_counter()
-        question = scene.ask(text, negatives=[p for p in phrases if p], foreground=foreground.strip())
-        self.seconds.text = time.perf_counter() - start
+    def ask(self, text: str) -> Question:
+        """Set the question: prompts as for `parse_prompts`. Raises UserError if there is none, or nothing can
+        be asked."""
+        question = self._scene_now().ask(text)
         self.question, self.found = question, None
         return question
 
@@ -101,11 +84,7 @@ class Conversation:
         """Matches of each prompt in the scene. First examines the scene, which takes long once."""
         question, scene = self.question, self._scene
         assert question is not None and scene is not None
-        if self.display.threshold is not None:
-            levels = (self.display.threshold,) * len(question.prompts)
-            found = scene.places(replace(question, thresholds=levels))
-        else:
-            found = scene.places(question)
+        found = scene.places(question)
         if question is self.question:
             self.found = found
         return found
@@ -164,36 +143,28 @@ class Conversation:
         if question is not None and scene is not None and rendering.channels is None:
             of_snapshot = scene.draw(rendering.camera, question.channels)
             rendering = replace(rendering, channels=of_snapshot.channels, alpha=of_snapshot.alpha)
-        found = pictures(rendering, question, replace(self.display, highest=self.highest()))
-        self.seconds.frame = seconds + time.perf_counter() - start
+        found = pictures(rendering, question)
+        self.seconds = seconds + time.perf_counter() - start
         return found
-
-    def highest(self) -> float | None:
-        """Relevancy for the last color of the heat map; None: the highest shown."""
-        scores = [v.score for found in self.found or () for v in found.views]
-        return max(scores) if self.per_scene and scores else None
 
     # ── saying how it went ──────────────────────────────────────────────────────────────────────────
 
-    def advice(self) -> str | None:
-        """Advice about the answer, if something is odd about it."""
-        found = self.found or []
-        told = [(caution(f.prompt.text), doubtful(shortened(f.prompt.text), f.doubt)) for f in found]
-        lines = [plain(line) for both in told for line in both if line]
-        if found and not any(f.views for f in found):
-            words = " or ".join(plain(shortened(f.prompt.text)) for f in found)
-            asked = self.display.threshold
-            level = "" if asked is None else f" by the threshold of {asked:.2f}. Lower it, or try other words"
-            lines.append(f"Nothing in the scene looks like {words}{level}.")
-        return "  \n".join(lines) or None
+    def summary(self) -> str:
+        """What was found, in Markdown: a line for each prompt, and one about a doubtful one."""
+        lines = []
+        for found in self.found or ():
+            count, text = len(found.views), shortened(found.prompt.text)
+            best = max((view.score for view in found.views), default=0.0)
+            where = f"{count} good views, best {best:.2f}" if count else "nothing in the scene looks like it"
+            lines.append(f"**{plain(text)}**: {where}")
+            lines += [
+                plain(line) for line in (caution(found.prompt.text), doubtful(text, found.doubt)) if line
+            ]
+        return "  \n".join(lines)
 
     def status(self) -> str:
-        """Times, in one line."""
-        s, parts = self.seconds, []
-        if s.frame is not None:
-            parts.append(f"{s.frame * 1e3:.0f} ms per frame")
-        if s.text is not None:
-            parts.append(f"{s.text * 1e3:.0f} ms per text")
+        """How long a frame takes, and what training still lacks."""
+        parts = [] if self.seconds is None else [f"{self.seconds * 1e3:.0f} ms per frame"]
         if self._scene_step is not None and self._learning():
             parts.append(f"words as of iteration {self._scene_step}, since the model still learns")
         return " · ".join(parts)

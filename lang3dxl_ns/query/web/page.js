@@ -1,116 +1,363 @@
-// A scene to walk through, and words answered beforehand as heat on its Gaussians.
-import { Color, OrbitControls, PerspectiveCamera, Scene, SparkRenderer, SplatMesh, Vector3, WebGLRenderer } from "./splats.js";
+// The page: the search box and its prompts, what a click tells, the address, and the keys.
+import { element, explain, percent, promptCard, say, shown } from "./cards.js";
+import { parsePrompts, tidy } from "./vocabulary.js";
+import { View } from "./view.js";
 
-const description = await (await fetch("scene.json")).json();
-const renderer = new WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
-renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
-document.body.prepend(renderer.domElement);
-const scene = new Scene(), camera = new PerspectiveCamera(50, 1, description.near, description.far);
-camera.up.fromArray(description.up);
-scene.add(new SparkRenderer({ renderer }));
-const splats = new SplatMesh({ url: description.splats });
-scene.add(splats);
-const controls = new OrbitControls(camera, renderer.domElement);
+const MOST_REMEMBERED = 20, TYPING = 500; // earlier prompts; milliseconds until negatives take effect
+const $ = (id) => document.getElementById(id);
+const prompts = [];
+let about, view, latest = null, read = "", settled = false; // settled: the address has been read
 
-// ── colors ──
-const colors = [];
-const heats = new Map();
-let shown = -1;
+// ── the worker ──
 
-async function show(index) {
-  shown = index === shown ? -1 : index;
-  const word = description.words[shown];
-  if (word && !heats.has(shown)) heats.set(shown, new Uint8Array(await (await fetch(word.heat)).arrayBuffer()));
-  const heat = word && heats.get(shown);
-  const color = new Color(), table = description.colors, half = word ? 255 * word.threshold : 0;
-  const range = Math.max(word ? 255 * word.highest - half : 1, 1);
-  splats.packedSplats.forEachSplat((i, center, scales, quaternion, opacity) => {
-    color.copy(colors[i]);
-    if (heat && heat[i] > half) {
-      const [r, g, b] = table[Math.min(Math.round((255 * (heat[i] - half)) / range), 255)];
-      color.lerp(new Color(r, g, b), 0.7);
-    }
-    splats.packedSplats.setSplat(i, center, scales, quaternion, opacity, color);
+const worker = new Worker("worker.js", { type: "module" }), waiting = new Map();
+worker.onmessage = ({ data: { id, output, error, done } }) => {
+  if (done !== undefined) return say(`Reading what the scene means: ${percent(done)}`);
+  const [resolve, reject] = waiting.get(id);
+  waiting.delete(id);
+  if (error) reject(new Error(error));
+  else resolve(output);
+};
+worker.onerror = () => say("This browser can't run the page's worker: update it.");
+
+function think(job, input = {}) {
+  return new Promise((...settle) => {
+    const id = Math.random();
+    waiting.set(id, settle);
+    worker.postMessage({ id, job, input });
   });
-  splats.packedSplats.needsUpdate = true;
-  splats.updateVersion();
-  document.querySelectorAll(".word").forEach((b, i) => b.setAttribute("aria-pressed", i === shown));
-  window.shownWord = word ? word.text : null;
 }
 
-// ── flying ──
-let flight = null;
+// ── asking ──
 
-function stand(view) {
-  const pose = view.pose, position = new Vector3(pose[0][3], pose[1][3], pose[2][3]);
-  const ahead = new Vector3(-pose[0][2], -pose[1][2], -pose[2][2]);
-  // The whole photo fits into the window.
-  const high = Math.tan(view.high / 2), wide = Math.tan(view.wide / 2);
-  const fov = (360 / Math.PI) * Math.atan(Math.max(high, wide / camera.aspect));
-  return { position, target: position.clone().addScaledVector(ahead, view.distance), fov };
+const commonNegatives = () => $("not").value.split(/[,;]/).map(tidy).filter(Boolean);
+
+/** Answer a prompt anew, and show it. */
+async function answer(prompt) {
+  const { text, examples, chosen: threshold } = prompt, negatives = [...prompt.negatives, ...commonNegatives()];
+  const turn = (prompt.turn = {}); // a later answer to the same prompt wins
+  const found = await think("ask", { text, examples, negatives, threshold });
+  if (turn !== prompt.turn || !found.known) return found;
+  Object.assign(prompt, found, { views: null, box: null });
+  prompt.finding = think("find", { relevancy: found.relevancy, threshold: found.threshold }).then((places) => {
+    if (turn === prompt.turn) Object.assign(prompt, places);
+    draw();
+  });
+  return found;
 }
 
-function place({ position, target, fov }) {
-  camera.position.copy(position);
-  controls.target.copy(target);
-  camera.fov = fov;
-  camera.updateProjectionMatrix();
-  controls.update();
-}
-
-function flyTo(view) {
-  const from = { position: camera.position.clone(), target: controls.target.clone(), fov: camera.fov };
-  flight = { from, to: stand(view), start: performance.now() };
-}
-
-function step(now) {
-  if (flight) {
-    let t = Math.min((now - flight.start) / 1200, 1);
-    const { from, to } = flight, s = t * t * (3 - 2 * t);
-    place({
-      position: from.position.clone().lerp(to.position, s),
-      target: from.target.clone().lerp(to.target, s),
-      fov: from.fov + (to.fov - from.fov) * s,
-    });
-    if (t === 1) flight = null;
+/** Ask prompts as if typed: several are separated by `;`. Resolves to the answer to the last. */
+async function ask(typed) {
+  await reading;
+  $("near").replaceChildren();
+  let found = null;
+  for (const { text, negatives } of about.words ? parsePrompts(String(typed)) : []) {
+    const old = prompts.find((prompt) => !prompt.examples && prompt.text === text && String(prompt.negatives) === String(negatives));
+    const prompt = old ?? { text, negatives, color: unusedColor() };
+    found = await answer(prompt);
+    if (!found.known) {
+      offerClosest(found);
+      continue;
+    }
+    if (!old) prompts.push(prompt);
+    remember(text);
+    draw();
   }
-  controls.update();
-  renderer.render(scene, camera);
+  const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
+  return { known, doubtful, threshold, peak, matching };
 }
 
-function resize() {
-  renderer.setSize(innerWidth, innerHeight);
-  camera.aspect = innerWidth / innerHeight;
-  camera.updateProjectionMatrix();
+function offerClosest({ unknown, closest }) {
+  const words = closest.map((word) => element("button", { className: "small", onclick: () => attempt(() => ask(word)) }, word));
+  $("near").replaceChildren(`This page doesn't know “${shown(unknown)}”: it answers ${about.known.toLocaleString("en")} words by itself. `,
+    words.length ? "Closest: " : "", ...words); // prettier-ignore
 }
 
-// ── panel ──
-function button(row, label, className, act) {
-  const element = document.createElement("button");
-  element.textContent = label;
-  element.className = className;
-  element.addEventListener("click", act);
-  row.append(element);
+const unusedColor = () => about.colors.find((color) => prompts.every((prompt) => prompt.color !== color)) ?? about.colors[prompts.length % about.colors.length];
+
+/** Run what may fail, and tell why. */
+async function attempt(work) {
+  try {
+    return await work();
+  } catch (error) {
+    say(error.message);
+  }
 }
 
-document.title = description.title;
-document.getElementById("credit").textContent = description.credit;
-addEventListener("resize", resize);
-renderer.domElement.addEventListener("pointerdown", () => (flight = null));
-resize();
-place(stand(description.start));
-await splats.initialized;
-splats.packedSplats.forEachSplat((i, center, scales, quaternion, opacity, color) => (colors[i] = color.clone()));
-const panel = document.getElementById("panel"), status = document.getElementById("status");
-status.textContent = description.title;
-description.words.forEach((word, i) => {
-  const row = document.createElement("div");
-  button(row, word.text, "word", () => show(i));
-  button(row, "Fly to", "fly", () => flyTo(word.view));
-  panel.append(row);
-});
-const row = document.createElement("div");
-button(row, "Overview", "overview", () => flyTo(description.start));
-panel.append(row);
-renderer.setAnimationLoop(step);
-window.ready = true;
+// ── showing ──
+
+function draw() {
+  const acts = { fly, remove, rename, setThreshold, teach };
+  $("prompts").replaceChildren(...prompts.map((prompt) => promptCard(prompt, acts)));
+  view.recolor(prompts.filter((prompt) => prompt.relevancy));
+  drawBoxes();
+  writeAddress();
+}
+
+function drawBoxes() {
+  const boxes = $("boxed").checked ? prompts.filter((prompt) => prompt.box) : [];
+  $("boxes").replaceChildren(...boxes.flatMap(outline));
+}
+
+const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7], NAMESPACE = "http://www.w3.org/2000/svg";
+
+function outline({ box: { low, high }, color, text }) {
+  const corners = CORNERS.map((k) => view.pixel(low.map((value, axis) => ((k >> axis) & 1 ? high[axis] : value))));
+  if (!corners.every(Boolean)) return [];
+  const edges = CORNERS.flatMap((k) => [1, 2, 4].filter((step) => !(k & step)).map((step) => `M${corners[k]}L${corners[k + step]}`));
+  const [path, label] = ["path", "text"].map((tag) => document.createElementNS(NAMESPACE, tag));
+  path.setAttribute("d", edges.join(""));
+  const top = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best));
+  [["x", top[0]], ["y", top[1] - 6]].forEach(([name, value]) => label.setAttribute(name, value));
+  label.textContent = shown(text);
+  for (const part of [path, label]) part.style.setProperty("--color", `rgb(${color})`);
+  return [path, label];
+}
+
+function fly(prompt) {
+  const shows = prompt.views.filter((one) => one.shown), views = shows.length ? shows : prompt.views.slice(0, 1);
+  if (!views.length) return;
+  prompt.place = ((prompt.place ?? -1) + 1) % views.length;
+  const best = views[prompt.place], middle = prompt.box?.low.map((value, axis) => (value + prompt.box.high[axis]) / 2);
+  view.flyTo(about.views[best.index], middle);
+  say(`View ${prompt.place + 1} of ${views.length}: ${best.name}; ${percent(best.area)} of it matches.`);
+}
+
+function remove(prompt) {
+  prompts.splice(prompts.indexOf(prompt), 1);
+  draw();
+}
+
+function rename(prompt, name) {
+  prompt.text = tidy(name).replaceAll("~", " ") || prompt.text;
+  draw();
+}
+
+async function setThreshold(prompt, value) {
+  prompt.chosen = value;
+  await attempt(() => answer(prompt));
+  draw();
+}
+
+// ── what is this? ──
+
+async function whatIs(x, y, most = 5) {
+  await reading;
+  if (!about.words) return [];
+  latest = await think("whatIs", { camera: view.picking, x, y, most });
+  return latest.words;
+}
+
+async function tell({ x, y, without }) {
+  if (!about.words) return;
+  const words = await whatIs(x, y), teaching = prompts.find((prompt) => prompt.examples && prompt.open);
+  if (teaching && latest.rows.length) return addExample(teaching, without);
+  const buttons = words.map(([word, score]) =>
+    element("button", { className: "small", onclick: () => attempt(() => ask(word)) }, `${word} ${percent(score)}`));
+  const like = element("button", { className: "small", onclick: likeThis }, "Like this");
+  $("here").replaceChildren(element("p", {}, words.length ? "Here, words that fit best:" : "Nothing is here that has a meaning."),
+    element("div", {}, ...buttons, ...(words.length ? [like] : []))); // prettier-ignore
+  $("here").hidden = false;
+}
+
+/** Light up what looks like the place clicked last; further clicks are further examples. */
+function likeThis() {
+  const number = prompts.filter((prompt) => prompt.examples).length + 1;
+  const prompt = { text: `like this ${number}`, negatives: [], examples: [], color: unusedColor() };
+  prompts.push(prompt);
+  teach(prompt, true);
+  attempt(() => addExample(prompt, false));
+}
+
+/** Whether clicks are further examples of this prompt. */
+function teach(prompt, open = !prompt.open) {
+  for (const other of prompts) other.open = other === prompt && open;
+  $("here").hidden = true;
+  draw();
+}
+
+function addExample(prompt, without) {
+  prompt.examples.push({ rows: latest.rows, without });
+  return answer(prompt).then(draw);
+}
+
+// ── address, history ──
+
+const asTyped = ({ text, negatives }) => `"${text}"` + (negatives.length ? ` not ${negatives.map((one) => `"${one}"`).join(", ")}` : "");
+const asExamples = (prompt) => [prompt.text, ...prompt.examples.map(({ rows, without }) => (without ? "-" : "") + rows.join("."))].join("~");
+
+function writeAddress() {
+  if (!settled) return;
+  const fields = new URLSearchParams({ view: view.address });
+  prompts.forEach((prompt) => fields.append(prompt.examples ? "like" : "ask", prompt.examples ? asExamples(prompt) : asTyped(prompt)));
+  if ($("not").value) fields.set("not", $("not").value);
+  read = `#${fields}`;
+  history.replaceState(null, "", read);
+}
+
+async function readAddress() {
+  const fields = new URLSearchParams(location.hash.slice(1));
+  if (fields.has("view")) view.address = fields.get("view");
+  $("not").value = fields.get("not") ?? "";
+  [prompts.length, settled] = [0, false];
+  try {
+    for (const typed of fields.getAll("ask").slice(0, 20)) await ask(typed);
+    for (const like of about.words ? fields.getAll("like").slice(0, 20) : []) await readExamples(like);
+  } finally {
+    settled = true;
+    draw();
+  }
+}
+
+async function readExamples(like) {
+  const [text, ...examples] = like.split("~");
+  const parsed = examples.map((one) => ({ rows: one.replace("-", "").split(".").map(Number), without: one.startsWith("-") }));
+  const known = (row) => Number.isInteger(row) && row >= 0 && row < about.count;
+  if (!parsed.length || !parsed.every(({ rows }) => rows.every(known))) return;
+  const prompt = { text: tidy(text), negatives: [], examples: parsed, color: unusedColor() };
+  prompts.push(prompt);
+  await answer(prompt);
+}
+
+const memory = `lang3dxl ${location.pathname}`;
+
+function remembered() {
+  try {
+    return JSON.parse(localStorage.getItem(memory) ?? "[]").map(String);
+  } catch {
+    return []; // a browser that keeps nothing
+  }
+}
+
+function remember(text) {
+  const texts = [text, ...remembered().filter((other) => other !== text)].slice(0, MOST_REMEMBERED);
+  try {
+    localStorage.setItem(memory, JSON.stringify(texts));
+  } catch {} // the same
+}
+
+// ── controls ──
+
+async function offer() {
+  const typed = $("word").value.split(";").at(-1), before = $("word").value.slice(0, $("word").value.length - typed.length);
+  const words = tidy(typed) ? await think("offered", { typed }) : remembered();
+  $("offered").replaceChildren(...words.map((word) => element("option", { value: before + word })));
+}
+
+function listen() {
+  let typing, moving;
+  $("ask").addEventListener("submit", (event) => {
+    event.preventDefault();
+    const typed = $("word").value;
+    $("word").value = "";
+    if (tidy(typed)) attempt(() => ask(typed));
+  });
+  for (const kind of ["input", "focus"]) $("word").addEventListener(kind, () => about.words && reading.then(offer));
+  $("not").addEventListener("input", () => {
+    clearTimeout(typing);
+    typing = setTimeout(() => attempt(async () => {
+      for (const prompt of prompts) {
+        const found = await answer(prompt);
+        if (!found.known) offerClosest(found);
+      }
+      draw();
+    }), TYPING); // prettier-ignore
+  });
+  $("boxed").addEventListener("change", drawBoxes);
+  $("overview").addEventListener("click", () => view.overview());
+  $("still").addEventListener("click", () => attempt(saveStill));
+  $("link").addEventListener("click", () => attempt(copyLink));
+  $("look").addEventListener("change", () => attempt(light));
+  view.addEventListener("click", ({ detail }) => attempt(() => tell(detail)));
+  view.addEventListener("moved", () => {
+    drawBoxes();
+    clearTimeout(moving);
+    moving = setTimeout(writeAddress, 300);
+  });
+  addEventListener("hashchange", () => location.hash !== read && attempt(readAddress));
+  addEventListener("keydown", (event) => {
+    if (event.key === "/" && !event.target.matches("input")) {
+      event.preventDefault();
+      $("word").focus();
+    }
+    if (event.key === "Escape") {
+      prompts.length = 0;
+      $("here").hidden = true;
+      draw();
+    }
+  });
+}
+
+async function saveStill() {
+  const lines = prompts.map((prompt) => [prompt.text, `rgb(${prompt.color})`]);
+  const link = element("a", { download: "scene.png", href: URL.createObjectURL(await view.picture(lines)) });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+async function copyLink() {
+  writeAddress();
+  await navigator.clipboard.writeText(location.href);
+  say("The link is in the clipboard: it opens what you see.");
+}
+
+/** Colors in the lighting of a photo, from the server. */
+async function light() {
+  const photo = $("look").value;
+  const colors = photo ? await fetch(`api/look?photo=${encodeURIComponent(photo)}`) : null;
+  if (colors && !colors.ok) throw new Error(await colors.text());
+  view.light(colors ? new Uint8Array(await colors.arrayBuffer()) : view.own);
+}
+
+// ── start ──
+
+async function fetched(name) {
+  const file = await fetch(name);
+  if (!file.ok) throw new Error(`${name} is missing (${file.status}): write the page again.`);
+  return file;
+}
+
+async function open() {
+  about = await (await fetched("scene.json")).json();
+  document.title = $("title").textContent = about.title;
+  $("credit").textContent = [about.credit, about.license, about.made].filter(Boolean).join("\n");
+  $("lighting").hidden = !about.looks.length;
+  $("look").append(...about.looks.map((name) => element("option", { value: name }, name)));
+  const splats = await (await fetched("splats.bin")).arrayBuffer();
+  view = new View(about, $("frame"));
+  await view.show(splats);
+  listen();
+  return splats;
+}
+
+async function readMeaning(splats) {
+  if (!about.words) return say("This scene has colors alone: it can't be asked.");
+  say("Reading what the scene means…");
+  const { seconds, known } = await think("load", { description: about, splats });
+  Object.assign(about, { known, seconds });
+  say(explain(about));
+}
+
+/** Show what the address says, or what the page opens with. */
+async function begin() {
+  if (location.hash.length > 1) await readAddress();
+  else for (const [text, ...negatives] of about.prompts) await ask(asTyped({ text, negatives }));
+  settled = true;
+  writeAddress();
+}
+
+const drawing = open(), reading = drawing.then(readMeaning);
+window.lang3dxl = {
+  drawing,
+  ready: reading.then(begin),
+  ask,
+  whatIs,
+  get resting() {
+    return view.resting;
+  },
+  relevancy: async (text) => [...prompts.find((prompt) => prompt.text === text).relevancy],
+  get seconds() {
+    return about.seconds;
+  },
+};
+window.lang3dxl.ready.catch((error) => location.protocol !== "file:" && say(error.message));

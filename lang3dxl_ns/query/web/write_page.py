@@ -1,97 +1,196 @@
-"""Writes a scene as a static web page, with prompts answered beforehand."""
+"""The page of a scene: every file of it, with a vocabulary that it answers words from by itself."""
 
 from __future__ import annotations
 
 import json
-import math
-import shutil
-from collections.abc import Sequence
-from importlib.util import find_spec
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
-from numpy import ndarray as Array
+from jaxtyping import Float
+from torch import Tensor
 
-from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
-from lang3dxl_ns.query.heat_maps import color
-from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import make_folder, write_atomically
+from lang3dxl_ns.common.reports import watched
+from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
+from lang3dxl_ns.query.negatives import competitors
+from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
+from lang3dxl_ns.query.scene_file import Provenance
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
+from lang3dxl_ns.query.web.pack import (
+    LEAST_PIXELS,
+    PIXEL_STEPS,
+    PackedMeaning,
+    camera_json,
+    pack_colors,
+    pack_meaning,
+    pack_splats,
+    pack_view,
+    pack_words,
+    spread,
+)
 
 _HERE = Path(__file__).parent
-_FILES = ("index.html", "page.js", "splats.js", "LICENSES.txt")
+_KINDS = (".html", ".css", ".js", ".txt")
+_MOST_VIEWS = 24
+"""Training views that the page flies to, evenly chosen."""
+_TEXTS = 256
+"""Texts encoded at a time."""
+MOST_TEXT = 2_000
+"""Characters of a phrase; CLIP reads about 300."""
 
 
-def write_page(
-    scene: Scene,
-    folder: Path,
-    texts: Sequence[str | Prompt],
-    title: str = "",
-    credit: str = "",
-    look: str | None = None,
-) -> int:
-    """Write index.html and what it needs into `folder`, for any static web server; returns the bytes.
+class Page:
+    """A page about one scene.
 
     Args:
-        texts: prompts that get a button each, as `Scene.prompts` reads them.
-        title: heading (default: the photos' folder).
-        credit: line about the photos and their licence.
-        look: training photo whose light is shown.
-
-    Raises UserError if a text is no prompt.
+        scene: the scene.
+        texts: prompts that it opens with, as `Scene.prompts` reads them.
+        words: words that may name a place, besides the shipped vocabulary of buildings.
+        more: words that it knows besides.
+        provenance: title, credit and license shown on it.
+        look: training photo whose lighting is shown; default: of the overview photo.
+        live: whether a server encodes any other text (`answer`).
     """
+
+    def __init__(
+        self,
+        scene: Scene,
+        texts: Sequence[str | Prompt] = (),
+        words: Sequence[str] = (),
+        more: Sequence[str] = (),
+        provenance: Provenance | None = None,
+        look: str | None = None,
+        live: bool = False,
+    ) -> None:
+        self.scene, self.live = scene, live
+        self.prompts = scene.prompts(list(texts)) if texts else []
+        self._about = provenance or Provenance()
+        self._look, self._words, self._more = look, words, more
+        self._toward = scene.overview.camera.position.to(scene.device)
+        self._meaning: PackedMeaning | None = None
+        if scene.decoder is not None and scene.codes is not None:
+            self._meaning = pack_meaning(scene.decoder, scene.codes)
+
+    def files(self) -> dict[str, bytes]:
+        """Content of every file, by name."""
+        scene = self.scene
+        means = scene.splats.means[scene.splats.sound()]
+        center = means.median(0).values if len(means) else self._toward
+        files = {path.name: path.read_bytes() for path in _HERE.iterdir() if path.suffix in _KINDS}
+        files["splats.bin"] = pack_splats(scene.baked(self._look), center, self._toward).tobytes()
+        up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
+        about: dict[str, Any] = {
+            "title": self._about.title or Path(scene.file.data).name,
+            "credit": self._about.credit,
+            "license": self._about.license,
+            "made": self._about.made_how,
+            "count": len(scene.splats),
+            "center": center.tolist(),
+            "antialiased": scene.splats.antialiased,
+            "background": [0, 0, 0] if scene.background is None else scene.background.tolist(),
+            "up": (up / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
+            "start": camera_json(scene.overview.full_camera),
+            "colors": PROMPT_COLORS,
+            "live": self.live,
+            "looks": scene.looks.names if self.live and scene.looks else [],
+            "prompts": [[prompt.text, *prompt.negatives] for prompt in self.prompts],
+            "words": None,
+        }
+        if self._meaning is not None:
+            about["words"] = self._meaning.description | self._settings()
+            files |= self._meaning.files | self._vocabulary(self._meaning)
+            views = spread(list(scene.visible.items()), _MOST_VIEWS)
+            packed = [pack_view(view, len(scene.splats)) for _, view in views]
+            files["views.bin"] = b"".join(packed)
+            about["views"] = [
+                {"name": name, "bytes": len(data), **camera_json(view.camera)}
+                for (name, view), data in zip(views, packed, strict=True)
+            ]
+        files["scene.json"] = json.dumps(about).encode()
+        return files
+
+    def _settings(self) -> dict[str, Any]:
+        """What answers depend on besides rows and words."""
+        scene = self.scene
+        return {
+            "temperature": scene.engine.temperature,
+            "threshold": scene.config.threshold,
+            "unrelated": scene.doubts._unrelated.tolist(),
+            "gap": scene._gap,
+            "pixels": [LEAST_PIXELS, PIXEL_STEPS],
+        }
+
+    def _vocabulary(self, meaning: PackedMeaning) -> dict[str, bytes]:
+        """The words that the page knows: those that may name a place first, then all others."""
+        negatives = list(self.scene.text.config.negatives)
+        asked = [plain(phrase) for prompt in self.prompts for phrase in (prompt.text, *prompt.negatives)]
+        naming = list(dict.fromkeys(filter(None, map(plain, [*shipped_vocabulary(), *self._words, *asked]))))
+        words = list(dict.fromkeys([*naming, *common_words(), *filter(None, map(plain, self._more))]))
+        own = torch.cat([*self._encoded(meaning, negatives), *self._encoded(meaning, words)])
+        special, extra = {}, [own]
+        for i, word in enumerate(words):
+            if i < len(naming):
+                near, against = self._meant(meaning, word)
+            else:
+                near, against = own[:1], competitors(negatives, [word])
+            if len(near) > 1 or len(against) < len(negatives):
+                rows = range(sum(map(len, extra)), sum(map(len, extra)) + len(near))
+                special[i] = [list(rows) if len(near) > 1 else [len(negatives) + i], against]
+                extra += [near] if len(near) > 1 else []
+        described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
+        return {
+            "vocabulary.json": json.dumps(described).encode(),
+            "vocabulary.bin": pack_words(torch.cat(extra)),
+        }
+
+    def _meant(self, meaning: PackedMeaning, word: str) -> tuple[Float[Tensor, "s r"], list[int]]:
+        """Vectors that are searched for along with a word, and the negatives that it competes with."""
+        queries = self.scene.queries([Prompt(word)])
+        return meaning.of_texts(queries.vectors[list(queries.positive[0])]).cpu(), list(queries.negative[0])
+
+    def _encoded(self, meaning: PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
+        parts = [texts[row : row + _TEXTS] for row in range(0, len(texts), _TEXTS)]
+        for part in watched(parts, "encoding words", None) if len(parts) > 4 else parts:
+            yield meaning.of_texts(self.scene.text.vectors(part).to(self.scene.device)).cpu()
+
+    # ── what a live server adds ─────────────────────────────────────────────────────────────────────────
+
+    def answer(self, phrase: str) -> dict[str, Any]:
+        """Any phrase in this scene's own numbers: itself, what is searched for, and what it competes with.
+
+        Raises:
+            UserError: the phrase is empty, or the scene has colors alone.
+        """
+        if self._meaning is None:
+            raise UserError(NO_SEMANTICS)
+        text = plain(phrase[:MOST_TEXT].encode("utf-8", "ignore").decode())
+        if not text:
+            raise UserError("the prompt is empty: type what to look for, such as rose window")
+        near, against = self._meant(self._meaning, text)
+        vector = self.scene.text.vectors([text]).to(self.scene.device)
+        own = self._meaning.of_texts(vector)[0].tolist()
+        return {"own": own, "near": near.tolist(), "against": against}
+
+    def colors(self, photo: str) -> bytes:
+        """Red, green, blue and opacity of every Gaussian under a photo's lighting. Raises UserError if there
+        is no such look."""
+        return pack_colors(self.scene.baked(photo), self._toward).tobytes()
+
+
+def plain(text: str) -> str:
+    """A phrase as the page compares it: without quotes and needless spaces."""
+    return " ".join(text.replace('"', " ").replace("\0", " ").split())
+
+
+def write_page(page: Page, folder: Path) -> int:
+    """Write a page's files into a folder, for any static web server; returns the bytes."""
     make_folder(folder)
-    prompts = scene.prompts(texts) if texts else []
-    # View-dependent colors are drawn as from the overview, since heat replaces colors.
-    baked = scene.baked(look)
-    baked = baked.with_colors(baked.colors(scene.overview.camera.position))
-    splats, sound = "scene.spz" if find_spec("gsply") is not None else "scene.ply", baked.sound()
-    write_splats(folder / splats, baked)
-    middle = np.median(baked.means.cpu().numpy(), axis=0)
-    words = []
-    names = slugs([prompt.text for prompt in prompts])
-    for found, name in zip(scene.find(prompts) if prompts else [], names, strict=True):
-        relevancy = found.relevancy[sound.cpu().numpy()]
-        heat = (relevancy * 255).round().astype(np.uint8)
-        write_atomically(folder / f"heat-{name}.bin", heat.tobytes())
-        view = (found.views or found.closest)[0]
-        center = middle if found.box is None else np.array(found.box.center)
-        words.append(
-            {
-                "text": found.prompt.text,
-                "heat": f"heat-{name}.bin",
-                "threshold": found.threshold,
-                "highest": float(relevancy.max(initial=0)),
-                "view": _view(scene.file.photo(view.name).full_camera, center),
-            }
-        )
-    start = _view(scene.overview.full_camera, middle)
-    up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
-    description = {
-        "title": title or Path(scene.file.data).name,
-        "credit": credit,
-        "splats": splats,
-        "up": (up / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
-        "near": 1e-3 * start["distance"],
-        "far": 1e3 * start["distance"],
-        "start": start,
-        "words": words,
-        "colors": color(torch.linspace(0, 1, 256)).tolist(),
-    }
-    write_atomically(folder / "scene.json", json.dumps(description))
-    for file in _FILES:
-        shutil.copyfile(_HERE / file, folder / file)
-    return sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
-
-
-def _view(camera: Camera, center: Float64[Array, "3"]) -> dict[str, Any]:
-    """A photo's viewpoint for the page: pose, fields of view (radians), and distance of the orbit center."""
-    pose, k = camera.pose, camera.intrinsics.double().cpu().numpy()
-    high = 2 * math.atan(max(k[1, 2], camera.height - k[1, 2]) / k[1, 1])
-    wide = 2 * math.atan(max(k[0, 2], camera.width - k[0, 2]) / k[0, 0])
-    ahead = float((center - pose[:3, 3]) @ -pose[:3, 2])
-    return {"pose": pose.tolist(), "high": high, "wide": wide, "distance": max(ahead, 0.05)}
+    files = page.files()
+    for name, content in files.items():
+        write_atomically(folder / name, content)
+    return sum(map(len, files.values()))

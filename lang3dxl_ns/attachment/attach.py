@@ -1,0 +1,144 @@
+"""`attach`: words for a finished splat, from its photos or from views of itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame, side_by_side
+from lang3dxl_ns.attachment.known_frames import Similarity
+from lang3dxl_ns.attachment.learn import learn, prepare_photos, scene_file, settled
+from lang3dxl_ns.attachment.views import Up, rendered_views
+from lang3dxl_ns.common.console import say, some
+from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.stages import Stages
+from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
+from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.query.match import save_picture
+from lang3dxl_ns.query.read_splats import find_splats, read_splats
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
+from lang3dxl_ns.rendering.splats import Splats
+
+_LIGHT = 0.15
+"""Deviation of the photos' brightness (natural logarithm) from which it is told."""
+_SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
+
+
+@dataclass
+class AttachConfig:
+    """Settings of `attach`."""
+
+    views: int = 48
+    """Without photos: views of the splat to render and learn from."""
+    up: Up = "auto"
+    """Without photos: the splat's axis that points up (auto: by where its ground is)."""
+    cache_dir: Path | None = None
+    """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
+    preparation: PreparationConfig = field(default_factory=PreparationConfig)
+    """Encoders, crops and foreground."""
+
+
+def attach(
+    splat: str | Path,
+    data: str | Path | None = None,
+    out: str | Path | None = None,
+    config: AttachConfig | None = None,
+    device: torch.device | str | None = None,
+) -> Scene:
+    """Give a finished splat words: a scene that answers any text.
+
+    Targets are kept beside the photos, so that an interrupted call continues when it is repeated.
+
+    Args:
+        splat: the file or run, see `read_splats`.
+        data: its photos, see `read_collection`; None: views of the splat are rendered, and kept in the hidden
+            folder .NAME.views beside `out`.
+        out: the scene file to write; None (with `data`): none is written.
+        config: settings.
+        device: where to work; default: a GPU if there is one.
+
+    Returns:
+        The scene, its Gaussians in the splat's own frame and order.
+
+    Raises:
+        UserError: the splat or the photos can't be read, or the photos don't show the splat.
+    """
+    config, place = config or AttachConfig(), None if out is None else Path(out).expanduser().absolute()
+    if place is not None and place.suffix != SUFFIX:
+        raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
+    if data is None and place is None:
+        raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
+    preparation = settled(config.preparation)
+    option_prefix.set("--")
+    check_encoders(preparation.clip, preparation.dense)
+    stages, where = Stages(_SHARES), torch.device(device or best_device())
+    with stages.stage("splat"):
+        path = find_splats(splat)
+        splats = read_splats(path).to(where)
+        say(f"{path}: {splats}")
+    with stages.stage("frame"):
+        if data is None:
+            assert place is not None
+            folder = place.with_name(f".{place.stem}.views")
+            collection, similarity = rendered_views(splats, config.views, config.up, folder), np.eye(4)
+        else:
+            collection = read_collection(data)
+            similarity = _frame(splats, collection, path, place)
+    with stages.stage("prepare"):
+        cache = (config.cache_dir or collection.folder / "lang3dxl_cache").expanduser()
+        collection, targets = prepare_photos(collection, preparation, cache, where)
+    tracked = collection.reconstruction.photos
+    cameras = {photo.name: camera_in(similarity, tracked[photo.name]) for photo in collection.photos}
+    with stages.stage("learn"):
+        decoder, codes = learn(splats, collection, cameras, targets)
+    seen = float(codes.isfinite().all(1).float().mean())
+    what = "photos" if data is not None else "views"
+    say(f"{len(collection.photos)} {what} show {seen:.0%} of the Gaussians; the others match nothing")
+    file = scene_file(collection, cameras, similarity, preparation)
+    visible = None if place is None else place.with_name(f".{place.stem}.visible")
+    scene = Scene(splats, file, decoder, codes, cache=visible)
+    if place is not None:
+        written = write_scene(place, scene, _provenance(path, len(collection.photos), what))
+        say(f"Wrote {written / 1e6:.1f} MB to {place}")
+    return scene
+
+
+def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path | None) -> Similarity:
+    """The frame of the photos in the splat's; says what was found. Raises UserError if nothing fits."""
+    if collection.left_out:
+        say(f"{len(collection.left_out)} photos are left out: {some(list(collection.left_out.values()), 3)}")
+    fit = find_frame(splats, collection, path)
+    if not fit.fits:
+        raise UserError(_no_fit(splats, collection, fit, place))
+    say(f"the splat's frame is {fit.name}: renderings agree with their photos to {fit.score:.2f} (of 1)")
+    if fit.lighting > _LIGHT:
+        say(
+            f"the photos' brightness varies by {100 * fit.lighting:.0f} % beside the splat's: words are "
+            "learned all the same; the scene keeps the splat's colors"
+        )
+    return fit.similarity
+
+
+def _no_fit(splats: Splats, collection: PhotoCollection, fit: Fit, place: Path | None) -> str:
+    told = ""
+    if place is not None:
+        picture = place.with_name(f"{place.stem}.frame.png")
+        save_picture(side_by_side(splats, collection, fit), picture)
+        told = f"; {picture} shows a photo beside the splat at its camera"
+    return (
+        f"the photos in {collection.folder} don't show this splat in any frame that programs use (the best, "
+        f"{fit.name}, agrees to {fit.score:.2f} of 1){told}: give the photos and poses that the splat was "
+        "trained with, or leave out --data"
+    )
+
+
+def _provenance(path: Path, count: int, what: str) -> Provenance:
+    made = f"attached to {path.name} from {count} {what}"
+    return Provenance(made_by=f"lang3dxl-ns {version('lang3dxl-ns')}", made_how=made)

@@ -1,0 +1,233 @@
+"""Which frame a splat is in: renderings at the photos' cameras, compared with the photos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, registered_frames
+from lang3dxl_ns.common.console import progress
+from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.rendering.rasterize import rasterize
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera, resized
+from lang3dxl_ns.scene.colmap import TrackedPhoto
+from lang3dxl_ns.scene.photo import Photo
+
+FITS = 0.5
+"""Correlation of renderings with their photos above which a frame is right; wrong ones reach 0.3."""
+_CLOSE = 0.75
+"""Correlation from which a frame isn't refined, and no other one tried."""
+_PROMISING = 0.15
+"""Correlation below which a frame is not worth refining."""
+_SMALL, _LARGE = 64, 128
+"""Longer sides in pixels of the comparisons."""
+_FEW, _MANY = 5, 12
+"""Photos of the first comparison, and of the last."""
+_REFINED = 3
+"""Frames that are refined at most."""
+_ROUNDS = ((48, 40), (96, 40))
+"""Refinement: longer sides in pixels, and steps at each."""
+_RATE = 4e-3
+"""Adam's, in radians and shares of the scene's size."""
+_COVERED = 0.05
+"""Share of a photo that the splat must cover."""
+_SEES = 0.05
+"""Opacity of Gaussians that registration takes part of the shape."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A frame, and how well renderings in it agree with the photos."""
+
+    name: str
+    similarity: Similarity
+    score: float
+    """Mean correlation of brightness, −1…1."""
+    gains: tuple[float, ...]
+    """Brightness of each compared photo, relative to its rendering."""
+
+    @property
+    def fits(self) -> bool:
+        """Whether the frame is right."""
+        return self.score >= FITS
+
+    @property
+    def lighting(self) -> float:
+        """Standard deviation of the photos' brightness relative to the renderings, natural logarithms."""
+        return float(np.std(np.log(np.clip(self.gains, 1e-3, None)))) if self.gains else 0.0
+
+
+def camera_in(similarity: Similarity, tracked: TrackedPhoto) -> Camera:
+    """A photo's camera in the splat's frame. Its lens must not distort, or be of the undistorted photo."""
+    scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
+    view = np.vstack([tracked.camera_from_world, [0, 0, 0, 1]]) @ np.linalg.inv(similarity)
+    view[:3] = scale * view[:3]  # the camera's own axes stay of unit length
+    return tracked.lens.camera(torch.from_numpy(view).float())
+
+
+def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
+    """The frame in which renderings at the photos' cameras look like the photos.
+
+    The frames that programs use are tried first, then the scene's shape; the best of them are refined by
+    descent on the correlation. The result may be wrong: see `Fit.fits`.
+
+    Args:
+        splats: the Gaussians.
+        collection: the photos.
+        splat: file of the splat, see `known_frames`.
+    """
+    small, large = _Comparison.of(collection, _FEW, _SMALL), _Comparison.of(collection, _MANY, _LARGE)
+    best = _best(splats, small, known_frames(collection.reconstruction, splat))
+    if best[0].score < FITS:
+        seen = splats.opacities > _SEES
+        means = splats.means[seen].double().cpu().numpy()
+        shaped = registered_frames(collection.reconstruction.points, means)
+        best = sorted([*best, *_best(splats, small, shaped)], key=lambda fit: fit.score, reverse=True)
+    checked = [large.fit(splats, fit.name, fit.similarity) for fit in best[:_REFINED]]
+    found = max(checked, key=lambda fit: fit.score)
+    if found.score >= _CLOSE:
+        return found
+    worth = [fit for fit in checked if fit.score >= min(_PROMISING, found.score)]
+    with progress("refining the frame", len(worth) * sum(steps for _, steps in _ROUNDS)) as advance:
+        for fit in worth:
+            refined = fit.similarity
+            for side, steps in _ROUNDS:
+                refined = _Comparison.of(collection, _FEW, side).refined(splats, refined, steps, advance)
+            again = large.fit(splats, f"{fit.name}, refined", refined)
+            found = max(found, again, key=lambda fit: fit.score)
+    return found
+
+
+def _best(splats: Splats, comparison: _Comparison, frames: Mapping[str, Similarity]) -> list[Fit]:
+    with progress("comparing with the photos", len(frames)) as advance:
+        fits = []
+        for name, frame in frames.items():
+            fits.append(comparison.fit(splats, name, frame))
+            advance()
+            if fits[-1].score >= _CLOSE:
+                break
+    return sorted(fits, key=lambda fit: fit.score, reverse=True)
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """A photo, small and gray."""
+
+    tracked: TrackedPhoto
+    side: int
+    gray: Float[Tensor, "h w"]
+    mask: Bool[Tensor, "h w"]
+
+    @classmethod
+    def of(cls, photo: Photo, tracked: TrackedPhoto, side: int) -> _Compared:
+        scale = min(side / max(photo.width, photo.height), 1.0)
+        gray, mask = photo.read(scale).mean(-1), photo.read_mask(scale)
+        own = tracked.resized(gray.shape[1], gray.shape[0])
+        return cls(own, side, gray, torch.ones_like(gray, dtype=torch.bool) if mask is None else mask)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """Some photos, evenly spread, at one size."""
+
+    photos: Sequence[_Compared]
+
+    @classmethod
+    def of(cls, collection: PhotoCollection, count: int, side: int) -> _Comparison:
+        everything = collection.photos
+        chosen = {round(i) for i in np.linspace(0, len(everything) - 1, min(count, len(everything)))}
+        tracked = collection.reconstruction.photos
+        return cls([_Compared.of(everything[i], tracked[everything[i].name], side) for i in sorted(chosen)])
+
+    @torch.no_grad()
+    def fit(self, splats: Splats, name: str, similarity: Similarity) -> Fit:
+        scores, gains = [], []
+        for photo in self.photos:
+            drawn, covered = _gray(splats, camera_in(similarity, photo.tracked))
+            mask, gray = photo.mask.to(drawn.device) & covered, photo.gray.to(drawn)
+            scores.append(float(_correlation(drawn, gray, mask)))
+            gains.append(float(gray[mask].mean() / drawn[mask].mean().clamp_min(1e-3)) if mask.any() else 1.0)
+        return Fit(name, similarity, float(np.mean(scores)), tuple(gains))
+
+    def refined(self, splats: Splats, start: Similarity, steps: int, advance) -> Similarity:
+        """The similarity after some steps of Adam on rotation, translation and scale."""
+        centers = np.array([photo.tracked.center for photo in self.photos])
+        middle = torch.from_numpy(start[:3, :3] @ np.median(centers, axis=0) + start[:3, 3])
+        seen = splats.means[splats.opacities > _SEES].double().cpu()
+        size = float((seen - seen.median(0).values).norm(dim=1).median()) if len(seen) else 1.0
+        values = torch.zeros(7, dtype=torch.float64, requires_grad=True)
+        optimizer = torch.optim.Adam([values], lr=_RATE)
+        best, lowest = start, np.inf
+        for _ in range(steps):
+            change = _similarity(values, middle, size)
+            whole = change @ torch.from_numpy(start)
+            with torch.enable_grad():
+                loss = torch.stack([self._loss(splats, whole, photo) for photo in self.photos]).mean()
+                optimizer.zero_grad()
+                loss.backward()
+            if float(loss.detach()) < lowest:
+                best, lowest = whole.detach().numpy(), float(loss.detach())
+            optimizer.step()
+            advance()
+        return best
+
+    def _loss(self, splats: Splats, similarity: Float[Tensor, "4 4"], photo: _Compared) -> Float[Tensor, ""]:
+        scale = similarity[:3, :3].det().pow(1 / 3)
+        pose = torch.from_numpy(np.vstack([photo.tracked.camera_from_world, [0, 0, 0, 1]]))
+        view = pose @ similarity.inverse()
+        view = torch.cat([view[:3] * scale, view[3:]])
+        camera = photo.tracked.lens.camera(view.float())
+        drawn, covered = _gray(splats, camera)
+        return 1 - _correlation(drawn, photo.gray.to(drawn), photo.mask.to(drawn.device) & covered)
+
+
+def _similarity(values: Float[Tensor, "7"], middle: Float[Tensor, "3"], size: float) -> Float[Tensor, "4 4"]:
+    """A rotation about `middle` (radians), a scale (logarithm) and a translation (in units of the size)."""
+    x, y, z = values[:3]
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+    turn = values[6].exp() * torch.linalg.matrix_exp(skew)
+    shift = middle + size * values[3:6] - turn @ middle
+    top = torch.cat([turn, shift[:, None]], dim=1)
+    return torch.cat([top, top.new_tensor([[0.0, 0, 0, 1]])])
+
+
+def _gray(splats: Splats, camera: Camera) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """The brightness of a rendering, and where there is one: what is behind the splat is not in it."""
+    pose = camera.view_matrix.detach()
+    colors = splats.colors(-pose[:3, :3].T @ pose[:3, 3]).mean(1, keepdim=True)
+    raster = rasterize(splats.gaussians, camera, colors, antialiased=splats.antialiased)
+    alpha = raster.alpha[..., 0].detach()
+    return raster.image[..., 0], -F.max_pool2d(-alpha[None], 3, 1, 1)[0] > 0.8  # without the edges
+
+
+def _correlation(
+    a: Float[Tensor, "h w"], b: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
+) -> Float[Tensor, ""]:
+    """Pearson's, over the mask; 0 where one is flat, or the mask is small."""
+    if float(mask.float().mean()) < _COVERED:
+        return a.sum() * 0
+    a, b = a[mask] - a[mask].mean(), b[mask] - b[mask].mean()
+    return (a * b).sum() / (a.square().sum() * b.square().sum()).clamp_min(1e-12).sqrt()
+
+
+def side_by_side(splats: Splats, collection: PhotoCollection, fit: Fit) -> UInt8[Array, "h w 3"]:
+    """A photo beside the rendering at its camera, to look at."""
+    photo = collection.photos[len(collection.photos) // 2]
+    camera = camera_in(fit.similarity, collection.reconstruction.photos[photo.name])
+    from lang3dxl_ns.rendering.render import render
+
+    camera = resized(camera, 640)
+    rendering = (render(splats, camera).rgb.cpu() * 255).round().byte().numpy()
+    read = photo.read_uint8(camera.width / photo.width).numpy()
+    rows, columns = min(len(read), len(rendering)), min(read.shape[1], rendering.shape[1])
+    return np.concatenate([read[:rows, :columns], rendering[:rows, :columns]], axis=1)

@@ -1,0 +1,197 @@
+"""Frames that programs train splats in: similarities from the frame of the photos' poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.scene.colmap import Reconstruction
+
+Similarity = Float[Array, "4 4"]
+"""[[s·R, t], [0, 1]] from the photos' frame to the splat's."""
+RUN_TRANSFORM = "dataparser_transforms.json"
+"""File in which nerfstudio tells a run's frame."""
+_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""COLMAP's y down to nerfstudio's z up."""
+_OLD_Z_UP = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+"""The same in nerfstudio before 1.0."""
+_STEPS = 30
+_POINTS = 2_000
+_GAUSSIANS = 20_000
+
+
+def known_frames(reconstruction: Reconstruction, splat: Path) -> dict[str, Similarity]:
+    """What the frame of a splat may be, by the program that uses it.
+
+    Args:
+        reconstruction: the photos' poses, and points if there are some.
+        splat: file of the splat; in a run of nerfstudio the file beside it tells the frame.
+    """
+    cameras = np.array(
+        [np.vstack([p.camera_from_world, [0, 0, 0, 1]]) for p in reconstruction.photos.values()]
+    )
+    poses = np.linalg.inv(cameras.astype(np.float64))
+    frames = _of_run(splat)
+    frames["the photos' own, as in 3D Gaussian splatting"] = np.eye(4)
+    for name, axes in {"": np.eye(4), "with z up": _Z_UP, "as before version 1.0": _OLD_Z_UP}.items():
+        moved = axes @ poses
+        frames[f"nerfstudio's, {name}".rstrip(", ")] = _centered(moved, _upright(moved)) @ axes
+        frames[f"centered and scaled, {name}".rstrip(", ")] = _centered(moved, np.eye(4)) @ axes
+    frames |= _gsplat(poses, reconstruction.points)
+    for name, signs in {"x": (1, -1, -1), "y": (-1, 1, -1), "z": (-1, -1, 1)}.items():
+        frames[f"the photos' own, turned about {name}"] = np.diag([*map(float, signs), 1.0])
+    return frames
+
+
+def _of_run(splat: Path) -> dict[str, Similarity]:
+    for folder in splat.parents[:2]:
+        try:
+            content = read_json(folder / RUN_TRANSFORM)
+            rows = np.array(content["transform"], np.float64).reshape(3, 4) * float(content["scale"])
+        except (OSError, ValueError, LookupError, TypeError):
+            continue
+        own = np.vstack([rows, [0, 0, 0, 1]])
+        # A transforms.json of ns-process-data has turned the axes already.
+        return {
+            "the run's": own,
+            "the run's, of turned axes": own @ np.linalg.inv(_Z_UP),
+        }
+    return {}
+
+
+def _upright(poses: Float[Array, "n 4 4"]) -> Similarity:
+    """The smallest rotation that takes the cameras' mean up direction to z."""
+    up = -poses[:, :3, 1].mean(axis=0)
+    return _between(up / max(np.linalg.norm(up), 1e-12), np.array([0.0, 0, 1]))
+
+
+def _between(source: Float[Array, "3"], target: Float[Array, "3"]) -> Similarity:
+    axis, cosine = np.cross(source, target), float(source @ target)
+    turn = np.eye(4)
+    if cosine < -1 + 1e-8:
+        turn[:3, :3] = np.diag([1.0, -1, -1])
+    else:
+        x, y, z = axis
+        skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        turn[:3, :3] += skew + skew @ skew / (1 + cosine)
+    return turn
+
+
+def _centered(poses: Float[Array, "n 4 4"], turn: Similarity) -> Similarity:
+    """Turned, the cameras' mean at the origin, their largest coordinate 1."""
+    shift = np.eye(4)
+    shift[:3, 3] = -poses[:, :3, 3].mean(axis=0)
+    moved = (turn @ shift @ poses)[:, :3, 3]
+    return _scaled(1 / max(float(np.abs(moved).max()), 1e-12)) @ turn @ shift
+
+
+def _scaled(factor: float) -> Similarity:
+    return np.diag([factor, factor, factor, 1.0])
+
+
+def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[str, Similarity]:
+    """The normalization of gsplat's examples: up is −y, the origin is where the cameras look, the median
+    camera is at distance 1; then the principal axes of the points, and z up again."""
+    up = -poses[:, :3, 1].mean(axis=0)
+    turn = _between(up / max(np.linalg.norm(up), 1e-12), np.array([0.0, -1, 0]))
+    turned = turn @ poses
+    places, forward = turned[:, :3, 3], turned[:, :3, 2]
+    nearest = places - (forward * places).sum(1, keepdims=True) * forward
+    shift = np.eye(4)
+    shift[:3, 3] = -np.median(nearest, axis=0)
+    distance = np.median(np.linalg.norm(places + shift[:3, 3], axis=1))
+    first = _scaled(1 / max(float(distance), 1e-12)) @ shift @ turn
+    frames = {"gsplat's, without points": first}
+    if len(points) < 4:
+        return frames
+    moved = points @ first[:3, :3].T + first[:3, 3]
+    middle = np.median(moved, axis=0)
+    _, axes = np.linalg.eigh(np.cov(moved - middle, rowvar=False))
+    axes = axes[:, ::-1].copy()  # of largest variance first
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    principal = np.eye(4)
+    principal[:3, :3], principal[:3, 3] = axes.T, -axes.T @ middle
+    # Versions differ in the signs of the axes.
+    for name, signs in {"": (1, 1, 1), "x": (1, -1, -1), "y": (-1, 1, -1), "z": (-1, -1, 1)}.items():
+        frames[f"gsplat's, turned about {name}" if name else "gsplat's"] = (
+            np.diag([*map(float, signs), 1.0]) @ principal @ first
+        )
+    return frames
+
+
+def registered_frames(
+    points: Float[Array, "m 3"], means: Float[Array, "n 3"], most: int = 3
+) -> dict[str, Similarity]:
+    """Similarities that lay the photos' points onto the Gaussians, by iterated closest points from many
+    rotations, the closest first; none with fewer than 50 points."""
+    if len(points) < 50 or len(means) < 50:
+        return {}
+    chosen = np.random.default_rng(0)
+    source = _typical(points)[chosen.permutation(len(_typical(points)))[:_POINTS]]
+    target = _typical(means)[chosen.permutation(len(_typical(means)))[:_GAUSSIANS]]
+    tree, starts = KDTree(target), Rotation.create_group("O").as_matrix()
+    fits = sorted((_closest(source, target, tree, start) for start in starts), key=lambda fit: fit[0])
+    return {f"by its shape, {i + 1}": fit for i, (_, fit) in enumerate(fits[:most])}
+
+
+def _typical(points: Float[Array, "m 3"]) -> Float[Array, "k 3"]:
+    """The nine tenths nearest to the middle."""
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    return points[distance <= np.quantile(distance, 0.9)]
+
+
+def _closest(
+    source: Float[Array, "m 3"], target: Float[Array, "n 3"], tree: KDTree, turn: Float[Array, "3 3"]
+) -> tuple[float, Similarity]:
+    """Iterated closest points from principal axes and a rotation; the mean distance in units of the size."""
+    size = np.linalg.norm(target - np.median(target, axis=0), axis=1).mean()
+    fit = _axes_aligned(source, target, turn)
+    distance = np.inf
+    for _ in range(_STEPS):
+        moved = source @ fit[:3, :3].T + fit[:3, 3]
+        near, rows = tree.query(moved)
+        kept = near <= np.quantile(near, 0.8)
+        distance = float(near[kept].mean() / size)
+        fit = _umeyama(source[kept], target[rows[kept]])
+    # Everything shrunk onto one place is close, too.
+    return distance * max(1.0, size / max(_spread(source) * np.cbrt(np.linalg.det(fit[:3, :3])), 1e-12)), fit
+
+
+def _spread(points: Float[Array, "m 3"]) -> float:
+    return float(np.linalg.norm(points - np.median(points, axis=0), axis=1).mean())
+
+
+def _axes_aligned(
+    source: Float[Array, "m 3"], target: Float[Array, "n 3"], turn: Float[Array, "3 3"]
+) -> Similarity:
+    frames = []
+    for points in (source, target):
+        middle = np.median(points, axis=0)
+        _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        frames.append((middle, axes, _spread(points)))
+    (a, from_axes, small), (b, to_axes, large) = frames
+    fit = np.eye(4)
+    fit[:3, :3] = large / max(small, 1e-12) * to_axes @ turn @ from_axes.T
+    fit[:3, 3] = b - fit[:3, :3] @ a
+    return fit
+
+
+def _umeyama(source: Float[Array, "m 3"], target: Float[Array, "m 3"]) -> Similarity:
+    """The similarity with the least squared distances (Umeyama 1991)."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    covariance = (target - b).T @ (source - a) / len(source)
+    left, values, right = np.linalg.svd(covariance)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    scale = (values * signs).sum() / max(((source - a) ** 2).sum() / len(source), 1e-30)
+    fit = np.eye(4)
+    fit[:3, :3] = scale * (left * signs) @ right
+    fit[:3, 3] = b - fit[:3, :3] @ a
+    return fit

@@ -1,0 +1,144 @@
+"""Learning of a finished splat's codes from photos: prepare, gather, sharpen, compress, without a trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lang3dxl_ns.attachment.known_frames import Similarity
+from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.reports import progress_bar
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.preparation.collection import prepare_collection
+from lang3dxl_ns.preparation.encoders import BUILTIN, CLIP_OPTION, find_model
+from lang3dxl_ns.preparation.foreground import with_foreground
+from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
+from lang3dxl_ns.preparation.targets import TargetReader
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
+from lang3dxl_ns.rendering.render import composite
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera, camera_to_world, resized
+from lang3dxl_ns.scene.photo import Photo
+
+LONGER_SIDE = 800
+"""Pixels of the longer side at which photos are gathered, at most: a fine crop covers dozens of them."""
+
+
+def settled(config: PreparationConfig) -> PreparationConfig:
+    """The settings with which features are gathered: fine crops, and the dense encoder that belongs to the
+    CLIP."""
+    dense = config.dense
+    if dense == "auto":
+        dense = BUILTIN if config.clip == BUILTIN else DENSE_MODEL
+    return replace(config, dense=dense, regions="none", crops="fine")
+
+
+def prepare_photos(
+    collection: PhotoCollection, config: PreparationConfig, cache: Path, device: torch.device | str
+) -> tuple[PhotoCollection, TargetReader]:
+    """The photos with their foreground, and their targets; those that can't be read are left out.
+
+    Args:
+        collection: the photos.
+        config: see `settled`.
+        cache: folder of the targets, where training finds them too.
+        device: where the encoders run.
+    """
+    masked = with_foreground(collection.photos, config, collection.folder, cache, device, say)
+    names = [photo.name for photo in masked]
+    made = prepare_collection(
+        masked, collection.reconstruction, config, cache, device, log=say, regions=None, fine=names
+    )
+    kept = set(made.reader.names)
+    return replace(collection, photos=[photo for photo in masked if photo.name in kept]), made.reader
+
+
+def learn(
+    splats: Splats, collection: PhotoCollection, cameras: Mapping[str, Camera], targets: TargetReader
+) -> tuple[SemanticEncoder, Float[Tensor, "n code"]]:
+    """A decoder and the Gaussians' codes; NaN for those that no photo shows.
+
+    Args:
+        splats: the Gaussians, on the device to work on.
+        collection: the photos.
+        cameras: of each photo, at the file's resolution, in the splat's frame.
+        targets: of the photos.
+    """
+    device = splats.means.device
+    decoder = make_encoder(
+        EncoderConfig(), SemanticFieldConfig(preset="short"), targets.clip_dim, 0, torch.zeros(3), 1.0
+    ).to(device)
+    names = [photo.name for photo in collection.photos]
+    dense = partial(targets.dense_features, names) if targets.dense_dim else None
+    with progress_bar() as bar:
+        photos = bar.track(collection.photos, description="gathering features")
+        learning = bar.add_task("learning codes", total=decoder.learning_steps or None)
+        views = _views(splats, photos, cameras, targets)
+        codes = learn_codes(
+            decoder,
+            views,
+            splats.means,
+            partial(targets.clip_features, names),
+            dense,
+            lambda: bar.advance(learning),
+        )
+    if decoder.learned is not None:
+        say(decoder.learned)
+    return decoder.eval().requires_grad_(False), codes
+
+
+def _views(
+    splats: Splats, photos: Iterable[Photo], cameras: Mapping[str, Camera], targets: TargetReader
+) -> Iterator[TargetView]:
+    place = splats.means
+    for photo in photos:
+        camera = resized(cameras[photo.name], LONGER_SIDE)
+        dense = targets.dense(photo.name)
+        mask = photo.read_mask(camera.width / photo.width)
+        yield TargetView(
+            partial(composite, splats, camera),
+            (camera.height, camera.width),
+            targets.clip(photo.name).features.to(place),
+            None if dense is None else dense.to(place),
+            None if mask is None else mask.to(place.device),
+        )
+
+
+def scene_file(
+    collection: PhotoCollection,
+    cameras: Mapping[str, Camera],
+    similarity: Similarity,
+    config: PreparationConfig,
+) -> SceneFile:
+    """What a scene keeps of its photos, and of the frame: splat's = similarity · photos'."""
+    known, local = find_model(config.clip, CLIP_OPTION), Path(config.clip).expanduser()
+    scale = float(torch.from_numpy(similarity[:3, :3]).double().det().pow(1 / 3))
+    return SceneFile(
+        photos=[_scene_photo(photo, cameras[photo.name]) for photo in collection.photos],
+        clip=str(local.absolute()) if local.is_dir() else config.clip,
+        clip_identity=known.identity,
+        scale=scale,
+        transform=(similarity[:3] / scale).tolist(),
+        data=str(collection.folder),
+    )
+
+
+def _scene_photo(photo: Photo, camera: Camera) -> ScenePhoto:
+    return ScenePhoto(
+        name=photo.name,
+        split="train",
+        camera_to_world=camera_to_world(camera.view_matrix.double()).tolist(),
+        lens=photo.lens.scaled(min(1.0, LONGER_SIDE / max(photo.width, photo.height))),
+        mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
+        size=(photo.width, photo.height),
+    )

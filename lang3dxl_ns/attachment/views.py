@@ -1,0 +1,352 @@
+"""Views of a splat from the splat alone: around it and in it, outside of matter, chosen to show all of it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from lang3dxl_ns.common.console import progress, say
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
+from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.query.cache import fingerprint
+from lang3dxl_ns.query.match import as_bytes, save_picture
+from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.rendering.render import Rendering, composite, render
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera, Lens, resized
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
+from lang3dxl_ns.scene.photo import Photo
+
+Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
+LENS = Lens(480, 360, 384.0, 384.0, 240.0, 180.0)
+"""Of the views: 64 degrees wide, as a phone's."""
+BACKGROUND = (0.75, 0.8, 0.85)
+"""Behind the splat: a pale sky."""
+_RULE = 2
+"""Increased when views are chosen or rendered in another way."""
+_OPAQUE = 0.3
+_NEAR = 0.03
+"""Distance from matter that a camera keeps, in radii of the scene."""
+_CLOSE = 0.1
+"""Depth in radii below which a pixel shows something too close, and the share of such pixels."""
+_MOST_CLOSE = 0.1
+_COVERED = 0.35
+"""Share of a view that the splat must cover."""
+_BLURRED = 2.0
+"""Median size of the Gaussians in a view, relative to that in most views, from which it is blurred: too close
+for what the splat was made from."""
+_PROBES, _ROOFED = 64, 0.7
+"""Places tried, and the share of them with matter above from which a scene is indoors."""
+_TILT = 0.4
+"""Angle in radians between up and the nearest axis, at most."""
+_CANDIDATES = 5
+"""Candidates for every view wanted."""
+_SIDE = 96
+"""Longer side of the views that candidates are judged by."""
+_SAMPLE = 30_000
+"""Gaussians that candidates are judged by."""
+_ENOUGH = 4.0
+"""Pixels of a small view that show a Gaussian well; more count less."""
+_POINTS = 400
+"""Points per view, from its depth, for the sizes of crops."""
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Where a splat's matter is."""
+
+    center: Float[Tensor, "3"]
+    radius: float
+    """Holds three quarters of it."""
+    up: Float[Tensor, "3"]
+    ground: float
+    """Height of the ground, along `up`, from the center."""
+
+    @classmethod
+    def of(cls, splats: Splats, up: Up) -> Extent:
+        """Raises UserError if there is no matter."""
+        solid = solids(splats)
+        means = solid.means
+        center = means.median(0).values
+        radius = float((means - center).norm(dim=1).quantile(0.75))
+        direction = find_up(solid, center, radius) if up == "auto" else _axis(up).to(means)
+        heights = (means - center) @ direction
+        near = (means - center).norm(dim=1) < 1.5 * radius
+        return cls(center, radius, direction, float(heights[near].quantile(0.05)))
+
+
+def solids(splats: Splats, most: int = 200_000) -> Splats:
+    """Opaque Gaussians, at most so many of them. Raises UserError if there are hardly any."""
+    rows = (splats.opacities > _OPAQUE).nonzero()[:, 0]
+    if len(rows) < 10:
+        raise UserError("this splat has hardly an opaque Gaussian: nothing can be seen in it")
+    return splats.select(rows[:: -(-len(rows) // most)])
+
+
+def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:
+    """The direction, near one of the axes, against which the ground lies: of all flat things at an end of the
+    scene, the ground is the largest."""
+    normals, area = _normals(solid)
+    near = (solid.means - center).norm(dim=1) < 4 * radius
+    normals, area, places = normals[near], area[near], solid.means[near] - center
+    best, direction = -math.inf, _axis("z").to(normals)
+    for name in ("z", "-z", "y", "-y", "x", "-x"):
+        axis = _axis(name).to(normals)
+        facing = (normals @ axis).abs() > math.cos(_TILT)
+        if not facing.any():
+            continue
+        turned = normals[facing] * (normals[facing] @ axis).sign()[:, None]
+        own = F.normalize((turned * area[facing, None]).sum(0), dim=0)
+        heights = places @ own
+        ground = (heights - heights.quantile(0.03)).abs() < 0.15 * radius
+        score = float(area[ground & ((normals @ own).abs() > math.cos(0.3))].sum())
+        if score > best:
+            best, direction = score, own
+    return direction
+
+
+def _normals(solid: Splats) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """The thinnest axis of each Gaussian, and the area of the other two, which nothing huge dominates."""
+    w, x, y, z = F.normalize(solid.quats, dim=1).unbind(1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    turns = torch.stack(rows, dim=1).reshape(-1, 3, 3)
+    thin = solid.scales.argmin(1)
+    normals = turns.gather(2, thin[:, None, None].expand(-1, 3, 1))[..., 0]
+    area = solid.scales.prod(1) / solid.scales.amin(1).clamp_min(1e-12)
+    return normals, area.clamp_max(float(area.quantile(0.99)))
+
+
+def _axis(name: str) -> Float[Tensor, "3"]:
+    axis = torch.zeros(3)
+    axis["xyz".index(name[-1])] = -1.0 if name.startswith("-") else 1.0
+    return axis
+
+
+def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCollection:
+    """Pictures of a splat as a photo collection, in the splat's frame.
+
+    They are kept in `folder`, and made anew only for another splat or other settings.
+
+    Args:
+        splats: the Gaussians.
+        count: number of views.
+        up: axis that points up.
+        folder: where the pictures go.
+
+    Raises:
+        UserError: no view shows the splat well.
+    """
+    stamp = fingerprint(vars(splats.gaussians), [_RULE, count, up])
+    cameras = _kept(folder, stamp)
+    if cameras is None:
+        cameras = choose_views(splats, Extent.of(splats, up), count)
+    names = [f"{i:04d}.png" for i in range(len(cameras))]
+    make_folder(folder)
+    tracked, chosen = {}, np.random.default_rng(0)
+    with progress("rendering views", len(cameras)) as advance:
+        for name, camera in zip(names, cameras, strict=True):
+            view = _draw(splats, camera)
+            path = folder / "images" / name
+            if not path.is_file() or _kept(folder, stamp) is None:
+                save_picture(as_bytes(view.rgb), path)
+            tracked[name] = _tracked(name, view, chosen)
+            advance()
+    content = {"of": stamp, "views": [camera.view_matrix.tolist() for camera in cameras]}
+    write_atomically(folder / "views.json", json.dumps(content))
+    photos = [Photo(name, folder / "images" / name, None, LENS) for name in names]
+    points = np.concatenate([photo.points for photo in tracked.values()])
+    reconstruction = Reconstruction(tracked, points, np.zeros(points.shape, np.uint8))
+    return PhotoCollection(folder, photos, reconstruction, {})
+
+
+def _kept(folder: Path, stamp: str) -> list[Camera] | None:
+    """The cameras of an earlier call for the same splat."""
+    try:
+        content = read_json(folder / "views.json")
+        if content["of"] != stamp:
+            return None
+        return [
+            LENS.camera(torch.tensor(view, dtype=torch.float32).reshape(4, 4)) for view in content["views"]
+        ]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
+def _draw(splats: Splats, camera: Camera) -> Rendering:
+    return render(splats, camera, background=splats.means.new_tensor(BACKGROUND))
+
+
+def _tracked(name: str, view: Rendering, chosen: np.random.Generator) -> TrackedPhoto:
+    """A view with points of the surfaces that it shows."""
+    rows, columns = (view.alpha > 0.8).cpu().numpy().nonzero()
+    some = chosen.permutation(len(rows))[:_POINTS]
+    rows, columns = rows[some], columns[some]
+    depth = view.depth.cpu().double().numpy()[rows, columns]
+    pixels = np.column_stack([columns + 0.5, rows + 0.5])
+    rays = np.column_stack(
+        [(pixels[:, 0] - LENS.cx) / LENS.fx, (pixels[:, 1] - LENS.cy) / LENS.fy, np.ones(len(pixels))]
+    )
+    pose = view.camera.view_matrix.double().numpy()
+    points = (rays * depth[:, None] - pose[:3, 3]) @ pose[:3, :3]
+    return TrackedPhoto(name, LENS, pose[:3], points, pixels)
+
+
+def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
+    """Views that together show the most Gaussians at the size at which they were made.
+
+    Candidates stand around the scene and in it, at several heights and distances. Those too close to matter,
+    those that show little, and those that show it blurred are dropped; of the rest the one that adds most is
+    taken, again and again.
+
+    Raises:
+        UserError: no candidate is left.
+    """
+    sample = torch.linspace(0, len(splats) - 1, min(_SAMPLE, len(splats)), dtype=torch.float64).long()
+    free = _FreeSpace(solids(splats), extent)
+    shown, sizes, cameras = [], [], []
+    with progress("choosing views", _CANDIDATES * count) as advance:
+        for camera in candidates(extent, free, _CANDIDATES * count):
+            if (judged := _judged(splats, camera, extent)) is not None:
+                pixels, size = judged
+                shown.append(pixels[sample.to(pixels.device)].cpu())
+                sizes.append(size)
+                cameras.append(camera)
+            advance()
+    if not cameras:
+        raise UserError("no view shows this splat well: give its photos (--data)")
+    sharp = torch.tensor(sizes) <= _BLURRED * torch.tensor(sizes).median()
+    cameras = [camera for camera, keep in zip(cameras, sharp, strict=True) if keep]
+    found = _cover(torch.stack(shown)[sharp], min(count, len(cameras)))
+    say(f"{len(found)} views chosen of {len(cameras)} that show the splat well")
+    return [cameras[i] for i in found]
+
+
+def _cover(shown: Float[Tensor, "views n"], count: int) -> list[int]:
+    """Greedy choice: a Gaussian's first pixels count most."""
+    total, chosen = torch.zeros_like(shown[0]), list[int]()
+    for _ in range(count):
+        gain = ((total + shown) / _ENOUGH).log1p().sum(1) - (total / _ENOUGH).log1p().sum()
+        gain[chosen] = -math.inf
+        chosen.append(int(gain.argmax()))
+        total = total + shown[chosen[-1]]
+    return sorted(chosen)
+
+
+def _judged(splats: Splats, camera: Camera, extent: Extent) -> tuple[Float[Tensor, " n"], float] | None:
+    """Pixels that each Gaussian fills in a small view, and the median size of those seen, in pixels of the
+    large one; None for a view that isn't worth taking."""
+    small = resized(camera, _SIDE)
+    view = render(splats, small)
+    solid = view.alpha > 0.5
+    if float(solid.float().mean()) < _COVERED:
+        return None
+    if float((view.depth[solid] < _CLOSE * extent.radius).float().mean()) > _MOST_CLOSE:
+        return None
+    draw = partial(composite, splats, small)
+    pixels = filled_pixels(draw, torch.ones_like(view.alpha), len(splats))
+    seen = pixels > 0.1
+    if not seen.any():
+        return None
+    pose = camera.view_matrix.to(splats.means)
+    depth = (splats.means[seen] @ pose[2, :3] + pose[2, 3]).clamp_min(1e-6)
+    return pixels, float((splats.scales[seen].amax(1) * LENS.fx / depth).median())
+
+
+class _FreeSpace:
+    """Where no matter is: not close to it and, in scenes under the sky, not below it either: a building of
+    which only the outside was seen is hollow."""
+
+    def __init__(self, solid: Splats, extent: Extent) -> None:
+        near = (solid.means - extent.center).norm(dim=1) < 3 * extent.radius
+        solid = solid.select(near)
+        self._extent, self._margin = extent, _NEAR * extent.radius
+        self._tree = KDTree(solid.means.cpu().numpy())
+        self._reach = solid.scales.amax(1).clamp_max(0.2 * extent.radius).cpu().numpy()
+        self._plan = torch.stack(_level(extent.up), dim=1)
+        self._from_above = KDTree((solid.means @ self._plan).cpu().numpy())
+        self._heights = (solid.means @ extent.up).cpu().numpy()
+        self._width = 2 * (self._margin + float(np.median(self._reach)))
+        draw = torch.Generator().manual_seed(1)
+        places = [_inside(extent, draw)[0] for _ in range(_PROBES)]
+        self.indoors = sum(map(self.roofed, places)) > _ROOFED * _PROBES
+
+    def __contains__(self, place: Float[Tensor, "3"]) -> bool:
+        distance, rows = self._tree.query(place.cpu().numpy(), k=8)
+        far = distance - 2 * self._reach[np.minimum(rows, len(self._reach) - 1)] > self._margin
+        return bool(far.all()) and (self.indoors or not self.roofed(place))
+
+    def roofed(self, place: Float[Tensor, "3"]) -> bool:
+        """Whether there is matter above a place."""
+        rows = self._from_above.query_ball_point((place @ self._plan).cpu().numpy(), self._width)
+        return bool((self._heights[rows] > float(place @ self._extent.up) + self._margin).any())
+
+
+def candidates(extent: Extent, free: _FreeSpace, count: int) -> Iterator[Camera]:
+    """Cameras in free space: two thirds around the scene, looking in, one third in it, looking around."""
+    draw = torch.Generator().manual_seed(0)
+    found = tries = 0
+    while found < count and tries < 20 * count:
+        tries += 1
+        place, target = _inside(extent, draw) if tries % 3 == 0 else _around(extent, draw)
+        if place in free:
+            found += 1
+            yield LENS.camera(looking(place.cpu(), target.cpu(), extent.up.cpu()))
+
+
+def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """From 0.8 to 5 radii away, up to 40 degrees above the ground; at something in the inner half."""
+    angle, height, distance, *aim = torch.rand(6, generator=draw).tolist()
+    elevation = math.radians(40) * height**2
+    away = extent.radius * 0.8 * 6.0**distance
+    side, front = _level(extent.up)
+    direction = math.cos(2 * math.pi * angle) * side + math.sin(2 * math.pi * angle) * front
+    floor = extent.center + (extent.ground + 0.08 * extent.radius) * extent.up
+    place = floor + away * (math.cos(elevation) * direction + math.sin(elevation) * extent.up)
+    offset = torch.tensor([2 * value - 1 for value in aim]).to(place)
+    return place, extent.center + 0.5 * extent.radius * offset
+
+
+def _inside(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Somewhere over the ground within a radius, at a person's or a storey's height, looking around."""
+    x, y, height, angle, tilt = torch.rand(5, generator=draw).tolist()
+    side, front = _level(extent.up)
+    place = extent.center + extent.radius * ((2 * x - 1) * side + (2 * y - 1) * front)
+    place = place + (extent.ground + extent.radius * (0.08 + 0.4 * height**2)) * extent.up
+    ahead = math.cos(2 * math.pi * angle) * side + math.sin(2 * math.pi * angle) * front
+    return place, place + ahead + (0.5 * tilt - 0.15) * extent.up
+
+
+def _level(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Two directions along the ground."""
+    first = torch.zeros_like(up)
+    first[int(up.abs().argmin())] = 1.0
+    side = F.normalize(torch.linalg.cross(up, first), dim=0)
+    return side, torch.linalg.cross(up, side)
+
+
+def looking(
+    place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "4 4"]:
+    """World → camera (OpenCV axes) of an upright camera that looks from a place at a target."""
+    forward = F.normalize(target - place, dim=0)
+    right = F.normalize(torch.linalg.cross(forward, up), dim=0)
+    down = torch.linalg.cross(forward, right)
+    view = torch.eye(4)
+    view[:3, :3] = torch.stack([right, down, forward])
+    view[:3, 3] = -view[:3, :3] @ place
+    return view

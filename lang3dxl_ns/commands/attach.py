@@ -1,0 +1,74 @@
+"""`lang3dxl attach`: words for a splat that any program made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.settings import PreparationConfig
+
+
+@dataclass(kw_only=True)
+class Attach(PreparationConfig):
+    """Give words to a finished splat: writes a scene that answers any text, without training colors again.
+
+    Reads PLY of any program (SuperSplat's compressed one too), .spz, .splat, gsplat's checkpoints, and runs
+    of nerfstudio's splatfacto. With --data, words are learned from the splat's photos; without, from views of
+    the splat itself, which is less accurate.
+    """
+
+    splat: tyro.conf.Positional[Path]
+    """The splat's file, or the folder of its run."""
+    data: Path | None = None
+    """Its photos: a folder with a COLMAP model or a transforms.json, a folder of photos alone, or a video."""
+    out: Path
+    """The scene file to write, NAME.scene."""
+    text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """Texts to look for at the end ("windows; towers"): a picture of the best view of each is written beside
+    the scene."""
+    views: int = 48
+    """Without --data: number of views to render."""
+    up: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
+    """Without --data: the splat's axis that points up (auto: by where its ground is)."""
+    cache_dir: Path | None = None
+    """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.attachment.attach import AttachConfig, attach
+
+        self.check()
+        if not 4 <= self.views <= 10_000:
+            raise UserError(f"--views is {self.views}: give a number from 4 to 10000")
+        settings = PreparationConfig(**{f.name: getattr(self, f.name) for f in fields(PreparationConfig)})
+        config = AttachConfig(self.views, self.up, self.cache_dir, settings)
+        scene = attach(self.splat, self.data, self.out, config)
+        if self.text:
+            _show(scene, self.text, self.out)
+        say(f'Ask it: lang3dxl query {self.out} --text "windows" --out found')
+
+
+def _show(scene, texts: list[str], out: Path) -> None:
+    """Write a picture for each view that shows a prompt best, with the heat of all its prompts."""
+    from lang3dxl_ns.common.files import slugs
+    from lang3dxl_ns.query.doubt import doubtful
+    from lang3dxl_ns.query.match import save_picture, together
+
+    question = scene.ask(texts)
+    best = scene.best_views(question)
+    for name, slug in zip(dict.fromkeys(best), slugs(list(dict.fromkeys(best))), strict=True):
+        shown = [p for p, view in zip(question.prompts, best, strict=True) if view == name]
+        matches = scene.matches(scene.ask(shown), name)
+        picture = out.with_name(f"{out.stem}.{slug}.png")
+        if len(matches) == 1:
+            matches[0].save(picture)
+        else:
+            save_picture(together(matches), picture)
+        say(f"{'; '.join(prompt.text for prompt in shown)}: {picture}")
+    for prompt, doubt in zip(question.prompts, question.doubts, strict=True):
+        if advice := doubtful(prompt.text, doubt):
+            say(f"  {advice}")

@@ -1,0 +1,189 @@
+"""`lang3dxl teach` and `lang3dxl words`: words taught by example."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import tyro
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.query.scene import Scene
+    from lang3dxl_ns.query.teach import Example, TaughtWord
+
+
+@dataclass(kw_only=True)
+class Teach:
+    """Show a scene what a word means, by marking it in a photo: an outline, a box, or points.
+
+    The scene keeps the word. Further calls add examples, in the same photo or in others; `lang3dxl words`
+    lists them and takes them back. `query`, `export` and the viewer then find the word everywhere.
+    """
+
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
+    word: str
+    """The word to teach."""
+    photo: str
+    """The photo that is marked, by name."""
+    mask: Path | None = None
+    """Picture of the photo's proportions, white on all that is the word."""
+    box: str | None = None
+    """A box around all that is the word, in pixels of the photo: LEFT,TOP,RIGHT,BOTTOM."""
+    at: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """A point on the word, in pixels of the photo: X,Y; repeat the flag."""
+    not_at: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """A point on something else: X,Y; repeat the flag."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.query.scene_file import keep_words
+        from lang3dxl_ns.query.teach import known_word
+
+        scene, file = opened(self.scene)
+        example = self._example()
+        before = scene.words.get(known_word(self.word))
+        examples = [*(before.examples if before else ()), example]
+        taught = scene.teach(self.word, examples)
+        word = taught.words[known_word(self.word)]
+        keep_words(file, taught.words.values())
+        say(*described(word))
+        say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
+
+    def _example(self) -> Example:
+        from lang3dxl_ns.query.teach import Example
+
+        box = None if self.box is None else _numbers(self.box, 4, "--box LEFT,TOP,RIGHT,BOTTOM")
+        points, others = (
+            tuple((x, y) for x, y in (_numbers(text, 2, f"{flag} X,Y") for text in texts))
+            for texts, flag in ((self.at, "--at"), (self.not_at, "--not-at"))
+        )
+        mask = None if self.mask is None else read_mask(self.mask)
+        return Example(self.photo, mask, box, points, others)  # type: ignore[arg-type]
+
+
+@dataclass(kw_only=True)
+class Words:
+    """List the words that a scene was taught; take them back; carry them to other scenes of the same CLIP."""
+
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
+    forget: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """A word to forget, or one of its examples: doors, or doors/2 for its second example."""
+    save: Path | None = None
+    """Write the words to this file."""
+    load: Path | None = None
+    """Add the words from this file. What was learned in one scene often fails in another: check them."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.query.scene_file import keep_words
+        from lang3dxl_ns.query.teach import load_words, save_words
+
+        scene, file = opened(self.scene)
+        for name in self.forget:
+            scene = forgotten(scene, name)
+        if self.load is not None:
+            for word in load_words(self.load):
+                scene = carried(scene, word)
+        words = list(scene.words.values())
+        if self.forget or self.load is not None:
+            keep_words(file, words)
+        if self.save is not None:
+            if not words:
+                raise UserError("there is no word to save: teach one with lang3dxl teach")
+            save_words(self.save, words)
+        if not words:
+            say("This scene was taught no word: lang3dxl teach --word doors --photo NAME --at X,Y")
+        for word in words:
+            say(*described(word))
+
+
+def carried(scene: Scene, word: TaughtWord) -> Scene:
+    """The scene with a word that was taught elsewhere: learned anew where its photos are the same, otherwise
+    as it was learned there.
+
+    Raises:
+        UserError: it was learned with another CLIP.
+    """
+    if word.examples and word.scene == Path(scene.file.data).name:
+        return scene.teach(word.name, word.examples)
+    if word.clip != scene.file.clip_identity:
+        raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
+    return scene.with_words([*scene.words.values(), replace(word, examples=(), precision={})])
+
+
+def opened(path: Path | None) -> tuple[Scene, Path]:
+    """A scene, and the file that keeps its words.
+
+    Raises:
+        UserError: there is no scene file.
+    """
+    from lang3dxl_ns.open_scene import find_scene_file
+    from lang3dxl_ns.query.scene_file import read_scene
+
+    file = find_scene_file(path)
+    if file is None:
+        raise UserError(
+            "this run has no file to keep words in: write one with lang3dxl export --scene-file NAME.scene"
+        )
+    return read_scene(file), file
+
+
+def forgotten(scene: Scene, which: str) -> Scene:
+    """The scene without a word (doors), or without one of its examples (doors/2).
+
+    Raises:
+        UserError: it was not taught.
+    """
+    from lang3dxl_ns.query.teach import known_word
+
+    name, _, number = which.rpartition("/") if which.rpartition("/")[2].isdecimal() else (which, "", "")
+    word = scene.words.get(known_word(name))
+    if word is None or (number and not 1 <= int(number) <= len(word.examples)):
+        raise UserError(f"{which!r} was not taught: lang3dxl words lists what was")
+    left = [e for i, e in enumerate(word.examples, start=1) if number and i != int(number)]
+    if left:
+        return scene.teach(word.name, left)
+    return scene.with_words(one for one in scene.words.values() if one is not word)
+
+
+def described(word: TaughtWord) -> list[str]:
+    """A word and its examples, in lines."""
+    if not word.examples:
+        return [f"{word.name}: carried over from {word.scene}, which often fails: check it in a few photos"]
+    count = f"{len(word.examples)} example{'s' if len(word.examples) > 1 else ''}"
+    lines = [f"{word.name}: taught by {count}, doubt {word.doubt:.2f}"]
+    learned = ", learned from the others" if len(word.precision) > 1 else ""
+    for number, example in enumerate(word.examples, start=1):
+        precision = word.precision.get(example.photo)
+        score = "" if precision is None else f": average precision {precision:.2f}{learned}"
+        lines.append(f"  {number}. {_marks(example)} in {example.photo}{score}")
+    return lines
+
+
+def _marks(example: Example) -> str:
+    kind = "outline" if example.mask is not None else "box" if example.box is not None else ""
+    counted = ((len(example.points), "point"), (len(example.not_points), "point elsewhere"))
+    points = [f"{count} {what}" for count, what in counted if count]
+    return ", ".join([*([kind] if kind else []), *points])
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """A picture as a mask: at least half bright. Raises UserError where it can't be read."""
+    from lang3dxl_ns.evaluation.annotations import read_gray
+
+    return np.asarray(read_gray(path, "mask")) >= 128
+
+
+def _numbers(text: str, count: int, usage: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count:
+        raise UserError(f"{text!r} is not {usage}: give {count} numbers, separated by commas")
+    return numbers

@@ -1,0 +1,80 @@
+"""Codes of finished Gaussians from photos' targets: gather, sharpen, compress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
+from lang3dxl_ns.components.principal_basis import PrincipalBasis
+from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
+
+ClipMaps = Callable[[], Iterable[Float[Tensor, "hd wd c"]]]
+DenseMaps = Callable[[], Iterable[Float[Tensor, "t t d"]]]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetView:
+    """A photo's camera and its targets."""
+
+    composite: Composite
+    """Composites values of the Gaussians as this camera sees them."""
+    size: tuple[int, int]
+    """Rows and columns that it composites."""
+    clip: Float[Tensor, "hd wd c"]
+    """CLIP features, of any resolution."""
+    dense: Float[Tensor, "t t d"] | None = None
+    """Dense features of the photo squashed to a square."""
+    mask: Bool[Tensor, "h w"] | None = None
+    """The foreground; None for everything."""
+
+
+def learn_codes(
+    decoder: SemanticEncoder,
+    views: Iterable[TargetView],
+    means: Float[Tensor, "n 3"],
+    clip_targets: ClipMaps,
+    dense_targets: DenseMaps | None = None,
+    advance: Callable[[], None] = lambda: None,
+) -> Float[Tensor, "n code"]:
+    """Average the photos' targets over the Gaussians that they show, and let the decoder make codes of them.
+    NaN for Gaussians that no photo shows.
+
+    Args:
+        decoder: an encoder that `needs_lifting`; trained in place.
+        views: the photos, each once.
+        means: centers of the Gaussians; they tell number, type and device.
+        clip_targets: the CLIP targets of the views, to find a basis from.
+        dense_targets: their dense features; None: nothing is sharpened.
+        advance: called as the decoder learns, `decoder.learning_steps` times.
+    """
+    basis = fine_basis = None
+    width = channels = decoder.clip_dim
+    if decoder.gathered_channels is not None and decoder.gathered_channels < width:
+        width = channels = decoder.gathered_channels
+        basis = PrincipalBasis.of(clip_targets(), width)
+    if dense_targets is not None:
+        fine_basis = PrincipalBasis.of(map(_unit, dense_targets()), DENSE_AXES)
+        channels += fine_basis.axes.shape[1]
+
+    def targets():
+        for view in views:
+            maps = [view.clip if basis is None else basis.to(view.clip).coordinates(view.clip)]
+            if fine_basis is not None and view.dense is not None:
+                maps.append(fine_basis.to(view.clip).coordinates(_unit(view.dense)))
+            yield view.composite, Pixels.of(maps, view.size, view.mask)
+
+    features, mass = gather(len(means), targets(), channels, means)
+    if fine_basis is not None:
+        features = sharpen(features[:, :width], features[:, width:], mass)
+    # Features that are many lie on the CPU, and those that are codes themselves come from there.
+    return decoder.learn_gaussians(features, mass, advance, basis).to(means.device)
+
+
+def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:
+    return F.normalize(dense.float(), dim=-1)

@@ -1,0 +1,218 @@
+"""A folder of photos with poses, from a COLMAP model, a transforms.json, or photos alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded, read_json
+from lang3dxl_ns.common.pictures import open_picture
+from lang3dxl_ns.preparation.foreground import find_mask
+from lang3dxl_ns.scene.camera import Lens, check_pose
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, read_reconstruction
+from lang3dxl_ns.scene.companions import inside
+from lang3dxl_ns.scene.photo import Photo, upright_in_model
+from lang3dxl_ns.scene.photo_folder import find_photos
+from lang3dxl_ns.scene.reconstruct import reconstruct_scene
+from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
+
+MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
+OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
+"""Folder for a model of ours if sparse is taken."""
+TRANSFORMS = "transforms.json"
+MaskOf = Callable[[str], Path | None]
+
+
+@dataclass(frozen=True)
+class PhotoCollection:
+    """Photos on disk, and where they were taken."""
+
+    folder: Path
+    """The scene's folder."""
+    photos: list[Photo]
+    """In the order of the reconstruction."""
+    reconstruction: Reconstruction
+    """Of these photos, in the frame of the file that the poses come from."""
+    left_out: dict[str, str]
+    """Photos of the file that can't be used, with reasons."""
+    reconstructed: bool = False
+    """Whether the poses were computed here, in a frame that no other program knows."""
+
+
+def read_collection(data: str | Path) -> PhotoCollection:
+    """The photos of a folder or video; those without poses are reconstructed, which takes minutes.
+
+    Args:
+        data: a folder with a COLMAP model or a transforms.json, a folder of photos alone, or a video.
+
+    Raises:
+        UserError: there are no photos, or they can't be used, or the poses are damaged.
+    """
+    folder = expanded(data).absolute()
+    if is_video(folder) or (not folder.exists() and frames_folder(folder).is_dir()):
+        folder = extract_frames(folder)
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder: give the folder of the splat's photos as --data")
+    own = any((folder / OWN_MODEL).glob("images.*"))
+    model = next((f for f in MODEL_FOLDERS if any((folder / f).glob("images.*"))), OWN_MODEL if own else None)
+    if model is None and (folder / TRANSFORMS).is_file():
+        return _collection(folder, *read_transforms(folder / TRANSFORMS))
+    place = folder / model if model is not None else reconstruct_scene(folder)[1]
+    images, reconstruction = folder / images_path(folder), read_reconstruction(place)
+    photos, kept, left_out = usable_photos(
+        reconstruction, images, lambda name: find_mask(folder / "masks", name)
+    )
+    reconstruction = replace(reconstruction, photos=kept)
+    return _collection(folder, photos, left_out, reconstruction, model is None or model == OWN_MODEL)
+
+
+def _collection(
+    folder: Path,
+    photos: dict[Path, Photo],
+    left_out: Mapping[str, UserError],
+    reconstruction: Reconstruction,
+    reconstructed: bool = False,
+) -> PhotoCollection:
+    if not photos:
+        first = next(iter(left_out.values()), "it lists none")
+        raise UserError(f"none of the {len(left_out)} photos of {folder} can be used; the first: {first}")
+    kept = {name: tracked for name, tracked in reconstruction.photos.items() if name not in left_out}
+    reasons = {name: str(reason) for name, reason in left_out.items()}
+    return PhotoCollection(
+        folder, list(photos.values()), replace(reconstruction, photos=kept), reasons, reconstructed
+    )
+
+
+def images_path(data: Path, named: Path = Path("images")) -> Path:
+    """The photos' folder relative to the scene's: the named one if it exists, else one with photos."""
+    if (data / named).is_dir() and any((data / named).iterdir()):
+        return named
+    return find_photos(data).folder.relative_to(data) if any(find_photos(data).names) else named
+
+
+def usable_photos(
+    reconstruction: Reconstruction, images: Path, mask_of: MaskOf, follow_links: bool = False
+) -> tuple[dict[Path, Photo], dict[str, TrackedPhoto], dict[str, UserError]]:
+    """The photos of a COLMAP model that are on disk, by their files; their entries in the model, turned as
+    the files are; and why the others can't be used.
+
+    Args:
+        reconstruction: the model.
+        images: folder of the photos.
+        mask_of: finds a photo's foreground mask by its name.
+        follow_links: whether photos may be links that leave the folder.
+    """
+    photos, left_out = dict[Path, Photo](), dict[str, UserError]()
+    kept = dict[str, TrackedPhoto]()
+    for name, tracked in reconstruction.photos.items():
+        path = images / name
+        try:
+            if not inside(images, name, follow_links).is_file():
+                raise UserError(f"there is no {path}")
+            kept[name] = upright_in_model(tracked, path)
+            photos[path] = Photo.from_model(kept[name], path, mask_of(name))
+        except UserError as reason:
+            left_out[name] = reason
+    return photos, kept, left_out
+
+
+# ── transforms.json ─────────────────────────────────────────────────────────────────────────────────────
+
+
+_FISHEYES = ("OPENCV_FISHEYE",)
+_LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_FISHEYES)
+_Read = tuple[dict[Path, Photo], dict[str, UserError], Reconstruction]
+
+
+def read_transforms(path: Path) -> _Read:
+    """Photos and poses of a transforms.json, as instant-ngp and nerfstudio write it; without points.
+
+    Returns:
+        Photos by file, reasons for those left out, and the reconstruction in the file's frame.
+
+    Raises:
+        UserError: the file is damaged, or lists no photo.
+    """
+    try:
+        content = read_json(path)
+        frames = content["frames"]
+        photos, left_out, tracked = dict[Path, Photo](), dict[str, UserError](), dict[str, TrackedPhoto]()
+        for frame in frames:
+            name = _photo_name(path.parent, str(frame["file_path"]))
+            try:
+                photo = _transforms_photo(path.parent, name, {**content, **frame})
+                photos[photo.path] = photo
+                tracked[name] = _transforms_pose(photo, frame["transform_matrix"])
+            except UserError as reason:
+                left_out[name] = reason
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise UserError(f"{path} can't be used ({error!r}): correct it, or make it again") from error
+    photos = dict(sorted(photos.items(), key=lambda item: item[1].name))
+    nothing = np.zeros((0, 3))
+    return photos, left_out, Reconstruction(dict(sorted(tracked.items())), nothing, nothing.astype(np.uint8))
+
+
+def _photo_name(folder: Path, name: str) -> str:
+    """Relative to the folder; instant-ngp leaves out the suffix."""
+    if Path(name).is_absolute() and Path(name).is_relative_to(folder):
+        name = Path(name).relative_to(folder).as_posix()
+    name = name.removeprefix("./")
+    if Path(name).suffix:
+        return name
+    return next(
+        (name + s for s in (".png", ".jpg", ".jpeg", ".JPG") if (folder / (name + s)).is_file()), name
+    )
+
+
+def _transforms_photo(folder: Path, name: str, frame: Mapping[str, Any]) -> Photo:
+    path = inside(folder, name, follow_links=True)
+    if not path.is_file():
+        raise UserError(f"there is no {path}")
+    mask = frame.get("mask_path")
+    lens = _transforms_lens(frame, path, name)
+    nowhere = np.zeros((0, 3)), np.zeros((0, 2))
+    unposed = TrackedPhoto(name, lens, np.eye(4)[:3], *nowhere)
+    return Photo.from_model(unposed, path, None if mask is None else inside(folder, str(mask), True))
+
+
+def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
+    model = str(frame.get("camera_model", "OPENCV"))
+    if model not in _LENSES:
+        raise UserError(f"photo {name} has a {model} camera: undistort it first (colmap image_undistorter)")
+    if "w" in frame and "h" in frame:
+        width, height = int(frame["w"]), int(frame["h"])
+    else:
+        with open_picture(path) as image:
+            width, height = image.size
+    angle = None if "fl_x" in frame else float(frame["camera_angle_x"])
+    fx = float(frame["fl_x"]) if angle is None else width / 2 / math.tan(angle / 2)
+    names = ("k1", "k2", "k3", "k4") if model in _FISHEYES else ("k1", "k2", "p1", "p2")
+    distortion = tuple(float(frame.get(key, 0.0)) for key in names)
+    third = (float(frame["k3"]),) if model not in _FISHEYES and frame.get("k3") else ()
+    fisheye = model in _FISHEYES
+    lens = Lens(
+        width,
+        height,
+        fx,
+        float(frame.get("fl_y", fx)),
+        float(frame.get("cx", width / 2)),
+        float(frame.get("cy", height / 2)),
+        (*distortion, *third) if fisheye or any((*distortion, *third)) else (),
+        fisheye,
+    )
+    lens.check()
+    return lens
+
+
+def _transforms_pose(photo: Photo, matrix: Any) -> TrackedPhoto:
+    check_pose(matrix)
+    pose = np.array(matrix, dtype=np.float64)
+    rotation = (pose[:3, :3] * [1, -1, -1]).T  # OpenGL's camera axes to OpenCV's, inverted
+    camera_from_world = np.hstack([rotation, -rotation @ pose[:3, 3:]])
+    return TrackedPhoto(photo.name, photo.lens, camera_from_world, np.zeros((0, 3)), np.zeros((0, 2)))

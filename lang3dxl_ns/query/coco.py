@@ -1,0 +1,87 @@
+"""Labels in COCO's format, and run lengths of masks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from numpy import ndarray as Array
+from scipy.ndimage import find_objects, label
+
+_LEAST_PART = 1e-4
+"""Share of a photo below which a separate part of a mask is left out."""
+
+
+def run_lengths(mask: Bool[Array, "h w"]) -> list[int]:
+    """Lengths of alternating runs of a mask, column by column, beginning with the pixels outside: COCO's
+    uncompressed RLE."""
+    flat = mask.ravel(order="F")
+    ends = np.flatnonzero(np.diff(flat)) + 1
+    lengths = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
+    return [0, *lengths] if flat.size and flat[0] else lengths
+
+
+def mask_of(lengths: Sequence[int], size: tuple[int, int]) -> Bool[Array, "h w"]:
+    """The mask (height, width) with these `run_lengths`. Raises ValueError if they don't fit its size."""
+    counts = np.asarray(lengths, np.int64)
+    if (counts < 0).any() or counts.sum() != size[0] * size[1]:
+        raise ValueError("run lengths don't fit the size of their mask")
+    return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(size, order="F")
+
+
+class CocoLabels:
+    """A data set in COCO's format, with an annotation for each connected part of each mask.
+
+    Args:
+        categories: their names.
+    """
+
+    def __init__(self, categories: Sequence[str]) -> None:
+        self._images: list[dict[str, Any]] = []
+        self._annotations: list[dict[str, Any]] = []
+        self._categories = [{"id": i, "name": name} for i, name in enumerate(categories, start=1)]
+
+    def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
+        """Add a photo.
+
+        Args:
+            photo: its name.
+            masks: one per category, at the size of the photo's file.
+        """
+        height, width = masks[0].shape
+        image = {"id": len(self._images) + 1, "file_name": photo, "width": width, "height": height}
+        self._images.append(image)
+        for category, mask in enumerate(masks, start=1):
+            for part in _parts(mask):
+                number = {"id": len(self._annotations) + 1, "image_id": image["id"], "category_id": category}
+                self._annotations.append(number | _annotation(part))
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The file's content."""
+        return {
+            "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
+            "images": self._images,
+            "annotations": self._annotations,
+            "categories": self._categories,
+        }
+
+
+def _parts(mask: Bool[Array, "h w"]) -> Iterable[Bool[Array, "h w"]]:
+    numbers, _ = label(mask)
+    for number, place in enumerate(find_objects(numbers), start=1):
+        if np.count_nonzero(numbers[place] == number) >= _LEAST_PART * mask.size:
+            yield numbers == number
+
+
+def _annotation(part: Bool[Array, "h w"]) -> dict[str, Any]:
+    rows, columns = part.any(1).nonzero()[0], part.any(0).nonzero()[0]
+    left, top = int(columns[0]), int(rows[0])
+    return {
+        "segmentation": {"size": list(part.shape), "counts": run_lengths(part)},
+        "area": int(part.sum()),
+        "bbox": [left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1],
+        "iscrowd": 0,
+    }

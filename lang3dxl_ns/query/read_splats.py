@@ -1,0 +1,383 @@
+"""Splats of other programs: PLY of any kind, SPZ, .splat, checkpoints of gsplat and nerfstudio.
+
+Sizes are compared with the file's before anything of that size is allocated. No code in a file is executed.
+"""
+
+from __future__ import annotations
+
+import gzip
+import pickle
+import re
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from math import isqrt
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Shaped
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.rendering.splats import Splats, harmonics_of
+
+KINDS = ".ply, .spz, .splat, a checkpoint of gsplat (.pt) or nerfstudio (.ckpt), or a run's folder"
+_IN_FOLDERS = ("*.ckpt", "nerfstudio_models/*.ckpt", "ckpts/*.pt", "point_cloud/iteration_*/point_cloud.ply")
+"""Where programs leave splats in the folder of a run."""
+_MOST_DAMAGE = 0.5
+"""Share of Gaussians with NaN or infinite values above which a file is refused."""
+_DAMAGE = (
+    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
+    *(MemoryError, struct.error, AssertionError),
+)
+"""Exceptions raised on reading values that a splat file doesn't have."""
+_HEADER = 1 << 16
+"""Most bytes of a PLY's header."""
+_ALL_BANDS = 16
+"""Harmonics of degree 3; those of higher degrees are dropped."""
+
+
+def find_splats(path: str | Path) -> Path:
+    """The file of a splat: the path itself, or the latest file in a run's folder.
+
+    Raises:
+        UserError: there is none.
+    """
+    path = expanded(path)
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise UserError(f"{path} does not exist: name a splat ({KINDS})")
+    found = [file for pattern in _IN_FOLDERS for file in path.glob(pattern)]
+    if not found:
+        raise UserError(f"{path} holds no splat: name one ({KINDS})")
+    return max(found, key=lambda file: (_number(file), file.name))
+
+
+def read_splats(path: str | Path) -> Splats:
+    """Read the Gaussians of a file, all of them and in its order.
+
+    Gaussians with NaN or infinite values keep their place, without size and opacity.
+
+    Args:
+        path: .ply (as 3D Gaussian splatting writes it, or compressed by SuperSplat), .spz, .splat, a gsplat
+            checkpoint (.pt), a splatfacto checkpoint (.ckpt), or the folder of a run with one of them.
+
+    Raises:
+        UserError: there is no such file, or it is damaged, cut short, too large for this machine, of another
+            kind, or most of its values are not finite.
+    """
+    path = find_splats(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise UserError(f"{path.name} names no kind of splat: give {KINDS}")
+    try:
+        splats = reader(path)
+    except ImportError as error:
+        raise UserError(f"{path.suffix} files need gsply: pip install 'lang3dxl-ns[share]'") from error
+    except _OtherKindError as error:
+        raise UserError(f"{path} is not a splat: {error}") from error
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    except _DAMAGE as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UserError(f"{path} is damaged or incomplete ({reason}): copy or export it again") from error
+    return _finite(splats, path)
+
+
+class _OtherKindError(Exception):
+    """The file is sound, but holds no Gaussians."""
+
+
+def _number(file: Path) -> int:
+    return max((int(digits) for digits in re.findall(r"\d+", str(Path(*file.parts[-2:])))), default=0)
+
+
+def _finite(splats: Splats, path: Path) -> Splats:
+    """The same Gaussians, those with NaN or infinite values made invisible."""
+    if not len(splats):
+        raise UserError(f"{path} holds no Gaussian: export it again")
+    sound = splats.sound() & (splats.means.abs() < 1e9).all(1) & (splats.scales >= 0).all(1)
+    if sound.all():
+        return splats
+    share = 1 - float(sound.float().mean())
+    if share > _MOST_DAMAGE:
+        raise UserError(f"{path}: {share:.0%} of its Gaussians have NaN or infinite values; export it again")
+    place = splats.means[sound].median(0).values
+    keep = sound[:, None]
+    return replace(
+        splats,
+        means=torch.where(keep, splats.means, place),
+        quats=torch.where(keep, splats.quats, 0.0),
+        scales=torch.where(keep, splats.scales, 1e-9),
+        opacities=torch.where(sound, splats.opacities, 0.0),
+        harmonics=torch.where(keep[..., None], splats.harmonics, 0.0),
+    )
+
+
+def _check_memory(count: int, bands: int) -> None:
+    """Raises UserError if Gaussians don't fit into memory, read and activated."""
+    needed, there = 3 * 4 * count * (11 + 3 * bands), machine_memory()
+    if needed > there:
+        raise UserError(
+            f"{count:,} Gaussians need {needed / 1e9:.0f} GB of memory, and this machine has "
+            f"{there / 1e9:.0f}: prune the splat (SuperSplat does), or use a larger machine"
+        )
+
+
+def _activated(
+    means: Any, log_scales: Any, quats: Any, logits: Any, harmonics: Any, antialiased: bool = False
+) -> Splats:
+    """Splats from what files store: logarithms of scales, logits of opacities, harmonics [n, k, 3]."""
+    means, log_scales, quats, logits, harmonics = map(_tensor, (means, log_scales, quats, logits, harmonics))
+    bands = harmonics.shape[1]
+    if isqrt(bands) ** 2 != bands:
+        raise ValueError(f"it has {bands} harmonics per color")
+    return Splats(
+        means,
+        quats,
+        log_scales.exp(),
+        logits.reshape(-1).sigmoid(),
+        harmonics[:, :_ALL_BANDS].contiguous(),
+        antialiased,
+    )
+
+
+def _tensor(values: Any) -> Float[Tensor, "n ..."]:
+    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
+    return tensor.detach().float()
+
+
+# ── PLY ─────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+_PLY_TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+
+
+@dataclass(frozen=True)
+class _Element:
+    """A table of a PLY."""
+
+    count: int
+    columns: dict[str, str]
+    """NumPy's types without byte order."""
+
+    @property
+    def bands(self) -> int:
+        """Harmonics per color."""
+        return 1 + sum(name.startswith("f_rest_") for name in self.columns) // 3
+
+
+def _ply(path: Path) -> Splats:
+    with path.open("rb") as file:
+        form, elements = _ply_header(file)
+        if "chunk" in elements and "packed_position" in elements.get("vertex", _Element(0, {})).columns:
+            return _supersplat(path, elements)
+        vertex = elements.get("vertex")
+        missing = [name for name in _NEEDED if vertex is None or name not in vertex.columns]
+        if vertex is None or missing:
+            raise _OtherKindError(
+                f"its points have no {', '.join(missing[:3])}; a point cloud can't be attached to"
+            )
+        if next(iter(elements)) != "vertex":
+            raise ValueError("its points don't come first")
+        _check_memory(vertex.count, vertex.bands)
+        return _of_table(_ply_table(file, path, form, vertex))
+
+
+_NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
+
+
+def _ply_header(file: BinaryIO) -> tuple[str, dict[str, _Element]]:
+    """The format and the tables of a PLY; the file is left at the first of them."""
+    head = file.read(_HEADER)
+    if not head.startswith(b"ply"):
+        raise ValueError("it doesn't begin like a PLY")
+    end = re.search(rb"end_header\r?\n", head)
+    if end is None:
+        raise ValueError("its header doesn't end")
+    form, elements, columns = "", dict[str, _Element](), dict[str, str]()
+    for line in head[: end.start()].decode("latin-1").splitlines():
+        match line.split():
+            case ["format", name, *_]:
+                form = name
+            case ["element", name, count]:
+                columns = {}
+                elements[name] = _Element(int(count), columns)
+            case ["property", kind, name]:
+                columns[name] = _PLY_TYPES[kind]
+            case ["property", "list", *_]:
+                columns["list"] = "V0"  # follows the vertices in meshes; never read
+    if any(element.count < 0 for element in elements.values()):
+        raise ValueError("a table has a negative length")
+    file.seek(end.end())
+    return form, elements
+
+
+def _ply_table(file: BinaryIO, path: Path, form: str, element: _Element) -> Mapping[str, Shaped[Array, " n"]]:
+    if form == "ascii":
+        text = np.fromstring(file.read().decode("latin-1"), sep=" ", dtype=np.float32)
+        rows = text[: element.count * len(element.columns)].reshape(element.count, len(element.columns))
+        return {name: rows[:, i] for i, name in enumerate(element.columns)}
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[form]
+    kind = np.dtype([(name, order + column) for name, column in element.columns.items()])
+    if element.count * kind.itemsize > path.stat().st_size - file.tell():
+        raise ValueError(f"it announces {element.count:,} Gaussians and holds fewer")
+    table = np.fromfile(file, kind, element.count)
+    return {name: table[name] for name in element.columns}
+
+
+def _of_table(table: Mapping[str, Shaped[Array, " n"]]) -> Splats:
+    """Splats from the columns that 3D Gaussian splatting writes."""
+    rest = sorted((name for name in table if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
+    constant = [table[f"f_dc_{i}"] for i in range(3)] if "f_dc_0" in table else None
+    if constant is None:
+        colors = torch.stack(
+            [_tensor(table[name].astype(np.float32)) for name in ("red", "green", "blue")], 1
+        )
+        first = harmonics_of(colors / 255)
+    else:
+        first = _columns(constant)[:, None]
+    # Channel by channel.
+    others = _columns([table[name] for name in rest]).reshape(len(first), 3, -1).mT if rest else first[:, :0]
+    scales = [table[f"scale_{i}"] for i in range(2)]
+    # A flat Gaussian (2D Gaussian splatting) has two scales.
+    scales.append(table["scale_2"] if "scale_2" in table else np.minimum(*scales) - 5)
+    return _activated(
+        _columns([table[name] for name in "xyz"]),
+        _columns(scales),
+        _columns([table[f"rot_{i}"] for i in range(4)]),
+        _tensor(table["opacity"].astype(np.float32)),
+        torch.cat([first, others], dim=1),
+    )
+
+
+def _columns(columns: list[Shaped[Array, " n"]]) -> Float[Tensor, "n k"]:
+    return torch.from_numpy(np.stack([column.astype(np.float32) for column in columns], axis=1))
+
+
+def _supersplat(path: Path, elements: dict[str, _Element]) -> Splats:
+    """SuperSplat's compressed PLY, in chunks of 256 Gaussians."""
+    import gsply
+
+    vertex, chunks = elements["vertex"], elements["chunk"].count
+    if chunks != -(-vertex.count // 256):
+        raise ValueError(f"{vertex.count:,} Gaussians don't lie in {chunks:,} chunks")
+    _check_memory(vertex.count, _ALL_BANDS)
+    kinds = {name: np.dtype([(c, t) for c, t in e.columns.items()]) for name, e in elements.items()}
+    if sum(e.count * kinds[name].itemsize for name, e in elements.items()) > path.stat().st_size:
+        raise ValueError(f"it announces {vertex.count:,} Gaussians and holds fewer")
+    if elements.get("sh", _Element(vertex.count, {})).count != vertex.count:
+        raise ValueError("its harmonics are of other Gaussians")
+    return _of_gsply(gsply.plyread(path))
+
+
+def _of_gsply(data: Any) -> Splats:
+    first = np.asarray(data.sh0).reshape(len(data.means), 1, 3)
+    rest = np.zeros((len(first), 0, 3), np.float32) if data.shN is None else np.asarray(data.shN)
+    bands = np.concatenate([first, rest.reshape(len(first), -1, 3)], axis=1)
+    return _activated(data.means, data.scales, data.quats, data.opacities, bands)
+
+
+# ── other files ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def _spz(path: Path) -> Splats:
+    """Niantic's compressed format."""
+    import gsply
+
+    with path.open("rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    if packed:  # a small file may unpack to any size
+        with gzip.open(path) as stream:
+            _, _, count, degree, *_ = struct.unpack("<IIIBBBB", stream.read(16))
+            _check_memory(count, _ALL_BANDS)
+            most = 20 * count + 3 * 15 * count + (1 << 20)
+            if degree > 3 or len(stream.read(most)) == most:
+                raise ValueError("it unpacks to more than its header announces")
+    return _of_gsply(gsply.read_spz(path))
+
+
+_SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
+
+
+def _splat(path: Path) -> Splats:
+    """The format of the first viewers for the web: 32 bytes each, one color."""
+    size = path.stat().st_size
+    if size % _SPLAT.itemsize:
+        raise ValueError(f"{size} bytes are not whole Gaussians of {_SPLAT.itemsize} bytes")
+    _check_memory(size // _SPLAT.itemsize, 1)
+    table = np.fromfile(path, _SPLAT)
+    colors = torch.from_numpy(table["color"].astype(np.float32) / 255)
+    quats: Float32[Array, "n 4"] = (table["quat"].astype(np.float32) - 128) / 128
+    means, scales = _tensor(table["mean"]), _tensor(table["scale"])
+    return Splats(means, _tensor(quats), scales, colors[:, 3], harmonics_of(colors[:, :3]))
+
+
+def _checkpoint(path: Path) -> Splats:
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except pickle.UnpicklingError as error:
+        raise ValueError("it holds more than tensors, or is no checkpoint; nothing in it was run") from error
+    if isinstance(state, dict) and isinstance(state.get("pipeline"), dict):
+        return _splatfacto(state["pipeline"], path)
+    if isinstance(state, dict) and isinstance(state.get("splats"), dict):
+        return _gsplat(state["splats"])
+    raise _OtherKindError("it is a checkpoint of another program than gsplat and nerfstudio")
+
+
+def _gsplat(parts: Mapping[str, Any]) -> Splats:
+    """What gsplat's example trainers save."""
+    _check_parts(parts, ("means", "scales", "quats", "opacities"))
+    if "sh0" not in parts:
+        raise UserError(
+            "this gsplat checkpoint has colors that a network makes (app_opt): train it without, or export "
+            "a PLY"
+        )
+    harmonics = torch.cat([parts["sh0"], parts["shN"]], dim=1)
+    return _activated(parts["means"], parts["scales"], parts["quats"], parts["opacities"], harmonics)
+
+
+def _splatfacto(pipeline: Mapping[str, Any], path: Path) -> Splats:
+    """nerfstudio's splatfacto, of any version."""
+    own = {name.rpartition(".")[2]: value for name, value in pipeline.items() if _is_gaussian(name)}
+    _check_parts(own, ("means", "scales", "quats", "opacities", "features_dc", "features_rest"))
+    first, rest = own["features_dc"].float().reshape(-1, 1, 3), own["features_rest"].float()
+    if not rest.shape[1]:  # colors themselves, as logits
+        first = harmonics_of(first[:, 0].sigmoid())
+    config = path.parent.parent / "config.yml"
+    antialiased = config.is_file() and "rasterize_mode: antialiased" in config.read_text(errors="replace")
+    harmonics = torch.cat([first, rest.reshape(len(first), -1, 3)], dim=1)
+    return _activated(own["means"], own["scales"], own["quats"], own["opacities"], harmonics, antialiased)
+
+
+def _is_gaussian(name: str) -> bool:
+    return name.startswith("_model.gauss_params.") or (name.startswith("_model.") and name.count(".") == 1)
+
+
+def _check_parts(parts: Mapping[str, Any], names: tuple[str, ...]) -> None:
+    missing = [name for name in names if not isinstance(parts.get(name), Tensor)]
+    if missing:
+        raise _OtherKindError(f"it has no {', '.join(missing)}")
+    count = len(parts["means"])
+    for name, value in parts.items():
+        if name in names and len(value) != count:
+            raise ValueError(f"{name} are {len(value):,}, and means {count:,}")
+        if isinstance(value, Tensor) and value.nbytes > value.untyped_storage().nbytes():
+            raise ValueError(f"{name} is larger than what is stored of it")
+    _check_memory(count, _ALL_BANDS)
+
+
+_READERS: dict[str, Callable[[Path], Splats]] = {
+    **{".ply": _ply, ".spz": _spz, ".splat": _splat},
+    **{".pt": _checkpoint, ".pth": _checkpoint, ".ckpt": _checkpoint},
+}

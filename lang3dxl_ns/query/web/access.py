@@ -1,0 +1,117 @@
+"""Who may use a viewer's server: checks of Host and Origin, and a token where other machines can reach it."""
+
+from __future__ import annotations
+
+import ipaddress
+import secrets
+from dataclasses import dataclass, field
+from functools import partial
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from typing import Any, Protocol
+from urllib.parse import parse_qs, urlsplit
+
+LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
+EVERYWHERE = ("", "0.0.0.0", "::")
+"""Addresses of servers that are reachable under all names of this machine."""
+_TOKEN = "token"
+Response = tuple[HTTPStatus, dict[str, str], bytes]
+
+
+class Headers(Protocol):
+    """Headers of a request: `http.server`'s or websockets'."""
+
+    def get_all(self, name: str, /) -> Any:
+        """All values of this name; none or None if there is none."""
+
+
+def is_local(host: str) -> bool:
+    """Whether a server at this address can be reached from this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+@dataclass
+class Access:
+    """Access rules of one server.
+
+    One that only this machine can reach answers requests by its own names (against DNS rebinding) from its
+    own pages. One that others can reach answers those who opened the address with the token, which becomes a
+    cookie.
+    """
+
+    host: str
+    port: int
+    token: str = field(default_factory=partial(secrets.token_urlsafe, 16))
+    public: bool = False
+    """Whether a tunnel makes a local server public."""
+
+    @property
+    def needs_token(self) -> bool:
+        """Whether other machines can reach the server."""
+        return self.public or not is_local(self.host)
+
+    @property
+    def address(self) -> str:
+        """URL to open in a browser on this machine."""
+        host = "localhost" if self.host in EVERYWHERE else self.host
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.port}/" + (f"?{_TOKEN}={self.token}" if self.needs_token else "")
+
+    def refusal(self, path: str, headers: Headers) -> Response | None:
+        """The response to a refused request; None for one that may proceed."""
+        try:
+            host, origin = _only(headers, "Host") or "", _only(headers, "Origin")
+            if not self._is_ours(host) or (origin is not None and not self._same_site(origin, host)):
+                return _refused(f"This page is not served to {origin or host}.")
+            if not self.needs_token or self._knows_token(headers):
+                return None
+            if not self._is_token(parse_qs(urlsplit(path).query).get(_TOKEN, [""])[0]):
+                return _refused("Open the address with its token, which the terminal shows.")
+        except ValueError as error:
+            return HTTPStatus.BAD_REQUEST, {"Content-Type": "text/plain"}, f"{error}\n".encode()
+        # Remove the token from the address, which the page could pass on.
+        cookie = f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+        return HTTPStatus.SEE_OTHER, {"Set-Cookie": cookie, "Location": "/"}, b""
+
+    @property
+    def _cookie(self) -> str:
+        return f"viewer-{self.port}"
+
+    def _is_ours(self, host: str) -> bool:
+        """Whether the host name is ours; with a token, the token protects."""
+        return self.needs_token or urlsplit(f"//{host}").hostname in (*LOCAL_NAMES, self.host)
+
+    def _same_site(self, origin: str, host: str) -> bool:
+        site = urlsplit(origin)
+        own = site.scheme in ("http", "https") and site.netloc.lower() == host.lower()
+        return own or (self.public and (site.hostname or "").endswith(".viser.studio"))
+
+    def _knows_token(self, headers: Headers) -> bool:
+        for line in headers.get_all("Cookie") or []:
+            try:
+                cookie = SimpleCookie(line).get(self._cookie)
+            except CookieError:
+                continue
+            if cookie is not None and self._is_token(cookie.value):
+                return True
+        return False
+
+    def _is_token(self, offered: str) -> bool:
+        return secrets.compare_digest(offered.encode("utf-8", "replace"), self.token.encode())
+
+
+def _only(headers: Headers, name: str) -> str | None:
+    """A header's value. Raises ValueError if it is given twice."""
+    values = headers.get_all(name) or []
+    if len(values) > 1:
+        raise ValueError(f"{name} is given twice")
+    return values[0] if values else None
+
+
+def _refused(why: str) -> Response:
+    return HTTPStatus.FORBIDDEN, {"Content-Type": "text/plain"}, f"{why}\n".encode("utf-8", "replace")

@@ -1,0 +1,48 @@
+// Pieces of the panel: messages, and a card per prompt with its color, heat, threshold and doubt.
+
+export const percent = (share) => (share > 0 && share < 0.01 ? "under 1 %" : `${Math.round(100 * share)} %`);
+export const shown = (text, most = 60) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);
+
+/** An element with these properties and children; texts stay texts. */
+export function element(tag, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}
+
+export function say(message) {
+  document.getElementById("status").textContent = message;
+}
+
+export const explain = ({ count, known, live }) =>
+  `${count.toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`);
+
+function doubtIn({ examples, open, doubt, doubtful }) {
+  const count = examples && `${examples.length} example${examples.length > 1 ? "s" : ""}`;
+  if (examples) return open ? `${count}: click for more, with Alt for what it is not.` : `${count}.`;
+  if (doubt === 1) return "Doubtful: it fits no place. It may not be here, or this scene's CLIP may not know the word.";
+  if (doubtful) return `Doubtful: ${percent(doubt)} of unrelated words fit this scene as well. It may not be here, or this scene's CLIP may not know the word.`;
+  return `Fits better than ${percent(1 - doubt)} of unrelated words.`;
+}
+
+/** acts: { fly, remove, rename, setThreshold, teach }, each called with the prompt. */
+export function promptCard(prompt, { fly, remove, rename, setThreshold, teach }) {
+  const { text, negatives, color, threshold, peak, matching, views, examples, open } = prompt;
+  const card = element("li");
+  card.style.setProperty("--color", `rgb(${color})`);
+  const name = shown(text) + (negatives.length ? ` not ${negatives.map((one) => shown(one)).join(", ")}` : "");
+  const go = element("button", { className: "small fly", disabled: !views?.length, onclick: () => fly(prompt) }, "Fly to");
+  const away = element("button", { className: "small", ariaLabel: `Remove ${shown(text)}`, onclick: () => remove(prompt) }, "×");
+  const heading = examples ? element("input", { value: text, ariaLabel: "Name", maxLength: 60 }) : element("strong", {}, name);
+  heading.addEventListener("change", () => rename(prompt, heading.value));
+  const more = element("button", { className: "small", ariaPressed: Boolean(open), onclick: () => teach(prompt) }, open ? "Done" : "Add");
+  card.append(element("header", {}, heading, ...(examples ? [more] : []), go, away));
+  if (threshold == null) return card;
+  const slider = element("input", { type: "range", min: 0, max: 1, step: 0.01, value: threshold, ariaLabel: `Threshold of ${shown(text)}` });
+  slider.addEventListener("change", () => setThreshold(prompt, Number(slider.value)));
+  const ends = [threshold, Math.max(peak, threshold)].map((value) => element("span", {}, value.toFixed(2)));
+  card.append(element("div", { className: "ends" }, ends[0], element("div", { className: "heat" }), ends[1]),
+    element("p", {}, `${doubtIn(prompt)} ${matching.toLocaleString("en")} Gaussians match.`),
+    element("label", {}, "Threshold", slider)); // prettier-ignore
+  return card;
+}

@@ -1,0 +1,116 @@
+// Where a match is: the views that show it best, and a box around its strongest part, as in Python's query/.
+
+const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, OUTLIERS = 0.02, CORE = 0.002;
+
+/** Views with the Gaussians that they show, and the pixels that each fills. */
+export function readViews(about, buffer) {
+  const { count, pixels: [least, steps] } = about.words, bits = Math.ceil(count / 8);
+  let start = 0;
+  return about.views.map((view) => {
+    const seen = new Uint8Array(buffer, start, bits), codes = new Uint8Array(buffer, start + bits, view.bytes - bits);
+    start += view.bytes;
+    const rows = new Uint32Array(codes.length), shares = new Float32Array(codes.length);
+    for (let i = 0, k = 0; i < count; i++) if ((seen[i >> 3] >> (i & 7)) & 1) rows[k++] = i;
+    for (let k = 0; k < codes.length; k++) shares[k] = (least * 2 ** (codes[k] / steps)) / (view.width * view.height);
+    return { ...view, rows, shares };
+  });
+}
+
+/** Views by how well they show a match; see rank_views.py. */
+export function rankViews(views, centers, relevancy, threshold) {
+  const peaks = views.map((view) => peakOf(view, relevancy)), top = Math.max(...peaks);
+  const low = top > threshold ? threshold : relevancy.slice().sort()[(relevancy.length - 1) >> 1];
+  const level = low + STRONG * (top - low);
+  const ranked = views.map((view, v) => {
+    const { rows, shares } = view;
+    let area = 0, strong = 0, excess = 0, centered = 0;
+    for (let k = 0; k < rows.length; k++) {
+      const value = relevancy[rows[k]];
+      if (value > threshold) area += shares[k];
+      if (value <= level) continue;
+      strong += shares[k];
+      excess += (value - low) * shares[k];
+      centered += (value - low) * shares[k] * centeredness(view, centers, rows[k]);
+    }
+    const closeness = Math.max(0, Math.min((peaks[v] - low) / Math.max(top - low, 1e-9), 1));
+    const rank = (closeness * Math.sqrt(Math.min(strong / LARGE, 1)) * centered) / Math.max(excess, 1e-12);
+    return { name: view.name, index: v, area, rank, shown: area * view.width * view.height >= 1 };
+  });
+  return ranked.sort((a, b) => b.shown - a.shown || b.rank - a.rank);
+}
+
+function peakOf({ rows, shares }, relevancy) {
+  const order = rows.map((_, k) => k).sort((a, b) => relevancy[rows[b]] - relevancy[rows[a]]);
+  let before = 0, sum = 0;
+  for (const k of order) {
+    if (before >= PEAK) break;
+    sum += Math.min(PEAK - before, shares[k]) * relevancy[rows[k]];
+    before += shares[k];
+  }
+  return sum / PEAK;
+}
+
+function centeredness({ pose, fx, fy, cx, cy, width, height }, centers, row) {
+  const offset = [0, 1, 2].map((axis) => centers[3 * row + axis] - pose[axis][3]);
+  const [x, y, z] = [0, 1, 2].map((k) => offset.reduce((sum, value, axis) => sum + value * pose[axis][k], 0));
+  const u = (cx - (fx * x) / z) / width, v = (cy + (fy * y) / z) / height;
+  const off = Math.max(Math.abs(2 * u - 1), Math.abs(2 * v - 1));
+  return 1 - (1 - RIM) * Math.max(0, Math.min((off - 0.5) / 0.5, 1));
+}
+
+/** Pixels that every Gaussian fills, over all views. */
+export function massOf(views, count) {
+  const mass = new Float32Array(count);
+  for (const { rows, shares, width, height } of views) rows.forEach((row, k) => (mass[row] += shares[k] * width * height));
+  return mass;
+}
+
+/** A box around the strongest connected match: { low, high }; null if nothing matches. */
+export function boxAround(centers, relevancy, mass, threshold, gap) {
+  const matching = [];
+  for (let i = 0; i < relevancy.length; i++) if (relevancy[i] > threshold && mass[i] > 0) matching.push(i);
+  if (!matching.length) return null;
+  matching.sort((a, b) => relevancy[b] - relevancy[a]);
+  const total = matching.reduce((sum, i) => sum + mass[i], 0);
+  let before = 0;
+  const high = relevancy[matching.find((i) => (before += mass[i]) >= OUTLIERS * total) ?? matching.at(-1)];
+  const strong = matching.filter((i) => relevancy[i] >= threshold + STRONG * (high - threshold));
+  const group = heaviestGroup(strong, centers, (i) => (relevancy[i] - threshold) * mass[i], gap);
+  const ends = [0, 1, 2].map((axis) => {
+    const sorted = Float32Array.from(group, (i) => centers[3 * i + axis]).sort(), last = sorted.length - 1;
+    return [sorted[Math.round(OUTLIERS * last)], sorted[Math.round((1 - OUTLIERS) * last)]];
+  });
+  return { low: ends.map(([low]) => low), high: ends.map(([, high]) => high) };
+}
+
+/** Of Gaussians in touching cells of this size, the group that weighs most; cells that weigh nearly nothing
+ * part groups. */
+function heaviestGroup(rows, centers, weightOf, size) {
+  const cells = new Map();
+  for (const i of rows) {
+    const place = [0, 1, 2].map((axis) => Math.floor(centers[3 * i + axis] / size)), key = place.join();
+    if (!cells.has(key)) cells.set(key, { place, rows: [], weight: 0 });
+    const cell = cells.get(key);
+    cell.rows.push(i);
+    cell.weight += weightOf(i);
+  }
+  const total = [...cells.values()].reduce((sum, cell) => sum + cell.weight, 0);
+  for (const [key, cell] of cells) if (cells.size > 1 && cell.weight < CORE * total) cells.delete(key);
+  let best = { weight: -1, rows };
+  while (cells.size) {
+    const group = { weight: 0, rows: [] }, [first] = cells.values(), waiting = [first];
+    cells.delete(first.place.join());
+    while (waiting.length) {
+      const { place, rows, weight } = waiting.pop();
+      group.rows.push(...rows);
+      group.weight += weight;
+      for (let k = 0; k < 27; k++) {
+        const key = [place[0] + (k % 3) - 1, place[1] + (Math.floor(k / 3) % 3) - 1, place[2] + Math.floor(k / 9) - 1].join();
+        if (cells.has(key)) waiting.push(cells.get(key));
+        cells.delete(key);
+      }
+    }
+    if (group.weight > best.weight) best = group;
+  }
+  return best.rows;
+}

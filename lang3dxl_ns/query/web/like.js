@@ -1,0 +1,72 @@
+// "Like this": a place shown by example, told apart from the rest of the scene.
+
+const RIDGE = 0.01, STEPS = 8, OTHERS = 2000; // penalty, Newton steps, Gaussians that stand for the scene
+
+/** Probability of every Gaussian to be like the examples: [{ rows, without }], Gaussians that were clicked.
+ *
+ * A weighted logistic regression on the decoder's rows, standardized over the scene. Examples weigh as much
+ * together as what they are told apart from: the scene, and Gaussians clicked `without`. */
+export function likeness(rows, examples) {
+  const { width, count } = rows, known = [];
+  for (let i = 0, step = Math.max(Math.floor(count / OTHERS), 1); i < count; i += step) if (rows.scales[i]) known.push(i);
+  const wanted = examples.filter((one) => !one.without), unwanted = examples.filter((one) => one.without);
+  const sides = [wanted, unwanted].map((ones) => ones.flatMap((one) => one.rows).filter((i) => rows.scales[i]));
+  const share = unwanted.length ? 0.5 : 1;
+  const samples = [
+    ...sides[0].map((i) => ({ row: rows.row(i), is: 1, weight: 1 / sides[0].length })),
+    ...sides[1].map((i) => ({ row: rows.row(i), is: 0, weight: (1 - share) / sides[1].length })),
+    ...known.map((i) => ({ row: rows.row(i), is: 0, weight: share / known.length })),
+  ];
+  const others = samples.slice(-known.length).map(({ row }) => row);
+  const mean = new Float64Array(width), spread = new Float64Array(width);
+  for (const row of others) row.forEach((x, j) => (mean[j] += x / others.length));
+  for (const row of others) row.forEach((x, j) => (spread[j] += (x - mean[j]) ** 2 / others.length));
+  const least = 1e-3 * Math.sqrt(Math.max(...spread)); // below it there are rounding errors only
+  const scale = spread.map((variance) => 1 / Math.max(Math.sqrt(variance), least, 1e-9));
+  for (const sample of samples) sample.at = [...Array.from(sample.row, (x, j) => (x - mean[j]) * scale[j]), 1];
+  const weights = fitted(samples, width + 1), direction = scale.map((s, j) => s * weights[j]);
+  const start = weights[width] - mean.reduce((sum, x, j) => sum + x * direction[j], 0);
+  return rows.times(direction).map((x, i) => (rows.scales[i] ? 1 / (1 + Math.exp(-x - start)) : 0));
+}
+
+/** Weights of the logistic regression, by Newton's method; the last one, the constant, is not penalized. */
+function fitted(samples, size) {
+  const weights = new Float64Array(size);
+  for (let step = 0; step < STEPS; step++) {
+    const slope = new Float64Array(size), bend = Array.from({ length: size }, () => new Float64Array(size));
+    for (const { at, is, weight } of samples) {
+      const p = 1 / (1 + Math.exp(-at.reduce((sum, x, j) => sum + x * weights[j], 0)));
+      const curve = weight * Math.max(p * (1 - p), 1e-6);
+      for (let j = 0; j < size; j++) {
+        slope[j] += weight * (is - p) * at[j];
+        for (let k = 0, factor = curve * at[j]; k <= j; k++) bend[j][k] += factor * at[k];
+      }
+    }
+    for (let j = 0; j < size; j++) {
+      const penalty = j < size - 1 ? RIDGE : 1e-6;
+      slope[j] -= penalty * weights[j];
+      bend[j][j] += penalty;
+    }
+    solved(bend, slope).forEach((change, j) => (weights[j] += change));
+  }
+  return weights;
+}
+
+/** Solution of a symmetric positive system, given its lower half, by Cholesky's factors (overwritten). */
+function solved(matrix, right) {
+  const size = right.length, found = Float64Array.from(right);
+  for (let j = 0; j < size; j++) {
+    for (let k = 0; k <= j; k++) {
+      let sum = matrix[j][k];
+      for (let m = 0; m < k; m++) sum -= matrix[j][m] * matrix[k][m];
+      matrix[j][k] = j === k ? Math.sqrt(Math.max(sum, 1e-12)) : sum / matrix[k][k];
+    }
+    for (let k = 0; k < j; k++) found[j] -= matrix[j][k] * found[k];
+    found[j] /= matrix[j][j];
+  }
+  for (let j = size - 1; j >= 0; j--) {
+    for (let k = j + 1; k < size; k++) found[j] -= matrix[k][j] * found[k];
+    found[j] /= matrix[j][j];
+  }
+  return found;
+}

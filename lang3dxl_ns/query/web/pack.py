@@ -1,0 +1,203 @@
+"""Compact binary forms of a scene's parts for the page: splats, codes, the field, words and views.
+
+Numbers are little-endian. docs/share.md lists the files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Shaped, UInt8
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.hash_grid import HASH_PRIMES
+from lang3dxl_ns.components.semantic_field import SemanticField
+from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.visibility import VisibleGaussians
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera
+
+_LOG_SCALES = (-12.0, 9.0)
+"""Range of the logarithms of standard deviations, as the page's renderer packs them."""
+_MOST_PRODUCTS = 30_000
+"""Multiplications per Gaussian up to which the page decodes codes itself; otherwise it gets decoded rows."""
+_MOST_ROW_BYTES = 200_000_000
+LEAST_PIXELS, PIXEL_STEPS = 0.05, 12
+"""Pixels of a view that code 0 stands for, and codes per doubling: 12.75 would reach 50,000 pixels."""
+
+
+# ── splats ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def pack_splats(
+    splats: Splats, center: Float[Tensor, "3"], toward: Float[Tensor, "3"]
+) -> UInt8[Array, "n 16"]:
+    """16 bytes per Gaussian, in Spark's packed form.
+
+    Red, green, blue, opacity; half-precision means; two octahedral coordinates of the rotation's axis; three
+    logarithmic scales; the rotation's angle. Gaussians with a NaN or infinite value become invisible, so that
+    row numbers stay those of the scene.
+
+    Args:
+        splats: the Gaussians.
+        center: origin of the packed means, world units: half precision is finest close to it.
+        toward: viewing position that colors are taken for, world units.
+    """
+    sound = splats.sound()[:, None]
+    means = torch.where(sound, splats.means - center, 0.0).cpu().numpy().astype("<f2")
+    axes, angle = _octahedral(torch.where(sound, splats.quats, 0.0).cpu().double())
+    lowest, highest = _LOG_SCALES
+    logs = torch.where(sound, splats.scales, 1.0).clamp_min(1e-30).log()
+    scales = ((logs - lowest) * 254 / (highest - lowest)).round().clamp(0, 254) + 1
+    packed = np.empty((len(splats), 16), np.uint8)
+    packed[:, :4] = pack_colors(splats, toward)
+    packed[:, 4:10] = means.view(np.uint8).reshape(len(splats), 6)
+    packed[:, 10:12] = axes
+    packed[:, 12:15] = scales.cpu().numpy()
+    packed[:, 15] = angle
+    return packed
+
+
+def pack_colors(splats: Splats, toward: Float[Tensor, "3"]) -> UInt8[Array, "n 4"]:
+    """Red, green, blue and opacity as bytes; see `pack_splats`."""
+    values = torch.cat([splats.colors(toward), splats.opacities[:, None]], dim=1)
+    values = torch.where(splats.sound()[:, None], values, 0.0).clamp(0, 1)
+    return (values * 255).round().byte().cpu().numpy()
+
+
+def _octahedral(quats: Float[Tensor, "n 4"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
+    """Axes as octahedral coordinates, and angles (0 to π), of rotations; both as 0…255."""
+    quats = torch.where(quats.norm(dim=1, keepdim=True) > 0, quats, quats.new_tensor([1.0, 0, 0, 0]))
+    quats = F.normalize(quats, dim=1)
+    quats = torch.where(quats[:, :1] < 0, -quats, quats)
+    length = quats[:, 1:].norm(dim=1, keepdim=True)
+    axis = torch.where(length > 1e-9, quats[:, 1:] / length.clamp_min(1e-9), quats.new_tensor([1.0, 0, 0]))
+    flat = axis[:, :2] / axis.abs().sum(1, keepdim=True)
+    folded = (1 - flat.abs().flip(1)) * torch.where(flat >= 0, 1.0, -1.0)
+    flat = torch.where(axis[:, 2:] < 0, folded, flat)
+    angle = 2 * torch.atan2(length[:, 0], quats[:, 0])
+    return (255 * (flat + 1) / 2).round().numpy(), (255 * angle / torch.pi).round().numpy()
+
+
+# ── meaning ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True)
+class PackedMeaning:
+    """What the page decodes every Gaussian's row ((h, 1) / |d|) from, and how texts are turned to match."""
+
+    description: dict[str, Any]
+    """Sizes and settings, for the page's decode.js."""
+    files: dict[str, bytes]
+    head: Float[Tensor, "r c"] | None
+    """Turns a row into a unit feature; None if rows are unit features already."""
+
+    def of_texts(self, vectors: Float[Tensor, "v c"]) -> Float[Tensor, "v r"]:
+        """The r numbers whose product with a row is the cosine."""
+        return vectors if self.head is None else vectors @ self.head.T
+
+
+def pack_meaning(decoder: SemanticEncoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
+    """Codes and a small field or, for wide decoders, decoded rows.
+
+    Raises:
+        UserError: the rows of a wide decoder are too large for a page.
+    """
+    decoded = GaussianFeatures.of(decoder, codes)
+    rows = decoded.rows.cpu()
+    width = rows.shape[1]
+    gram = None if decoded.head is None else (decoded.head @ decoded.head.T).flatten().tolist()
+    description = {"count": len(rows), "width": width, "gram": gram}
+    if decoded.head is not None and isinstance(decoder, SemanticField) and _is_small(decoder):
+        settings, files = _packed_field(decoder)
+        places = 1 + (torch.nan_to_num(codes).double().sigmoid() * 65534).round()
+        files["codes.bin"] = places.cpu().numpy().astype("<u2").tobytes() + _half(rows[:, -1])
+        return PackedMeaning(description | {"field": settings}, files, decoded.head)
+    if rows.numel() * 2 > _MOST_ROW_BYTES:
+        raise UserError(
+            f"this scene's decoder has {width} numbers per Gaussian, {rows.numel() * 2 / 1e6:.0f} MB for a "
+            "page: train it with the field preset `short`, which a page decodes itself"
+        )
+    return PackedMeaning(description | {"field": None}, {"rows.bin": _half(rows)}, decoded.head)
+
+
+def _is_small(field: SemanticField) -> bool:
+    """Whether the page can decode this field: bounded codes, one pass through the grid, small layers."""
+    settings = field.settings
+    products = sum(layer.weight.numel() for layer in _linear_layers(field))
+    return settings.bounding == "sigmoid" and not settings.indexed and products <= _MOST_PRODUCTS
+
+
+def _linear_layers(field: SemanticField) -> list[torch.nn.Linear]:
+    return [layer for layer in field.layers if isinstance(layer, torch.nn.Linear)]
+
+
+def _packed_field(field: SemanticField) -> tuple[dict[str, Any], dict[str, bytes]]:
+    grid, settings, layers = field.grid, field.settings, _linear_layers(field)
+    table = grid.table.detach()
+    if field.level_weights is not None:
+        ends = [*grid.offsets.tolist()[1:], grid.entries]
+        sizes = torch.tensor([end - start for start, end in zip(grid.offsets.tolist(), ends, strict=True)])
+        table = table * field.level_weights.cpu().repeat_interleave(sizes)[:, None].to(table)
+    described = {
+        "dimensions": settings.code_dim,
+        "frequencies": settings.fourier_frequencies,
+        "features": grid.features_per_level,
+        "entries": grid.entries,
+        "cells": grid.cells.tolist(),
+        "offsets": grid.offsets.tolist(),
+        "dense": grid.dense_levels,
+        "mask": grid.hash_mask,
+        "primes": list(HASH_PRIMES[: settings.code_dim]),
+        "layers": [[layer.in_features, layer.out_features] for layer in layers],
+        "rectify": [settings.activation == "every" or layer is layers[-1] for layer in layers],
+    }
+    weights = [np.concatenate([_array(x.weight.T).ravel(), _array(x.bias)]) for x in layers]
+    return described, {"field.bin": np.concatenate(weights).astype("<f4").tobytes() + _half(table)}
+
+
+def pack_words(numbers: Float[Tensor, "v r"]) -> bytes:
+    """Half floats of texts in a scene's own space."""
+    return _half(numbers)
+
+
+# ── views ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def pack_view(view: VisibleGaussians, count: int) -> bytes:
+    """Which Gaussians a view shows, a bit each, and the pixels that each of them fills, a byte each."""
+    pixels = view.pixels.float().cpu().numpy()
+    keep = pixels >= LEAST_PIXELS
+    seen = np.zeros(count, bool)
+    seen[view.rows.cpu().numpy()[keep]] = True
+    codes = np.rint(PIXEL_STEPS * np.log2(pixels[keep] / LEAST_PIXELS)).clip(0, 255)
+    return np.packbits(seen, bitorder="little").tobytes() + codes.astype(np.uint8).tobytes()
+
+
+def camera_json(camera: Camera) -> dict[str, Any]:
+    """A camera as the page takes it: pose (camera → world, nerfstudio's axes, by rows) and pinhole lens."""
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.double().tolist()
+    lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.width, "height": camera.height}
+    return {"pose": camera.pose.tolist(), **lens}
+
+
+def _half(values: Tensor) -> bytes:
+    return _array(values).astype("<f2").tobytes()
+
+
+def _array(values: Tensor) -> Shaped[Array, "..."]:
+    return values.detach().float().cpu().numpy()
+
+
+def spread(items: Sequence[Any], most: int) -> list[Any]:
+    """At most so many of them, evenly chosen."""
+    count = min(most, len(items))
+    return [items[i * len(items) // count] for i in range(count)]

@@ -1,0 +1,64 @@
+// The Gaussians that a pixel shows, front to back, with their weights in the picture.
+import { floats } from "./decode.js";
+
+const BLUR = 0.3; // square pixels that every splat is widened by, as in training
+
+/** Centers [3n] (relative to the scene's origin), axes [9n] scaled by the standard deviations, opacities [n]. */
+export function unpackSplats(buffer) {
+  const bytes = new Uint8Array(buffer), halves = new Uint16Array(buffer), count = bytes.length / 16;
+  const centers = new Float32Array(3 * count), axes = new Float32Array(9 * count), opacities = new Float32Array(count);
+  for (let i = 0; i < count; i++) {
+    const at = 16 * i;
+    centers.set(floats(halves.subarray(8 * i + 2, 8 * i + 5)), 3 * i);
+    opacities[i] = bytes[at + 3] / 255;
+    const [u, v] = [bytes[at + 10] / 127.5 - 1, bytes[at + 11] / 127.5 - 1], w = 1 - Math.abs(u) - Math.abs(v);
+    const fold = Math.max(-w, 0), x = u + (u >= 0 ? -fold : fold), y = v + (v >= 0 ? -fold : fold);
+    const turn = rotation([x, y, w], (bytes[at + 15] / 255) * Math.PI);
+    for (let k = 0; k < 9; k++) axes[9 * i + k] = turn[k] * Math.exp(((bytes[at + 12 + Math.floor(k / 3)] - 1) * 21) / 254 - 12);
+  }
+  return { centers, axes, opacities };
+}
+
+/** Columns, one after the other, of the rotation by an angle about an axis (Rodrigues). */
+function rotation(axis, angle) {
+  const length = Math.hypot(...axis), [x, y, z] = axis.map((value) => value / length);
+  const c = Math.cos(angle), s = Math.sin(angle), t = 1 - c;
+  return [c + t * x * x, t * x * y + s * z, t * x * z - s * y, t * x * y - s * z, c + t * y * y, t * y * z + s * x,
+    t * x * z + s * y, t * y * z - s * x, c + t * z * z]; // prettier-ignore
+}
+
+/** camera: { view: world → camera by columns, looking along −z; focal, width, height in pixels }; x, y: pixel.
+ * Returns pairs of row and weight. */
+export function gaussiansAt({ centers, axes, opacities }, { view, focal, width, height }, x, y, antialiased) {
+  const hits = [];
+  const turned = (a, b, c) => [0, 1, 2].map((k) => view[k] * a + view[4 + k] * b + view[8 + k] * c);
+  for (let i = 0; i < opacities.length; i++) {
+    const [a, b, c] = [centers[3 * i], centers[3 * i + 1], centers[3 * i + 2]];
+    const depth = -(view[2] * a + view[6] * b + view[10] * c + view[14]);
+    if (depth <= 0.01 || opacities[i] < 1 / 255) continue;
+    const right = (view[0] * a + view[4] * b + view[8] * c + view[12]) / depth;
+    const up = (view[1] * a + view[5] * b + view[9] * c + view[13]) / depth;
+    const du = x - width / 2 - focal * right, dv = y - height / 2 + focal * up;
+    let reach = 0;
+    for (let k = 0; k < 9; k++) reach = Math.max(reach, Math.abs(axes[9 * i + k]));
+    if (Math.max(Math.abs(du), Math.abs(dv)) > 2 + (8 * focal * reach) / depth) continue;
+    let uu = 0, uv = 0, vv = 0;
+    for (let k = 9 * i; k < 9 * i + 9; k += 3) {
+      const [p, q, r] = turned(axes[k], axes[k + 1], axes[k + 2]);
+      const u = (focal * (p + right * r)) / depth, v = (-focal * (q + up * r)) / depth;
+      (uu += u * u), (uv += u * v), (vv += v * v);
+    }
+    const sharp = uu * vv - uv * uv;
+    uu += BLUR;
+    vv += BLUR;
+    const area = uu * vv - uv * uv, far = (vv * du * du - 2 * uv * du * dv + uu * dv * dv) / area;
+    const alpha = opacities[i] * Math.exp(-far / 2) * (antialiased ? Math.sqrt(Math.max(sharp / area, 0)) : 1);
+    if (alpha > 1 / 255) hits.push([depth, i, Math.min(alpha, 0.999)]);
+  }
+  let clear = 1;
+  return hits.sort((a, b) => a[0] - b[0]).map(([, i, alpha]) => {
+    const weight = clear * alpha;
+    clear -= weight;
+    return [i, weight];
+  });
+}

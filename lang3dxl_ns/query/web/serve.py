@@ -1,0 +1,123 @@
+"""The server of `lang3dxl view`: the page's own files, and any text encoded by the scene's CLIP."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from socketserver import TCPServer
+from urllib.parse import parse_qs, urlsplit
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.web.access import Access
+from lang3dxl_ns.query.web.write_page import Page
+
+FIRST_PORT, PORTS = 7007, 20
+"""Ports tried where none is requested."""
+_PATIENCE = 30.0
+"""Seconds that a connection may stay silent."""
+_KINDS = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "json": "application/json",
+    "txt": "text/plain; charset=utf-8",
+}
+_HEADERS = {
+    "Cache-Control": "no-cache",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves one page from memory, until `shutdown`.
+
+    Args:
+        page: the page, with `live` set.
+        host: address to serve at.
+        port: the port; None: the first free one from 7007 on.
+
+    Raises:
+        UserError: the port is taken, or the address is not this machine's.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, page: Page, host: str = "127.0.0.1", port: int | None = None) -> None:
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self.access = Access(host, 0)
+        self.page = page
+        self.files: Mapping[str, bytes] = {}
+        self._bind_first(host, [*range(FIRST_PORT, FIRST_PORT + PORTS), 0] if port is None else [port])
+        self.access.port = self.server_port
+        self.files = page.files()
+
+    def _bind_first(self, host: str, ports: Sequence[int]) -> None:
+        for port in ports:
+            try:
+                return super().__init__((host, port), Handler)
+            except (OSError, OverflowError) as error:
+                reason = error
+        ask = f"port {ports[0]} of {host}" if len(ports) == 1 else host
+        raise UserError(f"nothing can be served at {ask} ({reason}): choose another --port or --host")
+
+    def server_bind(self) -> None:
+        """Bind without asking for this machine's name, which may take seconds."""
+        TCPServer.server_bind(self)
+        self.server_name, self.server_port = self.access.host, self.server_address[1]
+
+    def answer(self, path: str) -> tuple[HTTPStatus, str, bytes]:
+        """Status, type and content for a path of the page, or a request of it."""
+        place = urlsplit(path)
+        values = {name: found[0] for name, found in parse_qs(place.query).items()}
+        if place.path == "/api/encode":
+            content = json.dumps(self.page.answer(values.get("text", ""))).encode()
+            return HTTPStatus.OK, "application/json", content
+        if place.path == "/api/look":
+            return HTTPStatus.OK, "application/octet-stream", self.page.colors(values.get("photo", ""))
+        name = place.path.removeprefix("/") or "index.html"
+        if name not in self.files:
+            return HTTPStatus.NOT_FOUND, "text/plain", b"404\n"
+        kind = _KINDS.get(name.rpartition(".")[2], "application/octet-stream")
+        return HTTPStatus.OK, kind, self.files[name]
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One connection of a `PageServer`."""
+
+    server: PageServer
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "lang3dxl", ""
+    timeout = _PATIENCE
+
+    def do_GET(self) -> None:
+        """Answer, unless access is refused."""
+        refused = self.server.access.refusal(self.path, self.headers)
+        if refused is not None:
+            return self._send(*refused)
+        try:
+            status, kind, content = self.server.answer(self.path)
+        except (UserError, ValueError) as error:  # ValueError: an impossible address
+            status, kind, content = (
+                HTTPStatus.BAD_REQUEST,
+                _KINDS["txt"],
+                f"{error}".encode("utf-8", "replace"),
+            )
+        self._send(status, {"Content-Type": kind}, content)
+
+    def _send(self, status: HTTPStatus, headers: Mapping[str, str], content: bytes) -> None:
+        self.send_response(status)
+        for name, value in {**_HEADERS, **headers, "Content-Length": str(len(content))}.items():
+            self.send_header(name, value)
+        self.end_headers()
+        with contextlib.suppress(ConnectionError):  # the browser has gone on
+            self.wfile.write(content)
+
+    def log_message(self, *_: object) -> None:
+        """No lines for requests."""

@@ -1,0 +1,231 @@
+// The picture: splats drawn with WebGL (Spark, three.js), their colors, the camera and its flights.
+import { OrbitControls, PackedSplats, PerspectiveCamera, Scene, SparkRenderer, SplatMesh, Vector3, WebGLRenderer } from "./splats.js";
+
+const FLIGHT = 1200, WIDEST = 85, HEAT = 0.7, BLUR = 0.3; // milliseconds, degrees, opacity, square pixels
+const still = matchMedia("(prefers-reduced-motion: reduce)");
+
+export class View extends EventTarget {
+  /** about: the page's description; frame: the element to fill. Fires `moved` and `click`. */
+  constructor(about, frame) {
+    super();
+    Object.assign(this, { about, frame });
+    this.renderer = new WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    const [red, green, blue] = about.background.map((value) => Math.round(255 * value));
+    this.renderer.setClearColor(`rgb(${red}, ${green}, ${blue})`);
+    this.canvas = frame.appendChild(this.renderer.domElement);
+    const [preBlurAmount, blurAmount] = about.antialiased ? [0, BLUR] : [BLUR, 0];
+    this.scene = new Scene();
+    this.scene.add(new SparkRenderer({ renderer: this.renderer, preBlurAmount, blurAmount, onDirty: () => this.wake() }));
+    const start = this.standing(about.start), distance = start.position.distanceTo(start.target);
+    this.camera = new PerspectiveCamera(50, 1, 1e-3 * distance, 1e3 * distance);
+    this.camera.up.fromArray(about.up);
+    this.controls = new OrbitControls(this.camera, this.canvas);
+    this.controls.enableDamping = !still.matches;
+    this.controls.addEventListener("change", () => this.wake());
+    this.controls.addEventListener("start", () => (this.flight = null));
+    new ResizeObserver(() => this.resize()).observe(frame);
+    this.resize();
+    this.place(this.standing(about.start));
+    this.listen();
+  }
+
+  // ── splats ──
+
+  /** Draw packed splats, 16 bytes each. */
+  async show(buffer) {
+    const words = new Uint32Array(buffer), count = words.length / 4;
+    this.packed = new PackedSplats({ maxSplats: count });
+    await this.packed.initialized;
+    this.packed.ensureSplats(count).set(words);
+    this.packed.numSplats = count;
+    this.bytes = new Uint8Array(this.packed.packedArray.buffer, this.packed.packedArray.byteOffset);
+    this.own = this.plain = Uint8Array.from({ length: 4 * count }, (_, i) => this.bytes[16 * (i >> 2) + (i & 3)]);
+    this.splats = new SplatMesh({ packedSplats: this.packed });
+    this.splats.position.fromArray(this.about.center);
+    this.scene.add(this.splats);
+    await this.splats.initialized;
+    this.recolor();
+    requestAnimationFrame((now) => this.step(now));
+  }
+
+  /** Colors and opacities of all splats, four bytes each, before heat. */
+  light(colors) {
+    this.plain = colors;
+    this.recolor();
+  }
+
+  /** Show heat: layers of { relevancy, threshold, peak, color }, the strongest where several match. */
+  recolor(layers = this.layers ?? []) {
+    this.layers = layers;
+    if (!this.splats) return;
+    for (let i = 0; i < this.plain.length / 4; i++) {
+      let best = 0, chosen = null;
+      for (const layer of layers) {
+        if (layer.relevancy[i] > layer.threshold && layer.relevancy[i] > best) [best, chosen] = [layer.relevancy[i], layer];
+      }
+      const warmth = chosen && (best - chosen.threshold) / Math.max(chosen.peak - chosen.threshold, 1e-6);
+      const share = chosen ? HEAT * (0.5 + 0.5 * Math.min(warmth, 1)) : 0;
+      for (let k = 0; k < 3; k++) this.bytes[16 * i + k] = this.plain[4 * i + k] * (1 - share) + (chosen?.color[k] ?? 0) * share;
+      this.bytes[16 * i + 3] = this.plain[4 * i + 3];
+    }
+    this.packed.needsUpdate = true;
+    this.splats.updateVersion();
+    this.wake();
+  }
+
+  // ── camera ──
+
+  /** Where a photo was taken, so that the window shows all of it (up to a widest lens). target: what to turn
+   * around, moved onto the photo's axis; the scene's middle by default. */
+  standing({ pose, fx, fy, cx, cy, width, height }, target = this.about.center) {
+    const [position, ahead] = [3, 2].map((k) => new Vector3(...pose.slice(0, 3).map((row) => (k === 3 ? row[3] : -row[2]))));
+    const distance = Math.max(new Vector3(...target).sub(position).dot(ahead), 0.05);
+    const high = Math.max(cy, height - cy) / fy, wide = Math.max(cx, width - cx) / fx;
+    const fov = (360 / Math.PI) * Math.atan(Math.max(high, wide / (this.frame.clientWidth / this.frame.clientHeight)));
+    return { position, target: position.clone().addScaledVector(ahead, distance), fov: Math.min(fov, Math.max(WIDEST, (360 / Math.PI) * Math.atan(high))) };
+  }
+
+  get stand() {
+    return { position: this.camera.position.clone(), target: this.controls.target.clone(), fov: this.camera.fov };
+  }
+
+  place({ position, target, fov }) {
+    this.camera.position.copy(position);
+    this.controls.target.copy(target);
+    this.camera.fov = fov;
+    this.camera.updateProjectionMatrix();
+    this.controls.update();
+    this.wake();
+  }
+
+  /** Ten numbers or fewer as text: position, orbit center, field of view. */
+  get address() {
+    const { position, target, fov } = this.stand;
+    return [...position.toArray(), ...target.toArray(), fov].map((value) => +value.toPrecision(5)).join();
+  }
+
+  set address(text) {
+    const numbers = text.split(",").map(Number);
+    if (numbers.length !== 7 || !numbers.every(Number.isFinite) || !(numbers[6] > 1 && numbers[6] < 170)) return;
+    const [position, target] = [0, 3].map((k) => new Vector3(...numbers.slice(k, k + 3)));
+    if (position.distanceTo(target) > 0) this.place({ position, target, fov: numbers[6] });
+  }
+
+  /** Fly to a photo's viewpoint, around what is looked at rather than through it. */
+  flyTo(photo, target) {
+    this.flight = { from: this.stand, to: this.standing(photo, target), start: performance.now() };
+    this.wake();
+  }
+
+  overview() {
+    this.flyTo(this.about.start);
+  }
+
+  advance(now) {
+    const { from, to, start } = this.flight, time = still.matches ? 1 : Math.min((now - start) / FLIGHT, 1);
+    const eased = time * time * (3 - 2 * time), target = from.target.clone().lerp(to.target, eased);
+    const [here, there] = [from, to].map((stand) => stand.position.clone().sub(stand.target));
+    const distance = here.length() ** (1 - eased) * there.length() ** eased;
+    const offset = here.normalize().lerp(there.normalize(), eased).normalize().multiplyScalar(distance);
+    if (time === 1) this.flight = null;
+    this.place(time === 1 ? to : { position: target.clone().add(offset), target, fov: from.fov + (to.fov - from.fov) * eased });
+  }
+
+  // ── frames ──
+
+  /** Draw some frames: sorting follows the camera a few frames later, and calls this again. */
+  wake() {
+    this.frames = 6;
+  }
+
+  /** Whether nothing is left to draw. */
+  get resting() {
+    return !this.flight && this.frames <= 0;
+  }
+
+  step(now) {
+    requestAnimationFrame((next) => this.step(next));
+    if (this.flight) this.advance(now);
+    if (this.frames-- <= 0) return;
+    this.controls.update();
+    this.renderer.render(this.scene, this.camera);
+    this.dispatchEvent(new Event("moved"));
+  }
+
+  resize() {
+    const { clientWidth: width, clientHeight: height } = this.frame;
+    if (!width || !height) return;
+    this.renderer.setSize(width, height);
+    this.camera.aspect = width / height;
+    this.camera.updateProjectionMatrix();
+    this.wake();
+  }
+
+  // ── places on the screen ──
+
+  /** Pixel of a point in the world; null behind the camera. */
+  pixel(point) {
+    const seen = new Vector3(...point).project(this.camera);
+    if (seen.z > 1) return null;
+    return [((seen.x + 1) / 2) * this.frame.clientWidth, ((1 - seen.y) / 2) * this.frame.clientHeight];
+  }
+
+  /** The camera as pick.js takes it, in the frame of the packed splats. */
+  get picking() {
+    const { clientWidth: width, clientHeight: height } = this.frame;
+    this.camera.updateMatrixWorld();
+    const view = this.camera.matrixWorldInverse.clone(), [x, y, z] = this.about.center, m = view.elements;
+    for (let k = 0; k < 3; k++) m[12 + k] += m[k] * x + m[4 + k] * y + m[8 + k] * z;
+    return { view: [...m], focal: height / 2 / Math.tan((this.camera.fov * Math.PI) / 360), width, height };
+  }
+
+  listen() {
+    let down = null;
+    this.canvas.addEventListener("pointerdown", (event) => (down = event.isPrimary ? event : null));
+    this.canvas.addEventListener("pointerup", (event) => {
+      const near = down && Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) < 6;
+      if (!near || event.timeStamp - down.timeStamp > 600 || event.button > 0) return;
+      const corner = this.canvas.getBoundingClientRect();
+      const [x, y] = [event.clientX - corner.left, event.clientY - corner.top];
+      this.dispatchEvent(new CustomEvent("click", { detail: { x, y, without: event.altKey } }));
+    });
+    this.frame.addEventListener("keydown", (event) => this.steer(event));
+  }
+
+  /** Arrows turn, + and − go closer and away, Home shows the overview. */
+  steer(event) {
+    const turns = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
+    const zoom = { "+": 0.9, "=": 0.9, "-": 1.1 }[event.key], { target } = this.controls;
+    if (event.key === "Home") this.overview();
+    else if (turns || zoom) {
+      const offset = this.camera.position.clone().sub(target).multiplyScalar(zoom ?? 1);
+      if (turns) {
+        const side = this.camera.up.clone().cross(offset).normalize(), turned = offset.clone().applyAxisAngle(side, -turns[1]);
+        if (turned.angleTo(this.camera.up) > 0.05 && turned.angleTo(this.camera.up) < 3.09) offset.copy(turned);
+        offset.applyAxisAngle(this.camera.up, turns[0]);
+      }
+      this.flight = null;
+      this.place({ ...this.stand, position: target.clone().add(offset) });
+    } else return;
+    event.preventDefault();
+  }
+
+  /** The picture as a PNG, with lines of text ([text, color]) below. */
+  async picture(lines) {
+    this.renderer.render(this.scene, this.camera);
+    const canvas = document.createElement("canvas"), size = Math.max(this.canvas.width / 48, 14);
+    [canvas.width, canvas.height] = [this.canvas.width, this.canvas.height + lines.length * 1.6 * size];
+    const pen = canvas.getContext("2d");
+    pen.drawImage(this.canvas, 0, 0);
+    pen.font = `${size}px system-ui, sans-serif`;
+    lines.forEach(([text, color], k) => {
+      const top = this.canvas.height + (1.6 * k + 0.3) * size;
+      pen.fillStyle = color;
+      pen.fillRect(size / 2, top, size, size);
+      pen.fillStyle = "#fff";
+      pen.fillText(text, 2 * size, top + 0.85 * size);
+    });
+    return new Promise((done) => canvas.toBlob(done, "image/png"));
+  }
+}

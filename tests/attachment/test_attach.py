@@ -1,0 +1,98 @@
+"""Words for a finished splat, with its photos and without; and back."""
+
+import numpy as np
+import pytest
+import torch
+from box_splat import box_splat
+from scenes import write_scene
+
+from lang3dxl_ns.attachment.attach import AttachConfig, attach
+from lang3dxl_ns.attachment.known_frames import known_frames
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.photo_collection import read_collection
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.query.read_splats import read_splats
+from lang3dxl_ns.query.scene_file import read_scene
+from lang3dxl_ns.query.splat_file import write_splats
+
+SETTINGS = AttachConfig(
+    views=6, up="z", preparation=PreparationConfig(clip="builtin", dense="builtin", dense_tokens=16)
+)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A splat in nerfstudio's frame, its photos, and the scene attached to them."""
+    folder = tmp_path_factory.mktemp("attach")
+    write_scene(folder / "photos", size=(120, 90), photos=8, points=400)
+    photos = read_collection(folder / "photos")
+    frame = known_frames(photos.reconstruction, folder / "box.ply")["nerfstudio's, with z up"]
+    write_splats(folder / "box.ply", box_splat(0.1).transformed(torch.from_numpy(frame)))
+    attach(folder / "box.ply", folder / "photos", folder / "box.scene", SETTINGS)
+    return folder
+
+
+def features(scene) -> np.ndarray:
+    return scene.features.astype(np.float32)
+
+
+@pytest.mark.slow
+def test_the_scene_has_the_splats_gaussians_in_their_order_and_answers(place, tmp_path):
+    scene, splats = read_scene(place / "box.scene"), read_splats(place / "box.ply")
+    torch.testing.assert_close(scene.splats.means, splats.means)
+    norms = np.linalg.norm(features(scene), axis=1)
+    seen = np.linalg.norm(features(scene), axis=1) > 0
+    assert seen.mean() > 0.5
+    np.testing.assert_allclose(norms[seen], 1, atol=2e-3)
+    match = scene.query("windows", scene.photos[0].name)
+    assert match.relevancy.shape == (90, 120)
+    count = scene.export(tmp_path / "a.ply", "windows", threshold=0.0, index=tmp_path / "a.npy")
+    numbers = np.load(tmp_path / "a.npy")
+    assert len(numbers) == count and (np.diff(numbers) > 0).all()
+    torch.testing.assert_close(read_splats(tmp_path / "a.ply").means, splats.means[numbers])
+
+
+@pytest.mark.slow
+def test_exported_and_attached_again_it_has_the_same_words_and_nothing_is_encoded_twice(place, capsys):
+    first = read_scene(place / "box.scene")
+    first.export(place / "again.ply")
+    capsys.readouterr()
+    second = attach(place / "again.ply", place / "photos", place / "again.scene", SETTINGS)
+    assert "preparing" not in capsys.readouterr().out
+    a, b = features(first), features(second)
+    seen = (np.linalg.norm(a, axis=1) > 0) & (np.linalg.norm(b, axis=1) > 0)
+    assert seen.mean() > 0.5
+    assert float((a[seen] * b[seen]).sum(1).mean()) > 0.99
+
+
+@pytest.mark.slow
+def test_without_photos_the_splat_is_its_own(place):
+    scene = attach(place / "box.ply", None, place / "alone.scene", SETTINGS)
+    assert len(scene.photos) == 6
+    assert (place / ".alone.views" / "images" / "0000.png").is_file()
+    assert float(scene.codes.isfinite().all(1).float().mean()) > 0.5
+
+
+@pytest.mark.slow
+def test_photos_of_something_else_are_refused_with_a_picture(place):
+    splats = read_splats(place / "box.ply")
+    noise = torch.rand(len(splats), 3, generator=torch.Generator().manual_seed(0))
+    write_splats(place / "other.ply", splats.with_colors(noise))
+    with pytest.raises(UserError, match="don't show this splat"):
+        attach(place / "other.ply", place / "photos", place / "other.scene", SETTINGS)
+    assert (place / "other.frame.png").is_file()
+    assert not (place / "other.scene").exists()
+
+
+@pytest.mark.parametrize(
+    ("splat", "data", "out", "message"),
+    [
+        ("nothing.ply", None, "a.scene", "does not exist"),
+        ("nothing.ply", None, "a.ply", "end it in .scene"),
+        ("nothing.ply", None, None, "name the file to write"),
+    ],
+)
+def test_mistakes_end_in_a_sentence_before_any_work(splat, data, out, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        attach(tmp_path / splat, data, None if out is None else tmp_path / out, SETTINGS)
+    assert list(tmp_path.iterdir()) == []

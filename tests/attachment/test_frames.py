@@ -1,0 +1,115 @@
+"""Frames: a splat moved as a program moves it is laid back onto its photos."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from box_splat import box_splat
+from scenes import write_scene
+from scipy.spatial.transform import Rotation
+
+from lang3dxl_ns.attachment.frames import camera_in, find_frame
+from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames
+from lang3dxl_ns.preparation.photo_collection import read_collection
+from lang3dxl_ns.rendering.render import render
+
+
+@pytest.fixture(scope="module")
+def collection(tmp_path_factory):
+    folder = write_scene(tmp_path_factory.mktemp("box") / "scene", size=(120, 90), photos=8, points=400)
+    return read_collection(folder)
+
+
+def moved(similarity):
+    return box_splat().transformed(torch.from_numpy(similarity))
+
+
+def similarity(turn=(0.3, -0.2, 0.5), scale=0.4, shift=(1.0, -2.0, 0.5)) -> np.ndarray:
+    whole = np.eye(4)
+    whole[:3, :3] = scale * Rotation.from_rotvec(turn).as_matrix()
+    whole[:3, 3] = shift
+    return whole
+
+
+def misplacement(found: np.ndarray, wanted: np.ndarray) -> float:
+    """How far corners of the box are from where they belong, in units of the box."""
+    corners = np.array([[x, y, z, 1.0] for x in (-1.2, 1.2) for y in (-0.6, 0.6) for z in (0, 1)])
+    scale = np.cbrt(np.linalg.det(wanted[:3, :3]))
+    return float(np.abs((found - wanted) @ corners.T).max() / scale)
+
+
+def test_a_camera_moves_along_with_the_splat(collection):
+    whole, name = similarity(), collection.photos[0].name
+    tracked = collection.reconstruction.photos[name]
+    still = render(box_splat(), camera_in(np.eye(4), tracked))
+    again = render(moved(whole), camera_in(whole, tracked))
+    torch.testing.assert_close(again.rgb, still.rgb, atol=2e-3, rtol=0)
+    torch.testing.assert_close(again.depth, 0.4 * still.depth, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "name", ["the photos' own, as in 3D Gaussian splatting", "nerfstudio's, with z up", "gsplat's"]
+)
+def test_the_frames_of_programs_are_found(collection, name, tmp_path):
+    wanted = known_frames(collection.reconstruction, tmp_path / "a.ply")[name]
+    fit = find_frame(moved(wanted), collection, tmp_path / "a.ply")
+    assert fit.fits, fit
+    assert misplacement(fit.similarity, wanted) < 0.02
+
+
+def test_nerfstudio_frame_is_what_nerfstudio_computes(collection, tmp_path):
+    """Its own function is the reference."""
+    cameras = pytest.importorskip("nerfstudio.cameras.camera_utils")
+    photos = collection.reconstruction.photos.values()
+    poses = np.linalg.inv([np.vstack([p.camera_from_world, [0, 0, 0, 1]]) for p in photos])
+    poses[:, :3, 1:3] *= -1
+    poses = poses[:, [0, 2, 1, 3]]
+    poses[:, 2] *= -1
+    oriented, _ = cameras.auto_orient_and_center_poses(torch.from_numpy(poses).float(), "up", "poses")
+    wanted = oriented[:, :3, 3] / oriented[:, :3, 3].abs().max()
+    frame = known_frames(collection.reconstruction, tmp_path / "a.ply")["nerfstudio's, with z up"]
+    centers = np.array([p.center for p in photos])
+    np.testing.assert_allclose(centers @ frame[:3, :3].T + frame[:3, 3], wanted.numpy(), atol=1e-4)
+
+
+def test_a_frame_that_is_close_is_refined(collection, tmp_path):
+    wanted = similarity((0.02, -0.03, 0.02), 1.02, (0.05, -0.04, 0.03))
+    fit = find_frame(moved(wanted), collection, tmp_path / "a.ply")
+    assert fit.fits
+    assert misplacement(fit.similarity, wanted) < 0.03
+
+
+def test_a_run_tells_its_frame(collection, tmp_path):
+    wanted = similarity()
+    content = {"transform": (wanted[:3] / 0.4).tolist(), "scale": 0.4}
+    (tmp_path / RUN_TRANSFORM).write_text(json.dumps(content))
+    place = tmp_path / "nerfstudio_models" / "step-1.ckpt"
+    found = known_frames(collection.reconstruction, place)["the run's"]
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
+def test_photos_of_something_else_fit_nowhere(collection, tmp_path):
+    g = torch.Generator().manual_seed(0)
+    other = box_splat()
+    other = other.with_colors(torch.rand(len(other), 3, generator=g))
+    assert not find_frame(other, collection, tmp_path / "a.ply").fits
+
+
+def test_a_transforms_json_is_read_like_the_colmap_model(collection, tmp_path):
+    frames = []
+    for photo in collection.photos:
+        tracked = collection.reconstruction.photos[photo.name]
+        pose = np.linalg.inv(np.vstack([tracked.camera_from_world, [0, 0, 0, 1]]))
+        pose[:3, 1:3] *= -1
+        (tmp_path / photo.name).write_bytes(photo.path.read_bytes())
+        lens = photo.lens
+        frames.append({"file_path": f"./{photo.name}", "transform_matrix": pose.tolist()})
+    shared = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": 120, "h": 90}
+    (tmp_path / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
+    found = read_collection(tmp_path)
+    assert [photo.name for photo in found.photos] == [photo.name for photo in collection.photos]
+    assert [photo.lens for photo in found.photos] == [photo.lens for photo in collection.photos]
+    for name, tracked in found.reconstruction.photos.items():
+        wanted = collection.reconstruction.photos[name].camera_from_world
+        np.testing.assert_allclose(tracked.camera_from_world, wanted, atol=1e-9)

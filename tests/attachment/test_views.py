@@ -1,0 +1,118 @@
+"""Views from a splat alone: upright, outside of matter, of its surfaces."""
+
+import numpy as np
+import pytest
+import torch
+from box_splat import box_splat
+from scenes import CENTER, HALF_SIZES
+from scipy.spatial.transform import Rotation
+
+from lang3dxl_ns.attachment import views
+from lang3dxl_ns.attachment.views import (
+    LENS,
+    Extent,
+    candidates,
+    choose_views,
+    looking,
+    rendered_views,
+    solids,
+)
+
+SPLATS = box_splat(0.1, ground=True)
+
+
+def turned(matrix: np.ndarray):
+    whole = torch.eye(4, dtype=torch.float64)
+    whole[:3, :3] = torch.from_numpy(matrix)
+    return SPLATS.transformed(whole)
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_up_is_found_wherever_it_points(axis):
+    """The 90-degree rotations that take z to each of the six axes, and a tilt of ten degrees."""
+    up = np.eye(3)[axis % 3] * (1 if axis < 3 else -1)
+    matrix = Rotation.align_vectors([up], [[0, 0, 1]])[0].as_matrix()
+    matrix = Rotation.from_rotvec([0.1, -0.1, 0.1]).as_matrix() @ matrix
+    found = Extent.of(turned(matrix), "auto").up.numpy()
+    assert found @ (matrix @ [0, 0, 1]) > 0.99
+
+
+def test_a_camera_looks_at_its_target_upright():
+    place, target = torch.tensor([3.0, -2.0, 1.5]), torch.tensor([0.2, 0.4, 0.5])
+    up = torch.tensor([0.0, 0.0, 1.0])
+    camera = LENS.camera(looking(place, target, up))
+    at = camera.view_matrix[:3, :3] @ target + camera.view_matrix[:3, 3]
+    torch.testing.assert_close(
+        at, torch.tensor([0.0, 0.0, float((target - place).norm())]), atol=1e-5, rtol=0
+    )
+    above = camera.view_matrix[:3, :3] @ (target + up) + camera.view_matrix[:3, 3]
+    assert float(above[0].abs()) < 1e-5
+    assert float(above[1]) < 0  # y points down
+    assert float(camera.view_matrix[:3, :3].det()) == pytest.approx(1, abs=1e-5)
+
+
+def test_no_camera_stands_in_matter():
+    extent = Extent.of(SPLATS, "z")
+    free = views._FreeSpace(solids(SPLATS), extent)
+    places = np.array([camera.pose[:3, 3] for camera in candidates(extent, free, 60)])
+    assert len(places) == 60
+    inside = (np.abs(places - CENTER) < HALF_SIZES).all(axis=1)
+    assert not inside.any()
+    assert places[:, 2].min() > 0
+    assert torch.from_numpy(CENTER).float() not in free  # hollow, but under a roof
+    assert torch.tensor([1.2, 0.0, 0.5]) not in free  # on a wall
+    assert torch.tensor([2.0, -2.0, 0.5]) in free
+
+
+def test_a_room_is_seen_from_within():
+    """The box without anything around it, from which most places have its top above them."""
+    room = Extent(torch.from_numpy(CENTER).float(), 0.6, torch.tensor([0.0, 0, 1]), -0.5)
+    assert torch.from_numpy(CENTER).float() in views._FreeSpace(solids(box_splat(0.1)), room)
+
+
+def test_chosen_views_show_more_than_the_first_ones():
+    shown = torch.zeros(4, 30)
+    shown[0, :10], shown[1, :11], shown[2, 20:], shown[3, 10:20] = 5, 5, 5, 5
+    assert views._cover(shown, 3) == [1, 2, 3]
+
+
+def test_rendered_views_are_kept_and_their_points_lie_on_surfaces(tmp_path, monkeypatch):
+    found = rendered_views(SPLATS, 6, "z", tmp_path / "views")
+    assert len(found.photos) == 6
+    points = found.reconstruction.points
+    box = np.maximum(np.abs(points - CENTER) - HALF_SIZES, 0)
+    to_box = np.where(
+        box.any(axis=1), np.linalg.norm(box, axis=1), (HALF_SIZES - np.abs(points - CENTER)).min(1)
+    )
+    off = np.minimum(to_box, np.abs(points[:, 2]))
+    assert np.quantile(off, 0.9) < 0.1
+    tracked = found.reconstruction.photos["0000.png"]
+    camera = np.column_stack([tracked.points, np.ones(len(tracked.points))]) @ tracked.camera_from_world.T
+    pixels = camera[:, :2] / camera[:, 2:] * [LENS.fx, LENS.fy] + [LENS.cx, LENS.cy]
+    np.testing.assert_allclose(pixels, tracked.pixels, atol=1e-2)
+
+    def never(*_):
+        raise AssertionError("chosen again")
+
+    monkeypatch.setattr(views, "choose_views", never)
+    again = rendered_views(SPLATS, 6, "z", tmp_path / "views")
+    for name, photo in again.reconstruction.photos.items():
+        wanted = found.reconstruction.photos[name].camera_from_world
+        np.testing.assert_allclose(photo.camera_from_world, wanted, atol=1e-6)
+
+
+def test_another_splat_gets_other_views(tmp_path, monkeypatch):
+    chosen = []
+    monkeypatch.setattr(views, "choose_views", lambda *args: chosen.append(args) or choose_first(args[1]))
+    rendered_views(SPLATS, 2, "z", tmp_path / "views")
+    rendered_views(SPLATS.select(torch.arange(len(SPLATS)) % 2 == 0), 2, "z", tmp_path / "views")
+    assert len(chosen) == 2
+
+
+def choose_first(extent):
+    return list(candidates(extent, views._FreeSpace(solids(SPLATS), extent), 2))
+
+
+def test_all_of_a_splat_is_chosen_from(capsys):
+    found = choose_views(SPLATS, Extent.of(SPLATS, "z"), 4)
+    assert len(found) == 4

@@ -1,0 +1,145 @@
+"""`lang3dxl teach`, `lang3dxl words` and `lang3dxl query --coco`, on a scene file."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from painted_scene import CHANNELS, encode_texts, painted_file, painted_scene
+from PIL import Image
+
+from lang3dxl_ns.baselines.lifting import LiftedFeatures
+from lang3dxl_ns.cli import main
+from lang3dxl_ns.query.coco import CocoLabels, mask_of, run_lengths
+from lang3dxl_ns.query.scene_file import read_scene, write_scene
+
+DOME = "61,61,77,77"
+"""Box of the dome in all/0003.jpg, a little large."""
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A scene file, whose CLIP is the painted one."""
+    monkeypatch.setattr("lang3dxl_ns.query.scene.text_encoder", lambda file, device: encode_texts)
+    decoder = LiftedFeatures(CHANNELS, 0)
+    decoder.name = "lifting"
+    painted = painted_scene()
+    codes = torch.cat([torch.nan_to_num(painted.codes), torch.ones(len(painted.codes), 1)], 1)
+    file = replace(painted_file(), data="wall")
+    write_scene(tmp_path / "wall.scene", painted_scene(decoder=decoder, codes=codes, file=file))
+    return tmp_path / "wall.scene"
+
+
+def teach(place, *flags):
+    main(["teach", str(place), "--word", "gizmo", "--photo", "0003.jpg", *flags])
+
+
+def words(place):
+    return read_scene(place, "cpu").words
+
+
+def test_a_word_is_kept_in_the_scene_and_nothing_else_changes(place, capsys):
+    before = read_scene(place, "cpu")
+    teach(place, "--box", DOME)
+    after = read_scene(place, "cpu")
+    assert torch.equal(before.splats.harmonics, after.splats.harmonics)
+    assert torch.equal(before.codes, after.codes) and after.file == before.file
+    assert after.words["gizmo"].examples[0].box == tuple(map(float, DOME.split(",")))
+    said = capsys.readouterr().out
+    assert "1 example" in said and "average precision" in said and "check it" in said
+    teach(place, "--at", "69,69", "--not-at", "20,60")
+    assert len(words(place)["gizmo"].examples) == 2
+    main(["words", str(place), "--forget", "gizmo/1"])
+    (left,) = words(place)["gizmo"].examples
+    assert left.points == ((69, 69),) and left.not_points == ((20, 60),)
+    main(["words", str(place), "--forget", "Gizmo"])
+    assert not words(place)
+
+
+def test_a_mask_teaches_and_queries_say_so(place, tmp_path, capsys):
+    mask = np.zeros((96, 96), np.uint8)
+    mask[62:76, 62:76] = 255
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    teach(place, "--mask", str(tmp_path / "m.png"))
+    out = tmp_path / "found"
+    labels = tmp_path / "labels.json"
+    main(["query", str(place), "--text", "gizmo", "--all", "--out", str(out), "--coco", str(labels)])
+    assert "(taught)" in capsys.readouterr().out
+    report = json.loads((out / "query.json").read_text())
+    assert report["texts"][0]["taught"]
+    told = json.loads(labels.read_text())
+    assert len(told["images"]) == 4 and told["categories"] == [{"id": 1, "name": "gizmo"}]
+    (part,) = [
+        a for a in told["annotations"] if told["images"][a["image_id"] - 1]["file_name"] == "all/0003.jpg"
+    ]
+    shown = mask_of(part["segmentation"]["counts"], tuple(part["segmentation"]["size"]))
+    assert (shown & (mask > 0)).sum() / (shown | (mask > 0)).sum() > 0.6
+    assert part["area"] == shown.sum()
+    plain = tmp_path / "plain"
+    main(["query", str(place), "--text", "gizmo", "--image", "0003", "--out", str(plain), "--without-taught"])
+    assert not json.loads((plain / "query.json").read_text())["texts"][0]["taught"]
+
+
+def test_words_are_carried_to_another_scene(place, tmp_path, capsys):
+    teach(place, "--box", DOME)
+    kept = tmp_path / "words.json"
+    main(["words", str(place), "--save", str(kept)])
+    same, other, foreign = (tmp_path / f"{name}.scene" for name in ("same", "other", "foreign"))
+    scene = read_scene(place, "cpu").with_words(())
+    write_scene(same, scene)
+    for path, change in ((other, {"data": "tower"}), (foreign, {"data": "tower", "clip_identity": "45"})):
+        scene.file = replace(scene.file, **change)
+        write_scene(path, scene)
+    main(["words", str(same), "--load", str(kept)])
+    assert words(same)["gizmo"].examples, "the same photos: learned anew"
+    main(["words", str(other), "--load", str(kept)])
+    assert "carried over from wall" in capsys.readouterr().out
+    assert torch.equal(words(other)["gizmo"].vector, words(place)["gizmo"].vector)
+    with pytest.raises(SystemExit, match="another CLIP"):
+        main(["words", str(foreign), "--load", str(kept)])
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--box", "1,2,3"], "4 numbers"),
+        (["--at", "a,b"], "2 numbers"),
+        (["--at", "nan,2"], "not a number"),
+        ([], "nothing is marked"),
+        (["--mask", "nowhere.png"], "can't be read"),
+    ],
+)
+def test_wrong_marks_are_one_sentence_and_leave_the_file(place, flags, message):
+    before = place.read_bytes()
+    with pytest.raises(SystemExit, match=message):
+        teach(place, *flags)
+    assert place.read_bytes() == before
+
+
+def test_forgetting_what_was_not_taught_is_one_sentence(place):
+    with pytest.raises(SystemExit, match="was not taught"):
+        main(["words", str(place), "--forget", "dome"])
+
+
+def test_run_lengths_return_the_mask():
+    generator = np.random.default_rng(0)
+    for size in ((1, 1), (3, 5), (7, 2)):
+        for mask in (generator.random(size) < 0.4, np.ones(size, bool), np.zeros(size, bool)):
+            assert np.array_equal(mask_of(run_lengths(mask), size), mask)
+    column_first = np.array([[False, True], [True, True]])
+    assert run_lengths(column_first) == [1, 3]
+    assert run_lengths(np.array([[True, False]])) == [0, 1, 1]
+    with pytest.raises(ValueError, match="run lengths"):
+        mask_of([1, 2], (2, 2))
+
+
+def test_every_connected_part_is_an_annotation():
+    mask = np.zeros((40, 60), bool)
+    mask[5:10, 10:20] = mask[30:35, 40:42] = True
+    labels = CocoLabels(["a", "b"])
+    labels.add("x.jpg", [np.zeros_like(mask), mask])
+    first, second = labels.content["annotations"]
+    assert first["bbox"] == [10, 5, 10, 5] and second["bbox"] == [40, 30, 2, 5]
+    assert first["category_id"] == 2 and first["area"] == 50
+    assert labels.content["images"] == [{"id": 1, "file_name": "x.jpg", "width": 60, "height": 40}]

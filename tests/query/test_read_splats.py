@@ -1,0 +1,237 @@
+"""Splats of other programs: one scene, however it is written; and files that are none."""
+
+import gzip
+import struct
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from numpy.lib import recfunctions
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.read_splats import find_splats, read_splats
+from lang3dxl_ns.query.splat_file import log_scales, logits, write_splats
+from lang3dxl_ns.rendering.splats import Splats
+
+
+def some_splats(count: int = 300, bands: int = 4) -> Splats:
+    g = torch.Generator().manual_seed(0)
+
+    def rand(*shape):
+        return torch.rand(count, *shape, generator=g)
+
+    quats = F.normalize(rand(4) - 0.5, dim=1)
+    return Splats(rand(3) * 4 - 2, quats, 0.02 + rand(3), 0.05 + 0.9 * rand(), rand(bands, 3) - 0.5)
+
+
+def assert_alike(
+    found: Splats, wanted: Splats, means=1e-6, scales=1e-5, opacities=1e-5, colors=1e-6, turn=1e-6
+):
+    assert len(found) == len(wanted)
+    torch.testing.assert_close(found.means, wanted.means, atol=means, rtol=0)
+    torch.testing.assert_close(found.scales.log(), wanted.scales.log(), atol=scales, rtol=0)
+    torch.testing.assert_close(found.opacities, wanted.opacities, atol=opacities, rtol=0)
+    torch.testing.assert_close(found.harmonics, wanted.harmonics, atol=colors, rtol=0)
+    # q and −q are the same rotation.
+    cosine = (F.normalize(found.quats, dim=1) * F.normalize(wanted.quats, dim=1)).sum(1).abs()
+    assert float(cosine.min()) > 1 - turn
+
+
+def table(path) -> tuple[list[str], np.ndarray]:
+    header, body = path.read_bytes().split(b"end_header\n", 1)
+    names = [line.split()[-1] for line in header.decode().split("\n") if line.startswith("property")]
+    return names, np.frombuffer(body, dtype=[(name, "<f4") for name in names])
+
+
+def write_table(path, rows, form: str, kind: str, name: str) -> None:
+    columns = "".join(f"property {name} {column}\n" for column in rows.dtype.names)
+    header = f"ply\nformat {form} 1.0\ncomment by hand\nelement vertex {len(rows)}\n{columns}end_header\n"
+    numbers = recfunctions.structured_to_unstructured(rows)
+    body = numbers.astype(kind).tobytes()
+    if form == "ascii":
+        body = "\n".join(" ".join(map(repr, row)) for row in numbers.tolist()).encode()
+    path.write_bytes(header.encode() + body)
+
+
+@pytest.mark.parametrize("bands", [1, 4, 9, 16])
+def test_what_is_written_as_ply_is_read_back(bands, tmp_path):
+    splats = some_splats(bands=bands)
+    write_splats(tmp_path / "a.ply", splats, torch.rand(len(splats)))
+    assert_alike(read_splats(tmp_path / "a.ply"), splats)
+
+
+@pytest.mark.parametrize(
+    ("form", "kind", "name"),
+    [
+        ("binary_big_endian", ">f4", "float"),
+        ("binary_little_endian", "<f8", "double"),
+        ("ascii", "f4", "float32"),
+    ],
+)
+def test_byte_order_number_type_and_order_of_columns_make_no_difference(form, kind, name, tmp_path):
+    splats = some_splats()
+    write_splats(tmp_path / "a.ply", splats)
+    names, rows = table(tmp_path / "a.ply")
+    write_table(tmp_path / "b.ply", rows[names[::-1]], form, kind, name)
+    assert_alike(read_splats(tmp_path / "b.ply"), splats)
+
+
+def test_two_dimensional_gaussians_are_thin(tmp_path):
+    write_splats(tmp_path / "a.ply", some_splats())
+    names, rows = table(tmp_path / "a.ply")
+    write_table(
+        tmp_path / "b.ply", rows[[n for n in names if n != "scale_2"]], "binary_little_endian", "<f4", "float"
+    )
+    scales = read_splats(tmp_path / "b.ply").scales
+    assert bool((scales[:, 2] < 0.01 * scales[:, :2].amin(1)).all())
+
+
+def test_supersplats_compressed_ply_is_read(tmp_path):
+    gsply = pytest.importorskip("gsply")
+    splats = some_splats(700)
+    rest = splats.harmonics[:, 1:].numpy()
+    parts = (splats.means, log_scales(splats), splats.quats, logits(splats), splats.harmonics[:, 0])
+    data = gsply.GSData(*(part.numpy().copy() for part in parts), rest.copy())
+    (tmp_path / "a.compressed.ply").write_bytes(gsply.compress_to_bytes(data))
+    found = read_splats(tmp_path / "a.compressed.ply")
+    # The writer may sort them.
+    order = [torch.cdist(found.means, splats.means).argmin(1)]
+    wanted = splats.select(order[0])
+    assert_alike(found, wanted, means=5e-3, scales=5e-3, opacities=5e-3, colors=0.03, turn=1e-4)
+
+
+def test_an_spz_is_read(tmp_path):
+    pytest.importorskip("gsply")
+    splats = some_splats()
+    write_splats(tmp_path / "a.spz", splats)
+    found = read_splats(tmp_path / "a.spz")
+    assert_alike(found, splats, means=1e-3, scales=0.04, opacities=5e-3, colors=0.02, turn=1e-4)
+
+
+def test_a_splat_of_the_web_is_read(tmp_path):
+    splats = some_splats(bands=1)
+    colors = torch.cat([(splats.harmonics[:, 0] * 0.28209479 + 0.5), splats.opacities[:, None]], dim=1)
+    rows = np.zeros(len(splats), [("m", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
+    rows["m"], rows["s"] = splats.means, splats.scales
+    rows["c"] = (colors * 255).round()
+    rows["q"] = (F.normalize(splats.quats, dim=1) * 128 + 128).round().clamp(0, 255)
+    (tmp_path / "a.splat").write_bytes(rows.tobytes())
+    assert_alike(read_splats(tmp_path / "a.splat"), splats, opacities=3e-3, colors=0.01, turn=1e-4)
+
+
+def gsplat_state(splats: Splats) -> dict:
+    parts = {"means": splats.means, "scales": log_scales(splats), "quats": splats.quats}
+    parts |= {"opacities": logits(splats), "sh0": splats.harmonics[:, :1], "shN": splats.harmonics[:, 1:]}
+    return {"step": 29_999, "splats": parts}
+
+
+def splatfacto_state(splats: Splats) -> dict:
+    parts = {"means": splats.means, "scales": log_scales(splats), "quats": splats.quats}
+    parts |= {"opacities": logits(splats)[:, None], "features_dc": splats.harmonics[:, 0]}
+    parts |= {"features_rest": splats.harmonics[:, 1:]}
+    return {"step": 9, "pipeline": {f"_model.gauss_params.{name}": value for name, value in parts.items()}}
+
+
+def test_checkpoints_of_gsplat_and_splatfacto_are_read(tmp_path):
+    splats = some_splats(bands=16)
+    torch.save(gsplat_state(splats), tmp_path / "ckpt_29999_rank0.pt")
+    assert_alike(read_splats(tmp_path / "ckpt_29999_rank0.pt"), splats)
+    (tmp_path / "nerfstudio_models").mkdir()
+    torch.save(splatfacto_state(splats), tmp_path / "nerfstudio_models" / "step-000000009.ckpt")
+    (tmp_path / "config.yml").write_text("!!python/object:any.Thing\nrasterize_mode: antialiased\n")
+    found = read_splats(tmp_path)
+    assert_alike(found, splats)
+    assert found.antialiased
+
+
+def test_a_splatfacto_of_one_color_per_gaussian_stores_logits_of_it(tmp_path):
+    splats = some_splats(bands=1)
+    colors = (splats.harmonics[:, 0] * 0.28209479 + 0.5).clamp(0.01, 0.99)
+    state = splatfacto_state(splats.with_colors(colors))
+    state["pipeline"]["_model.gauss_params.features_dc"] = colors.logit()
+    torch.save(state, tmp_path / "step-1.ckpt")
+    torch.testing.assert_close(read_splats(tmp_path / "step-1.ckpt").colors(torch.zeros(3)), colors)
+
+
+def test_a_run_folder_means_its_latest_splat(tmp_path):
+    for step in (7_000, 30_000, 9_000):
+        place = tmp_path / "point_cloud" / f"iteration_{step}"
+        place.mkdir(parents=True)
+        write_splats(place / "point_cloud.ply", some_splats(10))
+    assert find_splats(tmp_path).parent.name == "iteration_30000"
+
+
+def test_gaussians_with_nan_keep_their_place_and_are_invisible(tmp_path):
+    splats = some_splats()
+    broken = splats.means.clone()
+    broken[[3, 70]] = torch.tensor([torch.nan, 0, torch.inf])
+    state = gsplat_state(Splats(broken, splats.quats, splats.scales, splats.opacities, splats.harmonics))
+    torch.save(state, tmp_path / "a.pt")
+    found = read_splats(tmp_path / "a.pt")
+    assert len(found) == len(splats) and bool(found.sound().all())
+    assert float(found.opacities[[3, 70]].max()) == 0
+    keep = torch.arange(len(splats)) % 67 != 3
+    assert_alike(found.select(keep), splats.select(keep))
+    torch.save(gsplat_state(Splats(broken * torch.nan, *list(vars(splats).values())[1:5])), tmp_path / "b.pt")
+    with pytest.raises(UserError, match="100% of its Gaussians"):
+        read_splats(tmp_path / "b.pt")
+
+
+class _Evil:
+    def __reduce__(self):
+        return print, ("this was run",)
+
+
+def bad_files(folder) -> dict[str, bytes]:
+    write_splats(folder / "good.ply", some_splats(20))
+    good = (folder / "good.ply").read_bytes()
+    torch.save({"splats": _Evil()}, folder / "evil.pt")
+    huge = struct.pack("<IIIBBBB", 0x5053474E, 3, 1_000_000_000, 3, 12, 0, 0)
+    bomb = struct.pack("<IIIBBBB", 0x5053474E, 3, 10, 0, 12, 0, 0) + bytes(20_000_000)
+    return {
+        "empty.ply": b"",
+        "text.ply": b"hello",
+        "cut.ply": good[:-1],
+        "header.ply": good[:200],
+        "huge.ply": good.replace(b"vertex 20", b"vertex 99999999999"),
+        "negative.ply": good.replace(b"vertex 20", b"vertex -20"),
+        "words.ply": good.replace(b"vertex 20", b"vertex many"),
+        "types.ply": good.replace(b"float x", b"quark x"),
+        "points.ply": good.replace(b"opacity", b"opaque!"),
+        "none.ply": good.replace(b"vertex 20", b"vertex 0"),
+        "odd.ply": good.replace(b"f_rest_0", b"f_best_0"),
+        "cut.splat": bytes(33),
+        "empty.splat": b"",
+        "huge.spz": gzip.compress(huge),
+        "bomb.spz": gzip.compress(bomb),
+        "text.spz": b"hello",
+        "evil.pt": (folder / "evil.pt").read_bytes(),
+        "text.ckpt": b"hello",
+        "a.obj": b"v 0 0 0",
+    }
+
+
+def test_every_bad_file_ends_in_one_sentence(tmp_path, capsys):
+    for name, content in bad_files(tmp_path).items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError) as error:
+            read_splats(tmp_path / name)
+        assert name in str(error.value), error.value
+        assert "\n" not in str(error.value)
+    assert capsys.readouterr().out == ""
+
+
+def test_a_ply_cut_anywhere_is_refused(tmp_path):
+    write_splats(tmp_path / "a.ply", some_splats(20))
+    content = (tmp_path / "a.ply").read_bytes()
+    for length in range(0, len(content), 41):
+        (tmp_path / "b.ply").write_bytes(content[:length])
+        with pytest.raises(UserError):
+            read_splats(tmp_path / "b.ply")
+
+
+def test_a_missing_file_and_a_folder_without_a_splat_are_named(tmp_path):
+    for place in (tmp_path / "nothing.ply", tmp_path):
+        with pytest.raises(UserError, match=place.name):
+            read_splats(place)
