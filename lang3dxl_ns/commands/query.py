@@ -109,7 +109,8 @@ class Query:
             closest = "" if score > level else " (no match; this view comes closest)"
             by = "" if prompt.taught is None else " (taught)"
             say(f"{prompt.text}{by}: {score:.2f} at {place}; {folder}{closest}")
-            told = (caution(prompt.text), doubtful(prompt.text, doubt, prompt.taught is not None))
+            taught = prompt.taught is not None
+            told = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
             for advice in filter(None, told):
                 say(f"  {advice}")
 

@@ -34,7 +34,7 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import MARK_SIDE, Example, TaughtWord, Weights, known_word, learn, marks
-from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched
 from lang3dxl_ns.query.threshold import match_thresholds
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
@@ -553,7 +553,7 @@ class Scene:
         if not synonyms or self.config.text.combine != "fallback":
             return synonyms
         if prompt.text not in self._doubt_alone:
-            alone = self.text.plain_queries([prompt.text]).to(self.device)
+            alone = self.text.plain_queries([searched(prompt.text)]).to(self.device)
             self._doubt_alone[prompt.text] = self.doubts.of(self.engine.of_gaussians(alone))[0]
         return synonyms if self._doubt_alone[prompt.text] > DOUBTFUL else []
 

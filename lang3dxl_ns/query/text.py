@@ -84,24 +84,26 @@ def _tidy(text: str) -> str:
 # ── what CLIP can't tell ────────────────────────────────────────────────────────────────────────────────
 
 _PLACES = "left|right|front|back|rear|top|bottom|upper|lower|middle|central|nearest|farthest|first|last"
+_SIZES = "main|big|large|huge|small|tiny|biggest|largest|smallest"
 _COLORS = "red|orange|yellow|green|blue|purple|pink|brown|black|white|gray|grey|golden"
 _WHERE = re.compile(
     rf"\s+(?:on|at|in|to|of|from|above|below|under|beside|behind|near)\s+(?:the\s+)?(?:{_PLACES})\b.*$"
-    rf"|^(?:the\s+)?(?:{_PLACES})\s+(?=\S)",
+    rf"|^(?:(?:the|a)\s+)?(?:{_PLACES}|{_SIZES})\s+(?!of\b)(?=\S)",
     re.IGNORECASE,
 )
 _COLOR = re.compile(rf"\b(?:{_COLORS})\b(?=\s+\S)", re.IGNORECASE)
 
 
 def searched(text: str) -> str:
-    """A prompt without what says where in a picture a thing is: *windows on the left tower* is *windows*."""
+    """A prompt without what says which of several things is meant, by its place or size: *windows on the left
+    tower* is *windows*."""
     return _WHERE.sub("", text).strip() or text
 
 
 def caution(text: str) -> str | None:
-    """A sentence about words in a prompt that CLIP can't tell: places and colors; None without such."""
+    """A sentence about words in a prompt that CLIP can't tell, places, sizes and colors; None without."""
     if (found := searched(text)) != text:
-        return f"places are not told apart: {found} is searched for everywhere"
+        return f"places and sizes are not told apart: {found} is searched for everywhere"
     if color := _COLOR.search(text):
         return f"colors are hardly told apart: {color[0]} is likely to be ignored"
     return None
@@ -202,7 +204,7 @@ class TextEncoder:
     def plain_queries(self, texts: Sequence[str]) -> Queries:
         """Vectors of texts without synonyms, against the negatives."""
         return Queries.of(
-            self.vectors([searched(text) for text in texts])[:, None].unbind(),
+            self.vectors(texts)[:, None].unbind(),
             self.vectors(self.config.negatives),
             against=[self._against(text) for text in texts],
         )
@@ -225,7 +227,7 @@ class TextEncoder:
     def _positive(self, prompt: Prompt, synonyms: list[str]) -> Float[Tensor, "s c"]:
         if prompt.vector is not None:
             return prompt.vector.to(self.vectors(self.config.negatives))[None]
-        words = [*synonyms, searched(prompt.text)]
+        words = [*synonyms, searched(prompt.text) if prompt.taught is None else prompt.text]
         return self.vectors([", ".join(words)] if self.config.combine == "joined" else words)
 
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:
