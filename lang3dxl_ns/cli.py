@@ -73,7 +73,7 @@ COMMANDS = {
         "Generate a demo scene: photos of a procedural landmark.",
     ),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),
-    "preset": ("commands.preset:Preset", "Print the flags that train a benchmark's scene as published."),
+    "preset": ("commands.preset:Preset", "Print the flags that train a benchmark's scene as in the paper."),
     "numerics": ("numerics.command:Numerics", "Error and time of every component on stiff cases."),
     "benchmark": (BENCHMARKS, "Measure: time, memory and error, side by side."),
 }

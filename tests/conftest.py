@@ -6,7 +6,7 @@
   look at the same run.
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
   `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
-  told `--pipeline.model.encoder.compression.steps 40`.
+  told `--pipeline.model.decoder.compression.steps 40`.
 - `wheel`: the package's wheel, built once per session.
 - `worker_tasks`: work for several processes; tests that need a Ray cluster belong into test_ray.py, which
   has one.
@@ -108,17 +108,17 @@ def train(tiny_clip, tiny_dense, tmp_path):
     return run
 
 
-def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, **changes):
-    """A trainer of the registered method, configured as the command line would."""
-    from lang3dxl_ns.methods import lang3dxl
+def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, method="lang3dxl", **changes):
+    """A trainer of a registered method, configured as the command line would."""
+    from lang3dxl_ns.methods import METHODS
 
-    config = deepcopy(lang3dxl.config)
+    config = deepcopy(METHODS[method].config)
     config.data = config.pipeline.datamanager.data = data
     config.output_dir, config.vis, config.max_num_iterations = output_dir, "tensorboard", iterations
     config.pipeline.datamanager.clip = str(clip) if semantics else "none"
     config.pipeline.datamanager.dense = str(dense) if semantics else "none"
     config.viewer.quit_on_train_completion = True
-    compression = config.pipeline.model.encoder.compression
+    compression = config.pipeline.model.decoder.compression
     compression.steps, compression.batch = 40, 512
     for path, value in changes.items():
         *owners, name = path.split("__")

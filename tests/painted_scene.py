@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.rendering.splats import Splats, harmonics_of
@@ -77,7 +77,7 @@ def painted_splats() -> Splats:
     )
 
 
-class Painted(SemanticEncoder):
+class Painted(Decoder):
     """Codes are the features themselves, decoded Gaussian by Gaussian."""
 
     name = "painted"

@@ -14,12 +14,12 @@ from conftest import make_trainer
 from fake_gpu import CUDA, GpuTensor, fake_gpu, real_gpu
 from scenes import write_scene
 
-from lang3dxl_ns.baselines.encoders import EncoderConfig
+from lang3dxl_ns.baselines.decoders import DecoderConfig
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
 
 EVERYTHING = {
-    "pipeline__model__encoder__name": "paper",
+    "pipeline__model__decoder__name": "paper",
     "pipeline__model__densify_grad_thresh": 1e-7,
     "pipeline__model__feature_gradient_to_geometry": True,
     "pipeline__model__background_color": "random",
@@ -160,14 +160,14 @@ def test_code_maps_are_decoded_at_five_sizes(default):
 
 
 @pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "langsplat", "direct", "lifting"])
-def test_every_encoder_trains(trained, name):
-    encoder = EncoderConfig(name, autoencoder_steps=5)
-    trained(2, pipeline__model__encoder=encoder, pipeline__model__densify_until=0.0)
+def test_every_decoder_trains(trained, name):
+    decoder = DecoderConfig(name, autoencoder_steps=5)
+    trained(2, pipeline__model__decoder=decoder, pipeline__model__densify_until=0.0)
 
 
 @pytest.mark.parametrize("preset", ["default", "official", "paper"])
 def test_every_preset_of_the_field_trains(trained, preset):
-    trained(1, pipeline__model__encoder__name="paper", pipeline__model__semantic_field__preset=preset)
+    trained(1, pipeline__model__decoder__name="paper", pipeline__model__semantic_field__preset=preset)
 
 
 def test_a_cap_holds_and_the_least_opaque_go(trained):
@@ -357,12 +357,12 @@ def test_a_conversation_in_the_viewer(default, gpu):
         model.answers = None
 
 
-@pytest.mark.parametrize(("name", "width"), [("lang3dxl", 3), ("lifting", 65)])
+@pytest.mark.parametrize(("name", "width"), [("gathered", 3), ("lifting", 65)])
 def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, width):
     """Wide features as principal components, a few channels at a time, sums on the CPU."""
     monkeypatch.setattr(CompressedField, "gathered_channels", 5)
     monkeypatch.setattr("lang3dxl_ns.rendering.gathering.MEMORY", 2.0)
-    model = trained(iterations=3, pipeline__model__encoder__name=name).pipeline.model
+    model = trained(iterations=3, pipeline__model__decoder__name=name).pipeline.model
     codes = model.gauss_params["codes"]
     assert codes.device == CUDA and codes.shape == (model.num_points, width)
     assert codes.isfinite().all(1).cpu().any()

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.attachment.known_frames import Similarity
-from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
+from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.reports import progress_bar
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.preparation.collection import prepare_collection
@@ -65,7 +65,7 @@ def prepare_photos(
 
 def learn(
     splats: Splats, collection: PhotoCollection, cameras: Mapping[str, Camera], targets: TargetReader
-) -> tuple[SemanticEncoder, Float[Tensor, "n code"]]:
+) -> tuple[Decoder, Float[Tensor, "n code"]]:
     """A decoder and the Gaussians' codes; NaN for those that no photo shows.
 
     Args:
@@ -75,8 +75,8 @@ def learn(
         targets: of the photos.
     """
     device = splats.means.device
-    decoder = make_encoder(
-        EncoderConfig(), SemanticFieldConfig(preset="short"), targets.clip_dim, 0, torch.zeros(3), 1.0
+    decoder = make_decoder(
+        DecoderConfig(), SemanticFieldConfig(preset="short"), targets.clip_dim, 0, torch.zeros(3), 1.0
     ).to(device)
     names = [photo.name for photo in collection.photos]
     dense = partial(targets.dense_features, names) if targets.dense_dim else None

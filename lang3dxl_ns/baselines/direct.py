@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 
 
-class DirectFeatures(SemanticEncoder):
+class DirectFeatures(Decoder):
     """Gaussians carry whitened CLIP and dense features. A map is mean + deviation × rendering, so that
     training starts at the mean feature, as for the semantic field."""
 

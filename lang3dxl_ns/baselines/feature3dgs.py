@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 
 
-class Feature3DGS(SemanticEncoder):
+class Feature3DGS(Decoder):
     """Codes half as wide as CLIP's features (256 for ViT-B/32), expanded by its "speed-up" layer, a 1×1
     convolution, to CLIP and dense features. Whitened like the semantic field, which can only help it."""
 

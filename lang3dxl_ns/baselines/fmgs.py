@@ -10,14 +10,14 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
 _STRETCH = 2.0
 """Positions within the scene radius fill 0.12 … 0.88 of the grid almost evenly; all others share the rest."""
 
 
-class PlaceField(SemanticEncoder):
+class PlaceField(Decoder):
     """The semantic field evaluated at a Gaussian's position instead of a pixel's code: every Gaussian is
     decoded, and whole features are rendered. Gaussians have no learned codes.
 

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 
 _ENCODER = (256, 128, 64, 32, 3)
 _DECODER = (16, 32, 64, 128, 256, 256)
@@ -21,7 +21,7 @@ _MOST_FEATURES = 400_000
 """Most features the autoencoder is trained on."""
 
 
-class LangSplat(SemanticEncoder):
+class LangSplat(Decoder):
     """Unit-length codes, decoded after rendering by the autoencoder's frozen decoder.
 
     The autoencoder learns the scene's CLIP targets before the run, as unit vectors; decoded features are

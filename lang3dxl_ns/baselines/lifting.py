@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 
 _LEAST_COVERAGE = 1e-4
 
 
-class LiftedFeatures(SemanticEncoder):
+class LiftedFeatures(Decoder):
     """Gaussians carry nothing in training. Afterwards they carry the lifted features and a 1, whose rendering
     is the coverage: a map is the mean feature of the visible Gaussians, however little of a pixel they
     cover."""

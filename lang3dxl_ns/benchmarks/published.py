@@ -6,9 +6,9 @@ import json
 import re
 import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from lang3dxl_ns.baselines.rows import FULL, choose_rows
 from lang3dxl_ns.benchmarks.ablation import make_all
@@ -52,8 +52,10 @@ class _Benchmark:
     """Training iterations (default: the published ones, or 30,000)."""
     scale: float = 0.5
     """Size of the training photos relative to those on disk."""
+    method: Literal["lang3dxl", "lang3dxl-paper"] = "lang3dxl"
+    """The method of `ns-train`: with lang3dxl-paper also the published schedules, and its own SAM."""
     ns_train: str = ""
-    """Extra flags of `ns-train lang3dxl` in one string, such as "--pipeline.model.encoder.name paper"."""
+    """Extra flags of that method in one string, such as "--pipeline.datamanager.regions none"."""
 
     name: ClassVar[str]
     measures: ClassVar[Mapping[str, str]]
@@ -76,11 +78,14 @@ class _Benchmark:
 
     def _run(self, scene: BenchmarkScene) -> Run:
         (row,) = choose_rows((FULL,), True, False)
-        steps = self.iterations or int(self._flags(scene).get("max-num-iterations", "30000"))
+        row = replace(row, method=self.method)
+        steps = self.iterations or int(self._flags(scene).get(_ITERATIONS, "30000"))
         return Run(row, scene.data, scene.name, 0, steps)
 
     def _store(self, scene: BenchmarkScene) -> KeptRuns:
-        flags = {k: v for k, v in self._flags(scene).items() if k not in _OF_THE_COMMAND}
+        flags = {k: v for k, v in self._flags(scene).items() if k != _ITERATIONS}
+        if self.method == "lang3dxl":  # its own schedule
+            flags = {k: v for k, v in flags.items() if k.startswith("pipeline.datamanager.")}
         words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
         flags_of_all = shlex.join([*words, *shlex.split(self.ns_train)])
         settings = RunSettings(self.clip, "auto", self.foreground, self.scale, flags_of_all)
@@ -173,12 +178,11 @@ _TOTALS = {
     "smooth_located": "smooth_localization_accuracy",
     "smooth_iou": "smooth_miou",
 }
-_OF_THE_COMMAND = ("max-num-iterations", "pipeline.datamanager.camera-res-scale-factor")
-"""Published flags that are options of the command, too."""
+_ITERATIONS = "max-num-iterations"
 
 
 class HolyScenes(_Benchmark):
-    """HolyScenes: six landmarks, trained with the published crop ranges and schedules and scored on labeled
+    """HolyScenes: six landmarks, trained with the published crop ranges and iterations and scored on labeled
     photos that training saw, beside the published figures.
 
     --data holds the photos of each scene (milano/images and a COLMAP model, or milano/dense/…) and the labels

@@ -137,6 +137,8 @@ class ScoredRuns:
     def _made_with(self, run: Run) -> dict[str, Any]:
         made_with = {"scene": str(run.scene), "changes": dict(run.row.changes), **asdict(self.settings)}
         made_with["clip_weights"] = self._clip_weights
+        if run.row.method != "lang3dxl":
+            made_with["method"] = run.row.method
         for name in set(SEGMENTERS) - {run.row.name}:
             del made_with[name]
         return json.loads(json.dumps(made_with))
@@ -177,7 +179,8 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
 
     from lang3dxl_ns.methods import run_config
 
-    config = run_config(run.scene, work / "runs", run.label, run.steps, settings.clip, settings.dense)
+    names = settings.clip, settings.dense, run.row.method
+    config = run_config(run.scene, work / "runs", run.label, run.steps, *names)
     config.timestamp = f"{run.row.name}-{run.seed}"
     data = config.pipeline.datamanager
     data.foreground, data.camera_res_scale_factor = settings.foreground, settings.scale

@@ -1,4 +1,4 @@
-"""`lang3dxl preset`: flags that train a benchmark scene as published."""
+"""`lang3dxl preset`: flags of `ns-train lang3dxl-paper` for a benchmark, or as the authors' release."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from typing import Annotated
 
 import tyro
 
-from lang3dxl_ns.common.presets import scene_presets, train_flags
+from lang3dxl_ns.common.presets import OFFICIAL, scene_presets, train_flags
 
 
 @dataclass
 class Preset:
-    """Print the flags that train a benchmark scene as published, for use as
+    """Print flags that train a benchmark's scene as in the paper, for use as
 
-    ns-train lang3dxl --data FOLDER $(lang3dxl preset holyscenes/milano)
+    ns-train lang3dxl-paper --data FOLDER $(lang3dxl preset holyscenes/milano)
+
+    `official`: flags for what the authors' release does otherwise; both can be given.
     """
 
     name: Annotated[str, tyro.conf.Positional] = ""
-    """Such as holyscenes/milano; without a name, lists them all."""
+    """Such as holyscenes/milano, or official; without a name, lists them all."""
 
     def main(self) -> None:
         if not self.name:
-            print("\n".join(scene_presets()))
+            print("\n".join([OFFICIAL, *scene_presets()]))
             return
         print(shlex.join(train_flags(self.name)))

@@ -31,18 +31,25 @@ def load_preset(name: str) -> dict[str, Any]:
     return settings
 
 
+OFFICIAL = "official"
+"""Preset of what the authors' release does otherwise than the paper."""
+
+
 def scene_presets() -> list[str]:
     """Names of the presets that describe a scene."""
     return sorted(f"holyscenes/{path.stem}" for path in FOLDER.glob("holyscenes/*.yaml"))
 
 
 def train_flags(name: str) -> list[str]:
-    """Flags of `ns-train lang3dxl` that train a scene as published: crop range, iterations, schedule.
+    """Flags of `ns-train lang3dxl-paper`: a scene's crop range and what of its schedule differs from the
+    method's, or all that the authors' release does otherwise.
 
-    Raises UserError for a preset that does not describe a scene.
+    Raises UserError for a preset of something else.
     """
     settings = load_preset(name)
     if "train" not in settings:
-        raise UserError(f"{name} is not a scene preset: choose one of {', '.join(scene_presets())}")
-    flags = {"pipeline.datamanager.scale-preset": name} | settings["train"]
+        choices = ", ".join([OFFICIAL, *scene_presets()])
+        raise UserError(f"{name} is no preset for training: choose one of {choices}")
+    scale = {"pipeline.datamanager.scale-preset": name} if "scale_range" in settings else {}
+    flags = scale | settings["train"]
     return [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 
 
-class SemanticEncoder(nn.Module, ABC):
+class Decoder(nn.Module, ABC):
     """Interface of the semantic field and of the baselines.
 
     The model gives every Gaussian `initial_codes`, renders what is `carried`, and decodes the rendered map.
@@ -32,7 +32,7 @@ class SemanticEncoder(nn.Module, ABC):
         self.register_buffer("output_std", torch.ones(clip_dim + dense_dim))
 
     name = ""
-    """What `baselines.encoders.make_encoder` makes it by."""
+    """What `baselines.decoders.make_decoder` makes it by."""
     bounded = False
     """Whether codes are squashed by a sigmoid before they are decoded."""
     per_gaussian = False
@@ -77,7 +77,7 @@ class SemanticEncoder(nn.Module, ABC):
         advance: Callable[[], None] = lambda: None,
         basis: PrincipalBasis | None = None,
     ) -> Float[Tensor, "n code"]:
-        """Codes for features gathered onto the Gaussians, if the encoder `needs_lifting`.
+        """Codes for features gathered onto the Gaussians, if the decoder `needs_lifting`.
 
         mass: pixels that each Gaussian fills; 0 for those visible in no photo. advance: called
         `learning_steps` times during the work. basis: what the features are coordinates in, if they are wider

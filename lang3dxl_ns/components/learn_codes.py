@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
@@ -35,7 +35,7 @@ class TargetView:
 
 
 def learn_codes(
-    decoder: SemanticEncoder,
+    decoder: Decoder,
     views: Iterable[TargetView],
     means: Float[Tensor, "n 3"],
     clip_targets: ClipMaps,

@@ -20,12 +20,9 @@ def exponential_ramp(step: float, start: float, end: float, steps: float) -> flo
     return log_linear(step / steps if steps > 0 else 1.0, start, end)
 
 
-def semantic_ramp(x: float) -> float:
-    """Weight of the semantic losses: 0.1 to 1 over the first half of the run, so that geometry leads.
-
-    Lang3D-XL's released schedule ramps over 15,000 of 30,000 iterations.
-    """
-    return exponential_ramp(x, 0.1, 1.0, 0.5)
+def semantic_ramp(x: float, share: float) -> float:
+    """Weight of the semantic losses: 0.1 to 1 over the first `share` of the run, so that geometry leads."""
+    return exponential_ramp(x, 0.1, 1.0, share)
 
 
 def cosine_decay(x: float, peak: float, end: float, power: float = 1.0) -> float:

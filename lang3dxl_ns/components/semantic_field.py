@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, MOST_DIMENSIONS, HashGrid
 from lang3dxl_ns.components.linear import linear
 
@@ -138,7 +138,7 @@ class SemanticFieldConfig:
         return settings
 
 
-class SemanticField(SemanticEncoder):
+class SemanticField(Decoder):
     """Decodes rendered codes to raw (not unit length) CLIP features and, if configured, dense features.
 
     Codes may be any number: ±inf decode to finite features, NaN to NaN in their own pixel alone. Everything
@@ -193,7 +193,7 @@ class SemanticField(SemanticEncoder):
         return (self.settings.code_std * noise).to(self.output_mean)
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
-        """See `SemanticEncoder`; without `whiten` they are ignored."""
+        """See `Decoder`; without `whiten` they are ignored."""
         if self.settings.whiten:
             super().set_output_statistics(mean, std)
 
@@ -216,7 +216,7 @@ class SemanticField(SemanticEncoder):
         return F.linear(self.hidden(codes), *self.clip_head())
 
     def clip_head(self) -> tuple[Float[Tensor, "clip hidden"], Float[Tensor, " clip"]]:
-        """See `SemanticEncoder`."""
+        """See `Decoder`."""
         return self._head(slice(0, self.clip_dim))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

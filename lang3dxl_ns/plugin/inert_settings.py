@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, fields
-from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import tyro
 
 from lang3dxl_ns.common.errors import UserError
-
-if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 
 Class = TypeVar("Class", bound=type)
 
@@ -34,8 +31,8 @@ OF_COLMAP = (
 )
 """nerfstudio's reader of COLMAP models; this package's reads points always, and depths never."""
 _OF_RENDERINGS = (
-    *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up"),
-    "feature_gradient_to_geometry",
+    *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up", "semantic_ramp"),
+    *("dense_compare", "mask_dense", "feature_gradient_to_geometry", "downsampler"),
 )
 """Settings of semantics that are trained with the scene."""
 
@@ -52,18 +49,25 @@ def without(*names: str) -> Callable[[Class], Class]:
     return hide
 
 
-def check_inert(config: Lang3DXLTrainerConfig) -> None:
-    """Raises UserError if a setting that has no effect in this run differs from its default."""
-    model, data = config.pipeline.model, config.pipeline.datamanager
+def check_inert(model: Any, data: Any) -> None:
+    """Raises UserError if a setting that has no effect in this run differs from its default.
+
+    model, data: settings of the model and of the data manager.
+    """
     changed = [
         *(f"--pipeline.model.{name}" for name in _changed(model, OF_SPLATFACTO)),
         *(f"--pipeline.datamanager.{name}" for name in _changed(data, OF_IMAGE_CACHES)),
     ]
     if changed:
         raise UserError(
-            f"{_option(changed[0])} has no effect on lang3dxl, which never reads it: leave it off"
+            f"{_option(changed[0])} has no effect here: no method of this package reads it; leave it off"
         )
-    if model.encoder.learns_from_renderings:
+    if model.decoder.start != "noise" and model.decoder.name != "paper":
+        raise UserError(
+            f"--pipeline.model.decoder.start has no effect with --pipeline.model.decoder.name "
+            f"{model.decoder.name}: leave it off, or train with ns-train lang3dxl-paper"
+        )
+    if model.decoder.learns_from_renderings:
         return
     changed = [f"--pipeline.model.{name}" for name in _changed(model, _OF_RENDERINGS)]
     if data.regions not in ("auto", "none"):
@@ -71,7 +75,8 @@ def check_inert(config: Lang3DXLTrainerConfig) -> None:
     if changed:
         raise UserError(
             f"{_option(changed[0])} has no effect where semantics are learned after training, as with "
-            f"--pipeline.model.encoder.name {model.encoder.name}: leave it off, or choose paper"
+            f"--pipeline.model.decoder.name {model.decoder.name}: leave it off, or train with "
+            "ns-train lang3dxl-paper"
         )
 
 

@@ -17,7 +17,7 @@ from pytorch_msssim import SSIM
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from lang3dxl_ns.baselines.encoders import make_encoder
+from lang3dxl_ns.baselines.decoders import make_decoder
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
@@ -99,8 +99,8 @@ class Lang3DXLModel(RenderingModel):
         self.register_buffer("clip_mean", clip_mean)
         self.register_buffer("dense_mean", dense_mean)
         c = self.config
-        self.semantic_field = make_encoder(
-            c.encoder, c.semantic_field, len(clip_mean), len(dense_mean), *self.extent
+        self.semantic_field = make_decoder(
+            c.decoder, c.semantic_field, len(clip_mean), len(dense_mean), *self.extent
         )
         if statistics is not None:
             clip, dense = statistics.clip.std, statistics.dense
@@ -197,7 +197,7 @@ class Lang3DXLModel(RenderingModel):
     ) -> dict[str, Tensor]:
         c = self.config
         assert c.dense_weight is not None
-        ramp = schedules.semantic_ramp(self.step / c.total_steps)
+        ramp = schedules.semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
         size = fitted_size(codes, self._random_size())
         clip, dense, small_mask = self._decode_small(codes, mask, size)
         with part("downsample"):
@@ -207,7 +207,8 @@ class Lang3DXLModel(RenderingModel):
             weight = None if small_mask is None else weight
             loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, target, weight)}
             if dense is not None and "dense_target" in batch:
-                difference = losses.dense_loss(dense, batch["dense_target"], small_mask)
+                shown = small_mask if c.mask_dense else None
+                difference = losses.dense_loss(dense, batch["dense_target"], shown, c.dense_compare)
                 loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
                 labels = resize_nearest(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()
@@ -298,20 +299,20 @@ class Lang3DXLModel(RenderingModel):
 
     def _feature_maps(self, camera: Cameras, longer_side: int, mask: Tensor | None):
         """Features in a camera → clip [h, w, C], dense [h, w, D] or None, mask [h, w]; decoded before or
-        after compositing, depending on the encoder."""
-        encoder, carried = self.semantic_field, self.carried
-        assert encoder is not None and carried is not None
-        if not encoder.per_gaussian:
+        after compositing, depending on the decoder."""
+        decoder, carried = self.semantic_field, self.carried
+        assert decoder is not None and carried is not None
+        if not decoder.per_gaussian:
             codes = self.composite(camera, carried)
             return self._decode_small(codes, mask, fitted_size(codes, longer_side))
         # The last layer is linear, so hidden activations are composited and divided by coverage.
         known = carried.isfinite().all(1, keepdim=True)
-        hidden = torch.where(known, encoder.hidden(torch.where(known, carried, 0.0)), 0.0)
+        hidden = torch.where(known, decoder.hidden(torch.where(known, carried, 0.0)), 0.0)
         maps = self.composite(camera, torch.cat([hidden, known.to(hidden)], dim=1))
         size = fitted_size(maps, longer_side)
         maps = resize_nearest(maps, size)
         clip = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3)
-        head = encoder.clip_head()
+        head = decoder.clip_head()
         if head is not None:
             clip = F.linear(clip, *head)
         small = None if mask is None else resize_nearest(mask[..., None].float(), size)[..., 0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from lang3dxl_ns.baselines.encoders import EncoderConfig
+from lang3dxl_ns.baselines.decoders import DecoderConfig
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
@@ -25,7 +25,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     """Splatfacto's settings, with the method's schedule and the semantic components."""
 
     _target: type = field(default_factory=lambda: _model_class())
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
     """The feature decoder: the semantic field, or a baseline."""
     semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
     """Decoder from a 3-number code to CLIP and dense features."""
@@ -42,11 +42,18 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
     decode_size: tuple[int, int] | None = None
     """The code map is decoded at one of five sizes in this range: pixels of its longer side, inclusive.
     None: 56 to 72 in short runs, growing to 80 to 120 (the paper's) in long ones."""
+    dense_compare: Literal["auto", "target"] = "auto"
+    """Grid on which dense features are compared: the target's, as published; `auto`: the prediction's,
+    which costs a fraction, unless the target is much coarser."""
+    mask_dense: bool = True
+    """Whether the dense loss leaves out the background, like the other losses; as published it doesn't."""
+    semantic_ramp: float = 0.5
+    """Fraction of the run over which the weight of the CLIP and dense losses rises from 0.1 to 1."""
     warm_up: float = 0.0
     """Fraction of the run that trains colors only, before the semantic losses start."""
     feature_gradient_to_geometry: bool = False
-    """Let the semantic losses also move Gaussians and change opacities. In the authors' code they move
-    Gaussians too, but their gradient stops at the opacity."""
+    """Let the semantic losses also move Gaussians, as in the authors' code; opacities belong to the colors
+    alone. Costs a second rendering."""
     view_dependence: Literal["auto", "on", "off"] = "auto"
     """Colors that depend on the viewing direction (spherical harmonics of `sh_degree`); off leaves one
     color and a quarter of the numbers per Gaussian. `auto`: by the scene's measured needs."""
@@ -90,7 +97,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
         self.total_steps = iterations
         if self.semantic_field.preset == "auto":
             # Compression is a direct regression of a thousand steps, whatever the run's length.
-            compressed = self.encoder.name == "lang3dxl"
+            compressed = self.decoder.name == "gathered"
             self.semantic_field.preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "default"
         self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
         if self.densify_grad_thresh is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from lang3dxl_ns.evaluation.ground_truth import Layout
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.describe_scene import describe_scene
 from lang3dxl_ns.plugin.evaluation import Evaluation, Split
-from lang3dxl_ns.plugin.lift_features import learn_from_photos
+from lang3dxl_ns.plugin.lift_features import learn_from_photos, start_codes
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
@@ -104,7 +105,11 @@ class Lang3DXLPipeline(VanillaPipeline):
         return results
 
     def get_train_loss_dict(self, step: int):
-        """Outputs, losses and metrics of the next photo."""
+        """Outputs, losses and metrics of the next photo; before it, where semantics begin, their start."""
+        config = self.config.model
+        begins = step == math.ceil(config.warm_up * config.total_steps)
+        if begins and config.decoder.start == "gathered" and self.model.learns_from_renderings:
+            start_codes(self.model, self.datamanager.train_photos())
         outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
         return outputs, self.last_losses, metrics
 
@@ -149,8 +154,8 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""
-        encoder = self.model.semantic_field
-        assert encoder is not None
+        decoder = self.model.semantic_field
+        assert decoder is not None
         training = self.model.training
         self.model.train()
         photos = self.datamanager.train_photos()
@@ -158,12 +163,12 @@ class Lang3DXLPipeline(VanillaPipeline):
             with progress_bar() as bar:
                 total = len(self.datamanager.train_dataset)
                 gathering = bar.track(photos, total=total, description="gathering features")
-                learning = bar.add_task("learning codes", total=encoder.learning_steps or None)
+                learning = bar.add_task("learning codes", total=decoder.learning_steps or None)
                 learn_from_photos(self.model, gathering, lambda: bar.advance(learning))
         finally:
             self.model.train(training)
-        if encoder.learned is not None:
-            CONSOLE.log(escape(encoder.learned))
+        if decoder.learned is not None:
+            CONSOLE.log(escape(decoder.learned))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""

@@ -18,7 +18,7 @@ from torch import Tensor
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
@@ -63,7 +63,7 @@ class RenderingModel(SplatfactoModel):
     """
 
     config: Lang3DXLModelConfig
-    semantic_field: SemanticEncoder | None
+    semantic_field: Decoder | None
     appearance: AppearanceField | None
     sky: Sky | None
     """The first Gaussians' colors; None: there is no sky, or it was trained like all Gaussians."""
@@ -164,7 +164,7 @@ class RenderingModel(SplatfactoModel):
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
         """Render a camera: `rgb`, `accumulation`, `background`; in training `codes` [H, W, d] if the
-        encoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
+        decoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
         if self.training:
             return self._training_outputs(camera)
         return self._shown(camera, None, None, self._code_colors())[1]
@@ -288,11 +288,11 @@ class RenderingModel(SplatfactoModel):
                 colors, in_photo = self.appearance(gaussians, colors, vector, visible, self.step)
         settings: dict[str, Any] = {"backend": self.backend, "antialiased": self.antialiased}
         absgrad, depth = self.strategy.absgrad, self.config.output_depth_during_training
-        detach = not self.config.feature_gradient_to_geometry
-        if in_photo is gaussians:
+        moves = self.config.feature_gradient_to_geometry and features is not None
+        if in_photo is gaussians and not moves:
             raster = rasterize(
                 gaussians, view, colors, background,
-                features=features, detach_features=detach, render_depth=depth, absgrad=absgrad, **settings,
+                features=features, render_depth=depth, absgrad=absgrad, **settings,
             )  # fmt: skip
             return raster, background
         photo = rasterize(in_photo, view, colors, background, absgrad=absgrad, **settings)
@@ -300,7 +300,9 @@ class RenderingModel(SplatfactoModel):
             return photo, background
         # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
         carried = colors.detach()[:, :1] if features is None else features
-        if detach:
+        if moves:
+            gaussians = replace(gaussians, opacities=gaussians.opacities.detach())
+        else:
             gaussians, view = gaussians.detach(), view.detach()
         scene = rasterize(gaussians, view, carried, render_depth=depth, **settings)
         image = None if features is None else scene.image

@@ -74,8 +74,8 @@ def _read(path: Path, places: Sequence[Sequence[str]], complete: bool = False) -
         *(RecursionError, ImportError),
     ) as error:
         raise UserError(
-            f"{path} can't be read ({error}): it is damaged, or from a version whose settings are no longer "
-            "known; restore it, or train anew"
+            f"{path} can't be read ({error}): it is damaged, or from a version of lang3dxl-ns whose settings "
+            "are no longer known; restore it, open it with that version, or train anew"
         ) from error
     for settings in found if complete else ():
         if is_dataclass(settings):
@@ -83,7 +83,8 @@ def _read(path: Path, places: Sequence[Sequence[str]], complete: bool = False) -
     odd = (line for settings in found if is_dataclass(settings) for line in _differences(settings))
     if first := next(odd, None):
         raise UserError(
-            f"{path} {first}: it is truncated, or from another version; copy it again, or train anew"
+            f"{path} {first}: it is truncated, or from another version of lang3dxl-ns; copy it again, open "
+            "it with that version, or train anew"
         )
     return found
 

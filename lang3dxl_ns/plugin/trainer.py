@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
@@ -46,10 +46,6 @@ from lang3dxl_ns.plugin.step_guard import StepGuard
 from lang3dxl_ns.preparation.needs import write_needs
 from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
-
-if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
-
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 6.0}
 """Time of an iteration in renderings of its photo, by whether semantics are trained with the scene: measured
@@ -90,7 +86,8 @@ class Lang3DXLTrainer(Trainer):
     """nerfstudio's trainer with atomic checkpoints, a resumed run that ends at the requested iteration, and a
     guard against steps that are not finite."""
 
-    config: Lang3DXLTrainerConfig
+    config: Any
+    """`Lang3DXLTrainerConfig`, whose module knows this class."""
     pipeline: Lang3DXLPipeline
     optimizers: GuardedOptimizers
     stages: Stages
@@ -104,7 +101,7 @@ class Lang3DXLTrainer(Trainer):
     _is_ending = False
     _run_state: dict[str, Any] | None = None
 
-    def __init__(self, config: Lang3DXLTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+    def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
         """Mixed precision means bfloat16 where the GPU has it: it has float32's range, so that gradients need
         no scale, and no step is lost or waits for one. Older GPUs (before Ampere) take float16 with a
         scale."""
@@ -280,12 +277,12 @@ class Lang3DXLTrainer(Trainer):
                 synchronize()
             rendering = perf_counter() - start
             model.train()
-        count, encoder = self.config.max_num_iterations, model.semantic_field
+        count, decoder = self.config.max_num_iterations, model.semantic_field
         seconds = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings]
         line, words = f"training: {roughly(seconds)} for {count:,} iterations", 0.0
-        if encoder is not None and self.pipeline.has_words_to_learn:
+        if decoder is not None and self.pipeline.has_words_to_learn:
             words = rendering * len(cameras) * RENDERINGS_PER_PHOTO
-            words += encoder.learning_seconds(model.num_points)
+            words += decoder.learning_seconds(model.num_points)
             line += f", then {roughly(words)} to learn words"
         self.stages.weigh("words", "train", words / seconds if seconds else 1.0)
         CONSOLE.log(f"{line}, more if Gaussians multiply")
@@ -374,7 +371,7 @@ class Lang3DXLTrainer(Trainer):
         """Write the trained scene as one file into the run's folder, to ask and to share."""
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
-        how = f"{self.config.method_name}, {config.encoder.name}, {self.config.max_num_iterations} iterations"
+        how = f"{self.config.method_name}, {config.decoder.name}, {self.config.max_num_iterations} iterations"
         scene = self.pipeline.model.scene(self.pipeline.scene_file)
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
         size = write_scene(path, scene, told)

@@ -83,7 +83,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             check_address(self.viewer.websocket_host, self.viewer.websocket_port)
         fresh = self.timestamp == "{timestamp}"
         if fresh:  # a run's config.yml has what these settings came to
-            check_inert(self)
+            check_inert(self.pipeline.model, self.pipeline.datamanager)
         super().set_timestamp()
         self.fit_to_run()
         data = self.pipeline.datamanager
@@ -156,7 +156,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.pipeline.model.fit_to_run(iterations)
         self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
         datamanager = self.pipeline.datamanager
-        datamanager.settle_targets(learned=self.pipeline.model.encoder.learns_from_renderings)
+        datamanager.settle_targets(learned=self.pipeline.model.decoder.learns_from_renderings)
         datamanager.data = _absolute(datamanager.data or self.data)
         self.data = datamanager.data
         self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import (
     TEMPERATURE,
@@ -116,7 +116,7 @@ class PerPixel:
 
 @torch.no_grad()
 def make_engine(
-    decoder: SemanticEncoder, codes: Float[Tensor, "n d"], temperature: float = TEMPERATURE
+    decoder: Decoder, codes: Float[Tensor, "n d"], temperature: float = TEMPERATURE
 ) -> QueryEngine:
     """The engine for a feature decoder, with its own order of compositing and decoding."""
     if decoder.per_gaussian:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.memory import with_less_memory
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 
 _CHUNK_MB = 64
@@ -33,9 +33,9 @@ class GaussianFeatures:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, encoder: SemanticEncoder, carried: Float[Tensor, "n d"]) -> GaussianFeatures:
+    def of(cls, decoder: Decoder, carried: Float[Tensor, "n d"]) -> GaussianFeatures:
         """Decode the carried values of Gaussians; a NaN marks an unknown one."""
-        layer = encoder.clip_head()
+        layer = decoder.clip_head()
         narrow = layer is not None and layer[0].shape[1] < layer[0].shape[0]
         head = torch.cat([layer[0].T, layer[1][None]]) if narrow and layer else None
         gram = None if head is None else (head.double() @ head.double().T).to(head)
@@ -44,13 +44,13 @@ class GaussianFeatures:
             seen = part.isfinite().all(1, keepdim=True)
             part = torch.where(seen, part, 0.0)
             if gram is None:
-                rows = F.normalize(encoder.decode_clip(part), dim=-1)
+                rows = F.normalize(decoder.decode_clip(part), dim=-1)
             else:
-                rows = F.pad(encoder.hidden(part), (0, 1), value=1.0)
+                rows = F.pad(decoder.hidden(part), (0, 1), value=1.0)
                 rows = rows / ((rows @ gram) * rows).sum(1, keepdim=True).clamp_min(1e-12).sqrt()
             return torch.where(seen, rows, 0.0).half()
 
-        rows = _in_chunks(decode, carried, encoder.clip_dim)
+        rows = _in_chunks(decode, carried, decoder.clip_dim)
         return cls(rows, head, (rows != 0).any(1))
 
     def some(self, count: int) -> GaussianFeatures:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import watched
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.cache import fingerprint
@@ -84,7 +84,7 @@ class Scene:
         self,
         splats: Splats,
         file: SceneFile,
-        decoder: SemanticEncoder | None = None,
+        decoder: Decoder | None = None,
         codes: Float[Tensor, "n d"] | None = None,
         *,
         looks: Looks | None = None,
@@ -604,7 +604,7 @@ class Scene:
 
     # ── computed once ───────────────────────────────────────────────────────────────────────────────
 
-    def _semantics(self) -> tuple[SemanticEncoder, Float[Tensor, "n d"]]:
+    def _semantics(self) -> tuple[Decoder, Float[Tensor, "n d"]]:
         if self.decoder is None or self.codes is None:
             raise UserError(NO_SEMANTICS)
         return self.decoder, self.codes

@@ -24,12 +24,12 @@ from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
 
-from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
+from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.query_config import QueryConfig
@@ -184,7 +184,7 @@ def _mask_of(photo: Any) -> bytes | None:
     return content.getvalue()
 
 
-def _described(decoder: SemanticEncoder) -> dict[str, Any]:
+def _described(decoder: Decoder) -> dict[str, Any]:
     settings = getattr(getattr(decoder, "field", decoder), "settings", None)
     return {
         "name": decoder.name,
@@ -364,7 +364,7 @@ def _codes(file: Any, sizes: Mapping[str, list[int]], bounded: bool, count: int)
     return torch.where(places == _UNKNOWN_CODE, torch.nan, codes)
 
 
-def _decoder(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> SemanticEncoder:
+def _decoder(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> Decoder:
     settings, clip, dense = told["settings"] or {}, told["clip_dim"], told["dense_dim"]
     for value in (clip, dense, *settings.values()):
         _expect(isinstance(value, int | float | str), f"a decoder has the setting {value!r}")
@@ -373,8 +373,9 @@ def _decoder(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) ->
     _expect(
         _parameters(settings, clip + dense) <= 4 * stored + 10_000_000, "its decoder is larger than the file"
     )
-    decoder = make_encoder(
-        EncoderConfig(name=told["name"]),
+    decoder = make_decoder(
+        # The first versions called it by the name of the method.
+        DecoderConfig(name="gathered" if told["name"] == "lang3dxl" else told["name"]),
         SemanticFieldConfig(preset="short", **settings),
         *(clip, dense, torch.zeros(3), 1.0),
     )

@@ -43,20 +43,31 @@ def doubtful_placements(
 ) -> dict[int, str]:
     """The photos whose matches contradict their place more than they support it, or support it by one other
     photo alone, with the reason. rotations: world → camera in the model."""
-    supporting, contradicting, supporters = Counter[int](), Counter[int](), Counter[int]()
-    for pair in pairs:
-        modeled = rotations[pair.second] @ rotations[pair.first].T
-        apart = np.degrees(np.arccos(np.clip((np.trace(modeled.T @ pair.turn) - 1) / 2, -1, 1)))
-        for photo in (pair.first, pair.second):
-            (contradicting if apart > APART else supporting)[photo] += pair.matches
-            supporters[photo] += apart <= APART
-    reasons = {}
-    for photo in rotations:
-        if contradicting[photo] > supporting[photo]:
-            reasons[photo] = "most of its matches are with photos that stand elsewhere"
-        elif supporters[photo] < 2 and len(rotations) > 3:
-            reasons[photo] = "only one other photo supports it"
-    return reasons
+    reasons: dict[int, str] = {}
+    judged = [(pair, _apart(rotations, pair) > APART) for pair in pairs]
+    while True:  # the most contradicted first, since its pairs would accuse its neighbors
+        supporting, contradicting, supporters = Counter[int](), Counter[int](), Counter[int]()
+        for pair, contradicts in judged:
+            if pair.first in reasons or pair.second in reasons:
+                continue
+            for photo in (pair.first, pair.second):
+                (contradicting if contradicts else supporting)[photo] += pair.matches
+                supporters[photo] += not contradicts
+        accused = {
+            photo: n - supporting[photo] for photo, n in contradicting.items() if n > supporting[photo]
+        }
+        if not accused:
+            break
+        worst = max(accused, key=lambda photo: accused[photo])
+        reasons[worst] = "most of its matches are with photos that stand elsewhere"
+    lonely = [p for p in rotations if p not in reasons and supporters[p] < 2 and len(rotations) > 3]
+    return reasons | dict.fromkeys(lonely, "only one other photo supports it")
+
+
+def _apart(rotations: Mapping[int, Float[Array, "3 3"]], pair: MatchedPair) -> float:
+    """Degrees between the measured rotation of a pair and the model's."""
+    modeled = rotations[pair.second] @ rotations[pair.first].T
+    return float(np.degrees(np.arccos(np.clip((np.trace(modeled.T @ pair.turn) - 1) / 2, -1, 1))))
 
 
 def matched_pairs(database: pycolmap.Database, model: pycolmap.Reconstruction) -> list[MatchedPair]:

@@ -247,7 +247,7 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     detector = make_tiny_grounding_dino(tmp_path / "detector", seed=2)
     sam = make_tiny_sam(tmp_path / "sam", seed=2)
     few = "--pipeline.datamanager.dense-tokens 8"
-    few += " --pipeline.model.encoder.compression.steps 40"  # learning codes takes 15 seconds otherwise
+    few += " --pipeline.model.decoder.compression.steps 40"  # learning codes takes 15 seconds otherwise
     short = {"steps": (4, 6), "ns_train": few}
     short |= {"clipseg": str(tmp_path / "no"), "langsam": (str(detector), str(sam))}
     command = Ablation(out, (scene,), rows=names, **short)

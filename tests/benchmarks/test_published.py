@@ -15,7 +15,7 @@ from lang3dxl_ns.common.reports import write_atomically
 from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
-SMALL = {"clip": "builtin", "scale": 1.0, "ns_train": "--pipeline.model.encoder.compression.steps 40"}
+SMALL = {"clip": "builtin", "scale": 1.0, "ns_train": "--pipeline.model.decoder.compression.steps 40"}
 """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
 
@@ -178,21 +178,23 @@ def test_ours_stand_beside_the_published_figures_of_their_scene_and_category(two
     assert "fine-tuned on landmarks" in text and "4 labeled photos" not in text
 
 
-def test_each_scene_is_trained_with_its_own_published_flags(two_scenes, monkeypatch):
+@pytest.mark.parametrize("method", ["lang3dxl", "lang3dxl-paper"])
+def test_each_scene_is_trained_with_its_own_published_flags(two_scenes, monkeypatch, method):
     seen = {}
 
     def submit(self, run, log):
-        seen[run.label] = (run.steps, self.settings.flags, self.truth.name)
+        seen[run.label] = (run.steps, self.settings.flags, self.truth.name, run.row)
         raise UserError("enough")
 
     monkeypatch.setattr(KeptRuns, "_submit", submit)
-    two_scenes.ns_train = "--pipeline.model.encoder.name paper"
+    two_scenes.method, two_scenes.ns_train = method, "--pipeline.model.clip-weight 2"
     two_scenes.main()
     for scene, preset in (("milano", "milano"), ("St_Paul", "st_paul")):
-        steps, flags, truth = seen[scene]
+        steps, flags, truth, row = seen[scene]
         assert steps == load_preset(f"holyscenes/{preset}")["train"]["max-num-iterations"] == 70_000
         assert f"--pipeline.datamanager.scale-preset holyscenes/{preset}" in flags
-        assert flags.endswith("--pipeline.model.encoder.name paper")
+        assert flags.endswith("--pipeline.model.clip-weight 2")
+        assert row.method == method
         assert truth == scene
 
 

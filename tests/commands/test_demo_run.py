@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 
 
 SCENE = {"photos": 8, "test_views": 6, "quick": True, "wild": False}
-FEW = "--pipeline.model.encoder.compression.steps 40"
+FEW = "--pipeline.model.decoder.compression.steps 40"
 """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
 

@@ -10,7 +10,7 @@ from processes import output as command
 from processes import run as attempt
 
 pytestmark = pytest.mark.slow
-FEW = ("--pipeline.model.encoder.compression.steps", 40)
+FEW = ("--pipeline.model.decoder.compression.steps", 40)
 """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
 

@@ -24,31 +24,36 @@ def test_an_unknown_preset_names_the_known_ones(name):
 
 
 def test_a_preset_that_is_not_a_scene_has_no_flags():
-    with pytest.raises(UserError, match="not a scene preset"):
+    with pytest.raises(UserError, match="no preset for training"):
         train_flags("synonyms/architecture")
 
 
 @pytest.mark.slow
 def test_training_takes_the_flags_of_every_scene(capsys):
-    """As `ns-train lang3dxl` would parse them."""
+    """As `ns-train lang3dxl-paper` would parse them, those of the authors' release after a scene's."""
     from copy import deepcopy
 
     import tyro
 
-    from lang3dxl_ns.methods import lang3dxl
+    from lang3dxl_ns.methods import lang3dxl_paper
 
     for path in FOLDER.glob("holyscenes/*.yaml"):
         cli.main(["preset", f"holyscenes/{path.stem}"])
         flags = capsys.readouterr().out.split()
         if path.stem in ("milano", "badshahi"):  # parsing takes seconds; the other four have milano's flags
-            config = tyro.cli(type(lang3dxl.config), args=flags, default=deepcopy(lang3dxl.config))
+            cli.main(["preset", "official"])
+            flags += capsys.readouterr().out.split()
+            settings = tyro.conf.FlagConversionOff[type(lang3dxl_paper.config)]
+            config = tyro.cli(settings, args=flags, default=deepcopy(lang3dxl_paper.config))
             iterations = config.max_num_iterations
             assert iterations == (200_000 if path.stem == "badshahi" else 70_000)
             assert config.pipeline.datamanager.scale_preset == f"holyscenes/{path.stem}"
             start = 5_000 if path.stem == "badshahi" else 2_000
             assert config.pipeline.model.densify_from * iterations == pytest.approx(start, abs=1)
             model = config.pipeline.model
-            assert (model.densify_grad_thresh, model.densify_size_thresh) == (2e-4, 0.22)
+            assert model.semantic_ramp * iterations == pytest.approx(15_000, abs=1)
+            assert (model.semantic_field.preset, model.dense_weight) == ("official", 0.8)
+            assert model.downsampler.logit_bound is None and not model.appearance.opacity_shift
             until = config.optimizers["means"]["scheduler"].until
             assert until * iterations == pytest.approx(30_000, abs=1)
         else:
@@ -57,5 +62,5 @@ def test_training_takes_the_flags_of_every_scene(capsys):
 
 def test_without_a_name_the_scenes_are_listed(capsys):
     cli.main(["preset"])
-    assert capsys.readouterr().out.split() == scene_presets()
+    assert capsys.readouterr().out.split() == ["official", *scene_presets()]
     assert all(train_flags(name) for name in scene_presets())

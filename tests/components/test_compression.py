@@ -98,10 +98,10 @@ def test_a_scene_that_nobody_has_seen_is_unknown():
 def test_learning_again_begins_anew():
     """As the viewer does while a run goes on, with Gaussians that have come meanwhile."""
     features, _ = clusters([200] * 4)
-    encoder = CompressedField(SemanticFieldConfig("short"), CHANNELS, QUICK)
-    first = encoder.learn_gaussians(features, torch.ones(len(features)))
-    encoder.learn_gaussians(features.flip(0)[:300], torch.ones(300))
-    again = encoder.learn_gaussians(features, torch.ones(len(features)))
+    decoder = CompressedField(SemanticFieldConfig("short"), CHANNELS, QUICK)
+    first = decoder.learn_gaussians(features, torch.ones(len(features)))
+    decoder.learn_gaussians(features.flip(0)[:300], torch.ones(300))
+    again = decoder.learn_gaussians(features, torch.ones(len(features)))
     assert torch.equal(first, again)
 
 
@@ -160,24 +160,24 @@ def test_codes_have_more_numbers_where_three_lose_too_much(monkeypatch):
     features, _ = clusters([100] * 4)
     losses = iter([0.9, 0.97, 0.97])
     monkeypatch.setattr(compression, "centered_cosine", lambda *_: next(losses))
-    encoder = CompressedField(SemanticFieldConfig("short"), CHANNELS, CompressionConfig(20, 128))
-    codes = encoder.learn_gaussians(features, torch.ones(len(features)))
-    assert codes.shape[1] == encoder.code_dim == 4
+    decoder = CompressedField(SemanticFieldConfig("short"), CHANNELS, CompressionConfig(20, 128))
+    codes = decoder.learn_gaussians(features, torch.ones(len(features)))
+    assert codes.shape[1] == decoder.code_dim == 4
     assert (
-        encoder.learned is not None
-        and "4 numbers" in encoder.learned
-        and "3 numbers: 0.900" in encoder.learned
+        decoder.learned is not None
+        and "4 numbers" in decoder.learned
+        and "3 numbers: 0.900" in decoder.learned
     )
     # Another process makes room for them, and decodes the same.
     other = CompressedField(SemanticFieldConfig("short"), CHANNELS)
     other.fit_codes(codes)
-    other.load_state_dict(encoder.state_dict())
-    torch.testing.assert_close(other.decode_clip(codes), encoder.decode_clip(codes))
+    other.load_state_dict(decoder.state_dict())
+    torch.testing.assert_close(other.decode_clip(codes), decoder.decode_clip(codes))
 
 
 def test_a_number_of_numbers_that_was_asked_for_is_kept(monkeypatch):
     features, _ = clusters([100] * 4)
     monkeypatch.setattr(compression, "centered_cosine", lambda *_: 0.0)
     config = SemanticFieldConfig("short", code_dim=2)
-    encoder = CompressedField(config, CHANNELS, CompressionConfig(20, 128))
-    assert encoder.learn_gaussians(features, torch.ones(len(features))).shape[1] == 2
+    decoder = CompressedField(config, CHANNELS, CompressionConfig(20, 128))
+    assert decoder.learn_gaussians(features, torch.ones(len(features))).shape[1] == 2

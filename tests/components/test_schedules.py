@@ -30,10 +30,11 @@ def test_an_exponential_ramp_reaches_its_end_at_the_given_step_and_stays():
     assert exponential_ramp(0, 0.1, 1.0, 0) == pytest.approx(1.0)
 
 
-def test_the_semantic_ramp_rises_from_a_tenth_to_one_in_half_the_run():
-    assert semantic_ramp(0) == pytest.approx(0.1)
-    assert semantic_ramp(0.25) == pytest.approx(math.sqrt(0.1))
-    assert [semantic_ramp(x) for x in (0.5, 0.75, 1)] == pytest.approx([1, 1, 1])
+@pytest.mark.parametrize("share", [0.5, 15_000 / 70_000])
+def test_the_semantic_ramp_rises_from_a_tenth_to_one_in_its_share_of_the_run(share):
+    assert semantic_ramp(0, share) == pytest.approx(0.1)
+    assert semantic_ramp(share / 2, share) == pytest.approx(math.sqrt(0.1))
+    assert [semantic_ramp(x, share) for x in (share, 0.75, 1)] == pytest.approx([1, 1, 1])
 
 
 @pytest.mark.parametrize("power", [1, 2])
@@ -46,7 +47,11 @@ def test_a_cosine_falls_from_peak_to_end_without_turning(power):
 
 
 def test_beyond_its_range_a_schedule_keeps_the_nearer_end():
-    for schedule in (lambda x: log_linear(x, 1, 2), lambda x: cosine_decay(x, 2, 1, 2), semantic_ramp):
+    for schedule in (
+        lambda x: log_linear(x, 1, 2),
+        lambda x: cosine_decay(x, 2, 1, 2),
+        lambda x: semantic_ramp(x, 0.3),
+    ):
         assert schedule(-1) == schedule(0)
         assert schedule(2) == schedule(1)
 
@@ -57,7 +62,7 @@ def test_numpy_scalars_never_leak_out(x):
     values = [
         log_linear(x, one, one),
         exponential_ramp(x, one, one, one),
-        semantic_ramp(x),
+        semantic_ramp(x, one),
         cosine_decay(x, one, one, one),
     ]
     assert {type(value) for value in values} == {float}

@@ -9,7 +9,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 
 USE = "pipeline__model__appearance__use"
-CODES = "pipeline__model__encoder__name"
+CODES = "pipeline__model__decoder__name"
 SHIFT = "pipeline__model__appearance__opacity_shift"
 
 

@@ -6,6 +6,7 @@ import pytest
 import tyro
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.plugin.inert_settings import OF_COLMAP, OF_IMAGE_CACHES, OF_SPLATFACTO, check_inert
 
@@ -46,6 +47,8 @@ def test_the_help_does_not_offer_them(capsys):
         ("pipeline.model.decode_size", (80, 120)),
         ("pipeline.model.warm_up", 0.5),
         ("pipeline.model.feature_gradient_to_geometry", True),
+        ("pipeline.model.downsampler", DownsamplerConfig(hidden=8)),
+        ("pipeline.model.decoder.start", "gathered"),
         ("pipeline.datamanager.regions", "felzenszwalb"),
     ],
 )
@@ -58,8 +61,9 @@ def test_setting_one_is_an_error_that_names_it(path, value, tmp_path):
 
 
 def test_what_is_trained_with_the_scene_may_set_its_weights():
-    config = changed("pipeline.model.encoder.name", "paper")
+    config = changed("pipeline.model.decoder.name", "paper")
     config.pipeline.model.clip_weight = 0.0
     config.pipeline.datamanager.regions = "felzenszwalb"
-    check_inert(config)
-    check_inert(changed("pipeline.datamanager.regions", "none"))
+    check_inert(config.pipeline.model, config.pipeline.datamanager)
+    plain = changed("pipeline.datamanager.regions", "none")
+    check_inert(plain.pipeline.model, plain.pipeline.datamanager)

@@ -18,6 +18,7 @@ import lang3dxl_ns
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.language import open_scorer
 from lang3dxl_ns.plugin.cameras import view_of
+from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.scene_file import describe_scene_file
 from lang3dxl_ns.rendering import Gaussians, rasterize
@@ -75,8 +76,10 @@ def test_training_leaves_a_scene_file_that_answers_like_the_run(scene, trainer):
     (path,) = trainer.base_dir.glob("*.scene")
     found = lang3dxl_ns.load_scene(trainer.base_dir)
     assert describe_scene_file(path)["provenance"].made_how.startswith("lang3dxl")
+    # Relevancy is steeper for encoders whose cosines lie close together, as random ones do.
+    atol = 1e-3 * max(1.0, scene.engine.temperature / TEMPERATURE)
     for word in ("dome", "rose window"):
-        np.testing.assert_allclose(found.relevancy(word), scene.relevancy(word), atol=1e-3)
+        np.testing.assert_allclose(found.relevancy(word), scene.relevancy(word), atol=atol)
     for photo in ("photo_000", "photo_003"):
         here, there = (s.render(photo).pixels.astype(float) / 255 for s in (scene, found))
         assert 10 * np.log10(1 / max(np.square(here - there).mean(), 1e-9)) > 40

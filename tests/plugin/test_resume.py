@@ -10,7 +10,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
 EVERYTHING = {
-    "pipeline__model__encoder__name": "paper",
+    "pipeline__model__decoder__name": "paper",
     "pipeline__model__densify_grad_thresh": 1e-7,  # at every second step, with random splits
     "pipeline__model__densify_until": 0.75,
     "pipeline__model__appearance__use": "on",

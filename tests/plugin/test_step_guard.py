@@ -59,7 +59,7 @@ def all_finite(state) -> bool:
     return all(map(all_finite, values))
 
 
-CODES = {"pipeline__model__encoder__name": "paper"}
+CODES = {"pipeline__model__decoder__name": "paper"}
 
 
 def spoil(monkeypatch, key: str, value: float, photos: set[str]) -> None:

@@ -15,7 +15,7 @@ from lang3dxl_ns.common.errors import UserError
 @pytest.fixture
 def train(train):
     """With codes that are trained with the scene."""
-    return partial(train, pipeline__model__encoder__name="paper")
+    return partial(train, pipeline__model__decoder__name="paper")
 
 
 def parameters(trainer) -> dict[str, torch.Tensor]:

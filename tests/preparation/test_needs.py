@@ -152,7 +152,7 @@ def test_needed_components_are_built_and_learn(train, scene):
         pipeline__model__view_dependence="on",
         pipeline__model__camera_optimization="on",
         pipeline__datamanager__regions="felzenszwalb",
-        pipeline__model__encoder__name="paper",  # only codes that are trained with the scene use regions
+        pipeline__model__decoder__name="paper",  # only codes that are trained with the scene use regions
     )
     model = trainer.pipeline.model
     assert model.gauss_params["features_rest"].shape[1] == 15

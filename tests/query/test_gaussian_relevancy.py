@@ -14,7 +14,7 @@ from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.scene.camera import Camera
 
 
-def encoder(channels: int) -> CompressedField:
+def decoder(channels: int) -> CompressedField:
     torch.manual_seed(0)
     field = CompressedField(SemanticFieldConfig("short"), channels)
     field.grid.table.data.normal_(std=0.3)
@@ -31,7 +31,7 @@ def queries(channels: int) -> Queries:
 @pytest.mark.parametrize("channels", [16, 65, 512, 1152])
 def test_the_low_rank_product_is_the_full_one(channels):
     """Narrower and wider than the hidden layer; 16 bits cost less than 1e-3."""
-    field, asked = encoder(channels), queries(channels)
+    field, asked = decoder(channels), queries(channels)
     codes = torch.randn(500, 3)
     features = GaussianFeatures.of(field, codes)
     assert features.rows.shape[1] <= 65
@@ -40,7 +40,7 @@ def test_the_low_rank_product_is_the_full_one(channels):
 
 
 def test_what_is_unknown_answers_nothing_and_changes_nothing():
-    field, asked = encoder(512), queries(512)
+    field, asked = decoder(512), queries(512)
     codes = torch.randn(20, 3)
     alone = GaussianFeatures.of(field, codes).relevancy(asked)
     codes = torch.cat([codes, torch.full((2, 3), torch.nan)])
@@ -52,7 +52,7 @@ def test_what_is_unknown_answers_nothing_and_changes_nothing():
 
 
 def test_memory_for_decoding_changes_no_answer(monkeypatch):
-    field, asked, codes = encoder(512), queries(512), torch.randn(300, 3)
+    field, asked, codes = decoder(512), queries(512), torch.randn(300, 3)
     whole = GaussianFeatures.of(field, codes).relevancy(asked)
     monkeypatch.setattr("lang3dxl_ns.query.gaussian_relevancy._CHUNK_MB", 0.05)
     parts = GaussianFeatures.of(field, codes).relevancy(asked)
@@ -60,7 +60,7 @@ def test_memory_for_decoding_changes_no_answer(monkeypatch):
 
 
 def test_every_encoder_has_the_engine_of_its_order():
-    assert isinstance(make_engine(encoder(16), torch.zeros(3, 3)), PerGaussian)
+    assert isinstance(make_engine(decoder(16), torch.zeros(3, 3)), PerGaussian)
     assert isinstance(make_engine(DirectFeatures(16, 0), torch.zeros(3, 16)), PerPixel)
 
 
@@ -86,7 +86,7 @@ def map_of(engine, asked, gaussians, camera):
 def test_a_composited_relevancy_is_the_mean_of_the_gaussians_by_their_weight():
     """Weights by hand: what a Gaussian alone carries a 1 of is its contribution to every pixel."""
     gaussians, camera = slab(12)
-    field, asked = encoder(64), queries(64)
+    field, asked = decoder(64), queries(64)
     codes = torch.randn(12, 3)
     engine = make_engine(field, codes)
     maps, _ = map_of(engine, asked, gaussians, camera)
@@ -99,7 +99,7 @@ def test_a_composited_relevancy_is_the_mean_of_the_gaussians_by_their_weight():
 def test_a_scene_of_one_material_says_the_same_wherever_it_is_seen():
     """Relevancy over coverage is one number: at edges, through haze, from the other side."""
     gaussians, camera = slab(60)
-    engine = make_engine(encoder(64), torch.tensor([[0.3, -1.0, 0.7]]).expand(60, 3))
+    engine = make_engine(decoder(64), torch.tensor([[0.3, -1.0, 0.7]]).expand(60, 3))
     asked = queries(64)
     expected = engine.of_gaussians(asked)[:, :1, None]
     behind = camera.view_matrix.clone()

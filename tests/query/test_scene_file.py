@@ -18,7 +18,7 @@ from painted_scene import (
 )
 from PIL import Image
 
-from lang3dxl_ns.baselines.encoders import NAMES, EncoderConfig, make_encoder
+from lang3dxl_ns.baselines.decoders import NAMES, DecoderConfig, make_decoder
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.looks import Looks
@@ -42,8 +42,8 @@ def looks(seed: int = 0) -> Looks:
 def decoded(name: str, seed: int = 0) -> dict:
     """A decoder of this kind with random weights, and codes for the painted Gaussians."""
     torch.manual_seed(seed)
-    decoder = make_encoder(
-        EncoderConfig(name=name), SemanticFieldConfig(preset="short"), CHANNELS, 0, torch.zeros(3), 5.0
+    decoder = make_decoder(
+        DecoderConfig(name=name), SemanticFieldConfig(preset="short"), CHANNELS, 0, torch.zeros(3), 5.0
     )
     decoder.requires_grad_(False)
     count = len(painted_gaussians()["means"])
@@ -53,14 +53,14 @@ def decoded(name: str, seed: int = 0) -> dict:
         codes = torch.randn(count, 3)
     gaussians = {"means": painted_splats().means}
     carried = decoder.carried(gaussians if codes is None else gaussians | {"codes": codes}).detach().clone()
-    if name == "lang3dxl":
+    if name == "gathered":
         carried[7] = torch.nan
     return {"decoder": decoder, "codes": carried}
 
 
 @pytest.fixture
 def written(tmp_path):
-    scene = painted_scene(**decoded("lang3dxl"), looks=looks(), background=torch.tensor([0.2, 0.0, 1.0]))
+    scene = painted_scene(**decoded("gathered"), looks=looks(), background=torch.tensor([0.2, 0.0, 1.0]))
     path = tmp_path / "wall.scene"
     write_scene(path, scene, Provenance(title="A wall", credit="Painters", license="CC BY 4.0"))
     return scene, path
@@ -89,7 +89,7 @@ def asdict_of(photo):
 @pytest.mark.parametrize("looks", [None, looks()], ids=["one lighting", "looks"])
 def test_common_words_need_no_clip(tmp_path, looks):
     """The CLIP that this scene names is nowhere."""
-    scene, path = painted_scene(**decoded("lang3dxl"), looks=looks), tmp_path / "wall.scene"
+    scene, path = painted_scene(**decoded("gathered"), looks=looks), tmp_path / "wall.scene"
     write_scene(path, scene)
     found = read_scene(path, "cpu")
     for word in ("dome", "windows", "pilasters"):
@@ -118,7 +118,7 @@ def test_colors_alone_make_a_scene(tmp_path):
 
 
 def test_a_gaussian_of_one_color_takes_at_most_48_bytes(tmp_path):
-    small, large = painted_scene(**decoded("lang3dxl")), painted_scene(**decoded("lang3dxl"))
+    small, large = painted_scene(**decoded("gathered")), painted_scene(**decoded("gathered"))
     rows = torch.arange(len(large.splats)).repeat(4)
     large = painted_scene(splats=large.splats.select(rows), decoder=large.decoder, codes=large.codes[rows])
     sizes = [write_scene(tmp_path / "a.scene", scene) for scene in (small, large)]
@@ -141,7 +141,7 @@ def test_foregrounds_travel_with_the_scene(tmp_path):
     mask[:, 12:] = 255
     Image.fromarray(mask).save(tmp_path / "mask.png")
     scene = painted_scene()
-    scene = painted_scene(**decoded("lang3dxl"))
+    scene = painted_scene(**decoded("gathered"))
     scene.file.photos[2] = replace(scene.file.photos[2], mask=str(tmp_path / "mask.png"))
     expected = scene.query("dome", "0003").relevancy
     write_scene(tmp_path / "a.scene", scene)
@@ -255,3 +255,10 @@ def test_other_names_are_refused(tmp_path):
         write_scene(tmp_path / "a.ply", painted_scene())
     with pytest.raises(UserError, match="not a file"):
         read_scene(tmp_path / "none.scene")
+
+
+def test_a_file_that_calls_the_default_by_its_former_name_opens(written):
+    scene, path = written
+    rewritten(path, lambda told, header: set_at(told, "lang3dxl", "decoder", "name"))
+    found = read_scene(path, "cpu", encode_texts=encode_texts)
+    np.testing.assert_allclose(found.relevancy("dome"), scene.relevancy("dome"), atol=1e-3)

@@ -65,7 +65,7 @@ def field_scene(code_dim: int, layers: int = 1):
     generator = torch.Generator().manual_seed(code_dim)
     config = SemanticFieldConfig(preset="short", code_dim=code_dim, hidden_layers=layers, hidden_width=12)
     decoder = CompressedField(config, 16)
-    decoder.name = "lang3dxl"
+    decoder.name = "gathered"
     for parameter in decoder.parameters():
         parameter.data = 0.3 * torch.randn(parameter.shape, generator=generator)
     decoder.grid.table.data *= 0.1

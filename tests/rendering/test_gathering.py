@@ -105,10 +105,10 @@ def test_where_all_pixels_agree_the_rendered_feature_is_theirs_at_any_coverage()
     feature = torch.tensor([2.0, -1.0, 0.5], dtype=torch.float64)
     pixels = torch.cat([feature, torch.ones(1).double()]).expand(SIZE, SIZE, 4)
     camera = cameras()[0]
-    encoder = LiftedFeatures(2, 1)
+    decoder = LiftedFeatures(2, 1)
     lifted = gather(5, [(lambda carried: composite(camera, carried), whole(pixels))], 3, feature)
-    rendered = composite(camera, encoder.learn_gaussians(*lifted))
-    clip, dense = encoder(rendered)
+    rendered = composite(camera, decoder.learn_gaussians(*lifted))
+    clip, dense = decoder(rendered)
     seen = rendered[..., -1] > 1e-3
     assert rendered[..., -1][seen].min() < 0.1
     torch.testing.assert_close(clip[seen], feature[:2].expand(int(seen.sum()), 2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import viser
 import viser.theme
@@ -14,6 +14,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.viewer.fly_to import stand_of
 from lang3dxl_ns.plugin.viewer.frame_size import keep_frames_recognizable
 from lang3dxl_ns.plugin.viewer.guard import Guard, guard_viewers
@@ -21,13 +22,12 @@ from lang3dxl_ns.plugin.viewer.session import Conversation, plain
 from lang3dxl_ns.plugin.viewer.worker import Worker
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.overview import overview
+from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
-
-    from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 
 INVITATION = (
     'Type what to look for: `rose window`, several as `dome; towers`, or `"windows" not "doors"`. '
@@ -38,13 +38,30 @@ _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""
 
 
+class Asked(Protocol):
+    """What the panel asks: the pipeline."""
+
+    model: Lang3DXLModel
+
+    @property
+    def scene_file(self) -> SceneFile:
+        """Photos, cameras and CLIP."""
+
+    @property
+    def query(self) -> str:
+        """The prompts to begin with."""
+
+    def learn_words(self) -> None:
+        """Gather the photos' features onto the present Gaussians, and learn codes."""
+
+
 class AskPanel(ViewerControl):
     """A text box, heat maps over the view, and the views that show a match best.
 
     nerfstudio's viewer finds it as an attribute of the pipeline, and sets it up on start.
     """
 
-    def __init__(self, pipeline: Lang3DXLPipeline) -> None:
+    def __init__(self, pipeline: Asked) -> None:
         guard_viewers()  # before nerfstudio starts a server
         keep_frames_recognizable()
         self._pipeline = pipeline

@@ -36,7 +36,7 @@ class Conversation:
         run: folder of the run, for what is computed once.
         lock: held while using the model.
         learning: whether the model still changes.
-        learn: makes the Gaussians' codes for the present model, for encoders that need it.
+        learn: makes the Gaussians' codes for the present model, for decoders that need it.
         shown: names of the outputs that the viewer shows.
         watch: called with a short description of slow work.
     """

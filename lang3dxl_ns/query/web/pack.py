@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.hash_grid import HASH_PRIMES
 from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
@@ -105,7 +105,7 @@ class PackedMeaning:
         return vectors if self.head is None else vectors @ self.head.T
 
 
-def pack_meaning(decoder: SemanticEncoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
+def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
     """Codes and a small field or, for wide decoders, decoded rows.
 
     Raises:

@@ -15,34 +15,38 @@ from lang3dxl_ns.baselines.langsplat import LangSplat
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressedField, CompressionConfig
-from lang3dxl_ns.components.feature_decoder import SemanticEncoder
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
-EncoderName = Literal["lang3dxl", "paper", "feature3dgs", "fmgs", "langsplat", "direct", "lifting"]
+DecoderName = Literal["gathered", "paper", "feature3dgs", "fmgs", "langsplat", "direct", "lifting"]
 
-NAMES: tuple[str, ...] = get_args(EncoderName)
+NAMES: tuple[str, ...] = get_args(DecoderName)
 
 
 @dataclass
-class EncoderConfig:
+class DecoderConfig:
     """The model's feature decoder. Targets, losses and schedules are the same for all, so that a comparison
     isolates the decoder."""
 
-    name: EncoderName = "lang3dxl"
-    """lang3dxl: targets are averaged onto the Gaussians after training and compressed to three numbers
+    name: DecoderName = "gathered"
+    """gathered: targets are averaged onto the Gaussians after training and compressed to three numbers
     each, which the semantic field decodes Gaussian by Gaussian. paper: Lang3D-XL as published, codes trained
     with the scene and decoded pixel by pixel. feature3dgs: codes of half the CLIP width and one linear layer
     after rendering. fmgs: a hash grid over positions, decoded before rendering; whole features are rendered.
     langsplat: a per-scene autoencoder's three numbers. direct: the whole feature on every Gaussian. lifting:
     targets averaged onto the Gaussians, rendered uncompressed."""
 
+    start: Literal["noise", "gathered"] = "noise"
+    """paper: initial codes. noise: nearly equal, as published. gathered: when the warm-up ends, the principal
+    components of the CLIP targets, gathered onto the Gaussians; rare things then have codes of their own."""
+
     compression: CompressionConfig = field(default_factory=CompressionConfig)
-    """lang3dxl: compression of gathered features to codes."""
+    """gathered: compression of gathered features to codes."""
 
     @property
     def learns_from_renderings(self) -> bool:
         """Whether codes are trained with the scene, with all semantic losses."""
-        return self.name not in ("lang3dxl", "lifting")
+        return self.name not in ("gathered", "lifting")
 
     alignment_weight: float = 0.01
     """fmgs: weight of the loss that aligns CLIP with dense features (published: 0.01 to 0.03)."""
@@ -50,14 +54,14 @@ class EncoderConfig:
     """langsplat: iterations of 1,024 features each, before the run."""
 
 
-def make_encoder(
-    config: EncoderConfig,
+def make_decoder(
+    config: DecoderConfig,
     settings: SemanticFieldConfig,
     clip_dim: int,
     dense_dim: int,
     center: Float[Tensor, "3"],
     radius: float,
-) -> SemanticEncoder:
+) -> Decoder:
     """The feature decoder of this name; `settings`: of those that have a hash grid.
 
     center, radius: of the scene, world units.
@@ -68,13 +72,13 @@ def make_encoder(
 
 
 def _make(
-    config: EncoderConfig,
+    config: DecoderConfig,
     settings: SemanticFieldConfig,
     clip_dim: int,
     dense_dim: int,
     center: Float[Tensor, "3"],
     radius: float,
-) -> SemanticEncoder:
+) -> Decoder:
     if config.name == "feature3dgs":
         return Feature3DGS(clip_dim, dense_dim)
     if config.name == "fmgs":
@@ -87,6 +91,6 @@ def _make(
         return LiftedFeatures(clip_dim, dense_dim)
     if config.name == "paper":
         return SemanticField(settings, clip_dim, dense_dim)
-    if config.name == "lang3dxl":
+    if config.name == "gathered":
         return CompressedField(settings, clip_dim, config.compression)
     raise UserError(f"there is no feature decoder {config.name!r}: choose one of {', '.join(NAMES)}")

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lang3dxl_ns.baselines.encoders import EncoderConfig, make_encoder
+from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.baselines.fmgs import neighbor_similarity, pixel_alignment_loss
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
@@ -11,10 +11,10 @@ NAMES = ("paper", "feature3dgs", "fmgs", "langsplat", "direct")
 CLIP, DENSE = 16, 6
 
 
-def encoder_of(name: str):
+def decoder_of(name: str):
     torch.manual_seed(0)
-    config = EncoderConfig(name, autoencoder_steps=300)
-    return make_encoder(config, SemanticFieldConfig("short"), CLIP, DENSE, torch.tensor([1.0, 2.0, 3.0]), 5.0)
+    config = DecoderConfig(name, autoencoder_steps=300)
+    return make_decoder(config, SemanticFieldConfig("short"), CLIP, DENSE, torch.tensor([1.0, 2.0, 3.0]), 5.0)
 
 
 def statistics():
@@ -24,62 +24,62 @@ def statistics():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_encoder_renders_some_width_and_decodes_to_the_widths_of_the_targets(name):
-    encoder = encoder_of(name)
+    decoder = decoder_of(name)
     gaussians = {"means": torch.randn(30, 3)}
-    codes = encoder.initial_codes(30)
+    codes = decoder.initial_codes(30)
     if codes is not None:
         gaussians["codes"] = codes
-    carried = encoder.carried(gaussians)
-    clip, dense = encoder(carried.reshape(5, 6, -1))
+    carried = decoder.carried(gaussians)
+    clip, dense = decoder(carried.reshape(5, 6, -1))
     assert clip.shape == (5, 6, CLIP)
-    torch.testing.assert_close(encoder.decode_clip(carried), clip.flatten(0, 1))
+    torch.testing.assert_close(decoder.decode_clip(carried), clip.flatten(0, 1))
     assert dense is None if name == "langsplat" else dense.shape == (5, 6, DENSE)
-    assert encoder.picture(carried.reshape(5, 6, -1)).shape == (5, 6, 3)
+    assert decoder.picture(carried.reshape(5, 6, -1)).shape == (5, 6, 3)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_reach_the_codes_and_everything_that_is_trained_and_nothing_else(name):
-    encoder = encoder_of(name)
+    decoder = decoder_of(name)
     means = torch.randn(30, 3, requires_grad=True)
     gaussians = {"means": means}
-    codes = encoder.initial_codes(30)
+    codes = decoder.initial_codes(30)
     if codes is not None:
         gaussians["codes"] = codes.requires_grad_()
     if name in ("feature3dgs", "direct"):
         gaussians["codes"] = (
             codes.detach() + 0.1
         ).requires_grad_()  # they start at 0, where a square has no gradient
-    clip, dense = encoder(encoder.carried(gaussians))
+    clip, dense = decoder(decoder.carried(gaussians))
     (clip.square().sum() + (0 if dense is None else dense.square().sum())).backward()
-    trained = [p for group in encoder.parameter_groups().values() for p in group]
+    trained = [p for group in decoder.parameter_groups().values() for p in group]
     assert all(p.grad.abs().max() > 0 for p in trained)
     assert means.grad is None
     if codes is not None:
         assert gaussians["codes"].grad.abs().max() > 0
-    others = [p for p in encoder.parameters() if not any(p is q for q in trained)]
+    others = [p for p in decoder.parameters() if not any(p is q for q in trained)]
     assert all(p.grad is None for p in others)
 
 
 @pytest.mark.parametrize("name", ["feature3dgs", "direct"])
 def test_training_starts_at_the_mean_of_the_targets(name):
-    encoder = encoder_of(name)
+    decoder = decoder_of(name)
     if name == "feature3dgs":
-        torch.nn.init.zeros_(encoder.layer.bias)
+        torch.nn.init.zeros_(decoder.layer.bias)
     mean, std = statistics()
-    encoder.set_output_statistics(mean, std)
-    clip, dense = encoder(encoder.initial_codes(4))
+    decoder.set_output_statistics(mean, std)
+    clip, dense = decoder(decoder.initial_codes(4))
     torch.testing.assert_close(clip, mean[:CLIP].expand(4, -1))
     torch.testing.assert_close(dense, mean[CLIP:].expand(4, -1))
 
 
 def test_codes_of_feature3dgs_are_half_as_wide_as_clip():
-    assert encoder_of("feature3dgs").initial_codes(2).shape == (2, CLIP // 2)
+    assert decoder_of("feature3dgs").initial_codes(2).shape == (2, CLIP // 2)
 
 
 def test_fmgs_gives_gaussians_at_one_place_one_feature_and_others_other_features():
-    encoder = encoder_of("fmgs")
+    decoder = decoder_of("fmgs")
     places = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [4.0, 2.0, 3.0]])
-    first, same, other = encoder.carried({"means": places})
+    first, same, other = decoder.carried({"means": places})
     torch.testing.assert_close(first, same)
     assert not torch.allclose(first, other)
 
@@ -113,17 +113,17 @@ def test_autoencoder_of_langsplat_tells_the_features_of_a_scene_apart():
     generator = torch.Generator().manual_seed(0)
     prototypes = torch.randn(4, CLIP, generator=generator)
     targets = [4 * prototypes[torch.randint(4, (9, 8), generator=generator)] for _ in range(3)]
-    encoder = encoder_of("langsplat")
-    encoder.set_output_statistics(torch.zeros(CLIP + DENSE), torch.ones(CLIP + DENSE))
-    encoder.learn_targets(lambda: iter(targets))
+    decoder = decoder_of("langsplat")
+    decoder.set_output_statistics(torch.zeros(CLIP + DENSE), torch.ones(CLIP + DENSE))
+    decoder.learn_targets(lambda: iter(targets))
     codes = torch.nn.functional.normalize(torch.randn(2000, 3, generator=generator), dim=1)
-    decoded = encoder.decode_clip(codes)
+    decoded = decoder.decode_clip(codes)
     similarity = torch.nn.functional.normalize(decoded, dim=1) @ torch.nn.functional.normalize(prototypes).T
     assert (similarity.amax(0) > 0.95).all()  # each of them is the decoding of some code
     torch.testing.assert_close(decoded.norm(dim=1), torch.full((2000,), CLIP**0.5))
-    assert not any(p.requires_grad for p in encoder.parameters())
+    assert not any(p.requires_grad for p in decoder.parameters())
 
 
 def test_gaussians_of_langsplat_carry_codes_of_unit_length():
-    carried = encoder_of("langsplat").carried({"codes": 5 * torch.randn(20, 3)})
+    carried = decoder_of("langsplat").carried({"codes": 5 * torch.randn(20, 3)})
     torch.testing.assert_close(carried.norm(dim=1), torch.ones(20))

@@ -8,19 +8,19 @@ import torch
 from conftest import make_trainer
 from nerfstudio.utils.eval_utils import eval_setup
 
-from lang3dxl_ns.baselines.encoders import EncoderConfig, EncoderName
+from lang3dxl_ns.baselines.decoders import DecoderConfig, DecoderName
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
 
 @pytest.fixture(scope="module")
 def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
-    """The finished short run of an encoder by name, "none" for colors alone; each is made once."""
+    """The finished short run of a decoder by name, "none" for colors alone; each is made once."""
 
     @cache
     def made(name: str, dense: bool = True):
         semantics = name != "none"
-        encoder = EncoderConfig(name, autoencoder_steps=20) if semantics else EncoderConfig()
-        changes = {"pipeline__model__encoder": encoder}
+        decoder = DecoderConfig(name, autoencoder_steps=20) if semantics else DecoderConfig()
+        changes = {"pipeline__model__decoder": decoder}
         if not dense:
             changes["pipeline__datamanager__dense"] = "none"
         folder = tmp_path_factory.mktemp(name)
@@ -32,8 +32,8 @@ def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
     return made
 
 
-@pytest.mark.parametrize("name", get_args(EncoderName))
-def test_an_encoder_trains_gives_features_of_the_targets_width_and_is_the_same_once_loaded(run, name):
+@pytest.mark.parametrize("name", get_args(DecoderName))
+def test_a_decoder_trains_gives_features_of_the_targets_width_and_is_the_same_once_loaded(run, name):
     trainer = run(name)
     model = trainer.pipeline.model.eval()
     camera, batch = next(iter(trainer.pipeline.datamanager.fixed_indices_eval_dataloader))
@@ -41,7 +41,7 @@ def test_an_encoder_trains_gives_features_of_the_targets_width_and_is_the_same_o
     assert model.semantic_field.decode_clip(model.carried).shape[-1] == batch["clip_target"].shape[-1]
     assert images["bottleneck"].shape[-1] == 3
     metrics = model.feature_metrics(camera, batch)
-    without_dense = name in ("langsplat", "lang3dxl", "lifting")
+    without_dense = name in ("langsplat", "gathered", "lifting")
     assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is not without_dense
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
     loaded = pipeline.model.eval()
@@ -51,7 +51,7 @@ def test_an_encoder_trains_gives_features_of_the_targets_width_and_is_the_same_o
 
 
 @pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "direct"])
-def test_what_an_encoder_trains_moves_and_geometry_is_left_to_the_colors(run, name):
+def test_what_a_decoder_trains_moves_and_geometry_is_left_to_the_colors(run, name):
     alone = run("none").pipeline.model
     model = run(name).pipeline.model
     torch.testing.assert_close(model.means, alone.means)
@@ -62,12 +62,12 @@ def test_what_an_encoder_trains_moves_and_geometry_is_left_to_the_colors(run, na
 
 
 def test_only_fmgs_has_an_alignment_loss(run):
-    for name in ("lang3dxl", "fmgs"):
+    for name in ("gathered", "fmgs"):
         trainer = run(name)
         assert ("alignment" in trainer.pipeline.last_losses) is (name == "fmgs")
 
 
-@pytest.mark.parametrize("name", ["lang3dxl", "lifting"])
+@pytest.mark.parametrize("name", ["gathered", "lifting"])
 def test_gathered_features_come_near_the_targets_and_nothing_is_learned_before(run, name):
     trainer = run(name)
     assert set(trainer.pipeline.last_losses) == {"rgb"}
@@ -93,7 +93,7 @@ def test_dense_features_sharpen_words_and_leave_all_else_as_it_is(run):
 )
 def test_fields_of_the_ablation_train(train, scene, field):
     trainer = train(
-        scene, iterations=3, pipeline__model__encoder__name="paper", pipeline__model__semantic_field=field
+        scene, iterations=3, pipeline__model__decoder__name="paper", pipeline__model__semantic_field=field
     )
     assert torch.isfinite(trainer.pipeline.last_losses["clip"])
 
@@ -101,7 +101,7 @@ def test_fields_of_the_ablation_train(train, scene, field):
 @pytest.mark.parametrize("match", ["resize-features", "resize-target"])
 def test_without_the_downsampler_codes_learn_all_the_same(train, scene, match):
     trainer = train(
-        scene, iterations=3, pipeline__model__encoder__name="paper", pipeline__model__downsampler__match=match
+        scene, iterations=3, pipeline__model__decoder__name="paper", pipeline__model__downsampler__match=match
     )
     assert trainer.pipeline.model.gauss_params["codes"].grad.abs().max() > 0
     assert trainer.pipeline.model.downsampler.network is None

@@ -1,0 +1,162 @@
+"""`ns-train lang3dxl-paper`: the paper's settings, and what they train."""
+
+from copy import deepcopy
+from functools import partial
+
+import pytest
+import torch
+from conftest import make_trainer
+
+from lang3dxl_ns.methods import METHODS, lang3dxl_paper
+from lang3dxl_ns.plugin import pipeline
+from lang3dxl_ns.plugin.lift_features import start_codes
+from lang3dxl_ns.plugin.optimizers import RunSchedule
+from lang3dxl_ns.rendering.gathering import Pixels, gather
+
+ITERATIONS = 70_000
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """The configuration as a run of the published length has it."""
+    config = deepcopy(lang3dxl_paper.config)
+    config.max_num_iterations = ITERATIONS
+    config.fit_to_run()
+    return config
+
+
+def rate(config, group, step):
+    """Learning rate of a group at a step."""
+    optimizer, scheduler = (config.optimizers[group][part] for part in ("optimizer", "scheduler"))
+    return optimizer.lr * (1.0 if scheduler is None else RunSchedule(scheduler).multiple(step))
+
+
+@pytest.mark.parametrize(
+    ("group", "step", "expected"),
+    [
+        ("means", 0, 1.6e-5 * 1.1),
+        ("means", 30_000, 1.6e-7 * 1.1),
+        ("means", 70_000, 1.6e-7 * 1.1),
+        ("opacities", 70_000, 0.05),
+        ("scales", 0, 5e-3),
+        ("quats", 0, 1e-3),
+        ("codes", 0, 1e-3),
+        ("codes", 70_000, 1e-5),
+        *((group, 0, 5e-5) for group in ("field_encoding", "field_decoder", "downsampler", "appearance")),
+        *((group, 35_000, 5e-4) for group in ("field_encoding", "field_decoder", "downsampler")),
+        ("field_decoder", 70_000, 5e-6),
+        ("appearance", 21_000, 5e-4),
+        ("appearance", 70_000, 5e-5),
+        ("appearance_vectors", 0, 1e-3),
+        ("appearance_vectors", 70_000, 1e-4),
+    ],
+)
+def test_rates_are_the_published_ones(fitted, group, step, expected):
+    assert rate(fitted, group, step) == pytest.approx(expected, rel=1e-3)
+
+
+def test_weights_sizes_and_schedules_are_the_published_ones(fitted):
+    model, data = fitted.pipeline.model, fitted.pipeline.datamanager
+    field = model.semantic_field.resolved()
+    assert (field.code_dim, field.indexed, field.levels, field.log2_table_size) == (3, True, 16, 8)
+    assert (field.min_resolution, field.max_resolution, field.hidden_width) == (16, 2048, 512)
+    assert (model.downsampler.kernel, model.downsampler.hidden) == ("box", 512)
+    assert (model.clip_weight, model.dense_weight, model.ssim_lambda) == (1.0, 0.5, 0.5)
+    assert model.decode_size == (80, 120) and model.densify_grad_thresh == pytest.approx(2e-4)
+    steps = [ITERATIONS * x for x in (model.densify_from, model.densify_until, model.semantic_ramp)]
+    assert steps == pytest.approx([2_000, 15_000, 15_000])
+    for group in ("field_decoder", "downsampler"):
+        assert fitted.optimizers[group]["optimizer"].weight_decay == 1e-5
+    assert (data.crops, data.regions, data.scale_mode) == ("pyramid", "sam", "physical")
+
+
+def test_the_default_is_another_method_with_settings_of_its_own():
+    default = METHODS["lang3dxl"].config
+    assert default.method_name == "lang3dxl" and lang3dxl_paper.config.method_name == "lang3dxl-paper"
+    assert default.pipeline.model.decoder.name != "paper"
+    assert default.optimizers["codes"]["scheduler"].end == 0.05
+
+
+@pytest.fixture(scope="module")
+def trained(scene, tiny_clip, tiny_dense, tmp_path_factory):
+    """A short run, with regions of one color in place of SAM's."""
+    changes = {"pipeline__datamanager__regions": "felzenszwalb", "pipeline__model__downsampler__hidden": 16}
+    folder = tmp_path_factory.mktemp("paper")
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 4, method="lang3dxl-paper", **changes)
+    trainer.setup()
+    trainer.train()
+    return trainer
+
+
+def test_every_loss_of_the_paper_is_part_of_a_step(trained):
+    losses = trained.pipeline.last_losses
+    assert set(losses) == {"rgb", "clip", "dense", "regions"}
+    assert all(torch.isfinite(value) and value > 0 for value in losses.values())
+
+
+def test_semantic_losses_move_gaussians_and_leave_opacities_to_the_colors(trained):
+    model = trained.pipeline.model.train()
+    model.zero_grad()
+    camera, _ = trained.pipeline.datamanager.next_train(0)
+    model.get_outputs(camera)["codes"].square().sum().backward()
+    gradients = {name: value.grad for name, value in model.gauss_params.items()}
+    assert gradients["means"].abs().max() > 0 and gradients["scales"].abs().max() > 0
+    assert gradients["opacities"] is None or not gradients["opacities"].any()
+
+
+def test_the_dense_loss_is_compared_at_its_target_and_sees_what_the_mask_leaves_out(trained, monkeypatch):
+    from lang3dxl_ns.components import losses
+
+    seen = []
+
+    def dense_loss(prediction, target, weight=None, compare_at="auto"):
+        seen.append((weight, compare_at))
+        return prediction.sum() * 0
+
+    monkeypatch.setattr(losses, "dense_loss", dense_loss)
+    model, data = trained.pipeline.model.train(), trained.pipeline.datamanager
+    camera, batch = data.next_train(0)
+    batch["mask"] = torch.ones(*batch["image"].shape[:2], 1, dtype=torch.bool)
+    model.get_loss_dict(model.get_outputs(camera), batch)
+    assert seen == [(None, "target")]
+
+
+def test_a_run_has_words_at_its_last_iteration_and_reads_as_this_method(trained):
+    assert not trained.pipeline.has_words_to_learn
+    assert trained.base_dir.parent.name == "lang3dxl-paper"
+    assert list(trained.base_dir.glob("*.scene"))
+
+
+def test_codes_may_start_as_the_principal_components_of_gathered_features(trained):
+    model, data = trained.pipeline.model.train(), trained.pipeline.datamanager
+    pixels = [(camera, batch["clip_target"]) for camera, batch in data.train_photos()]
+    views = [
+        (partial(model.composite, camera), Pixels.of([target], (int(camera.height), int(camera.width)), None))
+        for camera, target in pixels
+    ]
+    features, mass = gather(model.num_points, views, pixels[0][1].shape[-1], model.means.detach())
+    seen, codes = mass > 0, model.gauss_params["codes"]
+    with torch.no_grad():
+        before = codes.fill_(9.0).clone()
+    start_codes(model, data.train_photos())
+    assert torch.equal(codes[~seen], before[~seen])
+    rows = torch.cat([target.flatten(0, 1) for _, target in pixels]).double()
+    _, axes = torch.linalg.eigh((rows - rows.mean(0)).T @ (rows - rows.mean(0)))
+    places = (features[seen].double() - rows.mean(0)) @ axes[:, -3:].flip(1)
+    expected = (places / places.std(0)).clamp(-3, 3).float()
+    torch.testing.assert_close(codes[seen].abs(), expected.abs(), rtol=1e-2, atol=1e-2)
+
+
+def test_they_do_when_the_warm_up_ends(scene, tiny_clip, tiny_dense, tmp_path, monkeypatch):
+    steps = []
+    monkeypatch.setattr(pipeline, "start_codes", lambda model, photos: steps.append(model.step))
+    changes = {
+        "pipeline__datamanager__regions": "none",
+        "pipeline__model__decoder__start": "gathered",
+        "pipeline__model__warm_up": 0.3,
+        "pipeline__model__downsampler__hidden": 0,
+    }
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path, 5, method="lang3dxl-paper", **changes)
+    trainer.setup()
+    trainer.train()
+    assert steps == [2]
