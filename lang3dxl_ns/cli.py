@@ -32,6 +32,10 @@ BENCHMARKS = {
     "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
+    "typed-words": (
+        "benchmarks.typed_words:TypedWords",
+        "Fifty prompts as people type them, judged by labels.",
+    ),
     "teaching": (
         "benchmarks.teaching:TeachingBenchmark",
         "Words taught by example, beside the text alone.",

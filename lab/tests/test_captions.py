@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from lab.clip_training.captions import (
+    ABSENT,
     ADJECTIVES,
     CANONICAL,
     CLASS,
@@ -16,6 +17,7 @@ from lab.clip_training.captions import (
 )
 from lang3dxl_ns.demo.landmark.labels import CATEGORIES
 from lang3dxl_ns.demo.landmark.materials import MATERIALS
+from lang3dxl_ns.query.doubt import UNRELATED
 
 
 @pytest.fixture(scope="module")
@@ -70,3 +72,9 @@ def test_a_family_is_named_only_of_the_building():
 def test_articles_fit_the_words(texts):
     assert not any(f" a {vowel}" in f" {text}" for text in texts for vowel in "aeio")
     assert "a photo of domes" in {caption.text for caption in captions_of(CLASS["dome"], count=2_000)}
+
+
+def test_no_word_that_tells_doubt_was_learned(texts):
+    """Otherwise the built-in CLIP would reject these words more easily than what people ask for."""
+    learned = {word for text in (*texts, *words_of(ABSENT)) for word in text.lower().split()}
+    assert not learned & {word for text in UNRELATED for word in text.split()}

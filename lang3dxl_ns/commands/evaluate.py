@@ -99,14 +99,17 @@ class EvaluateRun:
         write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
     def _score_scene(self, file: Path) -> None:
-        from lang3dxl_ns.evaluation.score_scene import score_scene
+        from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene
+        from lang3dxl_ns.evaluation.selections import score_selections
         from lang3dxl_ns.open_scene import load_scene
 
         if self.ground_truth is None or self.split == "test":
             raise UserError(f"{file} is scored with --ground-truth FOLDER, --split held-out or seen")
         truth = GroundTruth(self.ground_truth, self.layout)
-        photos, protocol = score_scene(load_scene(file), truth, self.split)
+        scene = load_scene(file)
+        photos, protocol = score_scene(scene, truth, self.split)
         results = average(list(photos.values()), with_deviation=True)
+        results |= score_selections(scene, truth, labeled_photos(scene, truth, self.split))
         write_scores(self.out, self.scene or file.stem, results | {"protocol": protocol, "photos": photos})
 
 

@@ -28,7 +28,7 @@ from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.scene_file import Provenance, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
-from lang3dxl_ns.query.text import Prompt, parse_prompts
+from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
 from lang3dxl_ns.query.vocabulary import read_vocabulary, whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
@@ -109,7 +109,9 @@ class Query:
             closest = "" if score > level else " (no match; this view comes closest)"
             by = "" if prompt.taught is None else " (taught)"
             say(f"{prompt.text}{by}: {score:.2f} at {place}; {folder}{closest}")
-            if advice := doubtful(prompt.text, doubt, prompt.taught is not None):
+            taught = prompt.taught is not None
+            told = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
+            for advice in filter(None, told):
                 say(f"  {advice}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +56,25 @@ def scene_table(scene: str, results: Mapping[str, Any]) -> str:
     rows.append(["**mAP**", "", *(f"**{results[f'{prefix}map']:.3f}**" for prefix in whose)])
     heads = WHOSE | ({"": "unprocessed"} if results["protocol"].get("layout") == "lerf_ovs" else {})
     words = markdown_table(["average precision", "photos", *(heads[prefix] for prefix in whose)], rows)
+    if any(f"mask_iou_{c}" in results for c in categories):
+        words += "\n\n" + selection_table(results, categories)
     totals = [[name, f"{results[name]:.3f}"] for name in TOTALS.values() if name in results]
     others = [[name, _mean_std(results, name)] for name in _OTHERS if name in results]
     protocol = "\n".join(f"- {name.replace('_', ' ')}: {v}" for name, v in results["protocol"].items())
     figures = markdown_table(["", "mean"], totals + others)
     return f"# {scene}\n\n{words if categories else ''}\n\n{figures}\n\n{protocol}\n"
+
+
+def selection_table(results: Mapping[str, Any], categories: Sequence[str]) -> str:
+    """IoU of what a user gets (`evaluation.selections`), by category."""
+    names = ("mask_iou", "selection_iou", "box_iou")
+    figures = {
+        c: [results[f"{name}_{c}"] for name in names] for c in categories if f"mask_iou_{c}" in results
+    }
+    rows = [[c, *(f"{value:.3f}" for value in values)] for c, values in figures.items()]
+    means = [sum(column) / len(column) for column in zip(*figures.values(), strict=True)]
+    rows.append(["**mean**", *(f"**{mean:.3f}**" for mean in means)])
+    return markdown_table(["IoU by the scene's thresholds", "masks", "selected Gaussians", "boxes"], rows)
 
 
 _OTHERS = (

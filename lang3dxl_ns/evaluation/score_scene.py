@@ -12,6 +12,7 @@ from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.language import LanguageScorer
 from lang3dxl_ns.evaluation.scores import map_size
+from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.teach import known_word
 from lang3dxl_ns.scene.photo import Photo
@@ -35,10 +36,7 @@ def score_scene(
     Raises:
         UserError: the scene has colors alone, or no photo of the split has a label.
     """
-    wanted = {"held-out": ("eval",), "seen": ("train",), "all": ("train", "eval")}[split]
-    photos = [p for p in scene.photos if p.split in wanted and truth.key(p.name) is not None]
-    if not photos:
-        raise UserError(f"no label in {truth.folder} belongs to a {split} photo of the scene")
+    photos = labeled_photos(scene, truth, split)
     scorer = LanguageScorer(truth, scene.text.vectors)
     words = [scene.words.get(known_word(category)) for category in truth.categories]
     queries_shown = scorer.queries.taught(words)
@@ -65,6 +63,15 @@ def score_scene(
         **scorer.protocol(mask if masked else "none"),
     }
     return figures, protocol
+
+
+def labeled_photos(scene: Scene, truth: GroundTruth, split: SceneSplit) -> list[ScenePhoto]:
+    """The photos of a split that have labels. Raises UserError if there are none."""
+    wanted = {"held-out": ("eval",), "seen": ("train",), "all": ("train", "eval")}[split]
+    photos = [p for p in scene.photos if p.split in wanted and truth.key(p.name) is not None]
+    if not photos:
+        raise UserError(f"no label in {truth.folder} belongs to a {split} photo of the scene")
+    return photos
 
 
 def truths_of(truth: GroundTruth, photo: Photo, size: tuple[int, int]) -> dict[str, Truth]:

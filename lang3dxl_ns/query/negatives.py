@@ -1,4 +1,5 @@
-"""Negatives that prompts compete with: phrases that fit anything, and other contents of building photos."""
+"""Negatives that prompts compete with: phrases that fit anything, other contents of building photos, and
+other parts of buildings."""
 
 from __future__ import annotations
 
@@ -23,7 +24,24 @@ _SURROUNDINGS: dict[str, tuple[str, ...]] = {
     "bridge": ("viaduct", "aqueduct"),
 }  # fmt: skip
 """Each phrase with synonyms: prompts that use one of them don't compete with the phrase."""
-NEGATIVES = (*CANONICAL, *_SURROUNDINGS)
+_PARTS: dict[str, tuple[str, ...]] = {
+    "window": ("glass", "pane", "oculus", "lancet", "dormer", "tracery"),
+    "door": ("portal", "doorway", "entrance", "entry", "gate", "gateway", "archway"),
+    "tower": (
+        "belfry", "steeple", "campanile", "minaret", "turret",
+        "window", "pane", "oculus", "lancet",
+        "door", "portal", "doorway", "entrance", "entry", "gate", "gateway",
+    ),
+    "spire": ("steeple", "fleche", "pinnacle", "finial"),
+    "dome": ("cupola",),
+}  # fmt: skip
+"""The same for parts of buildings; a part doesn't compete with its whole: windows and doors not with
+towers."""
+_NAMED = {
+    phrase: frozenset((*_SURROUNDINGS.get(phrase, ()), *_PARTS.get(phrase, ())))
+    for phrase in (*_SURROUNDINGS, *_PARTS)
+}
+NEGATIVES = (*CANONICAL, *_NAMED)
 """The default."""
 
 
@@ -40,7 +58,7 @@ def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:
 
 def _meanings(phrase: str) -> set[str]:
     own = [form for word in phrase.lower().split() for form in _singulars(word)]
-    return {*own, *(word for form in own for word in _SURROUNDINGS.get(form, ()))}
+    return {*own, *(word for form in own for word in _NAMED.get(form, ()))}
 
 
 def _singulars(word: str) -> list[str]:

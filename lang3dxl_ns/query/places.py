@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from numpy import ndarray as Array
 from torch import Tensor
 
 _OUTLIERS = 0.02
@@ -62,17 +63,31 @@ def strongest_match(
         return None
     level = threshold + STRONG * (_high(scores[rows], mass[rows]) - threshold)
     strong = rows[scores[rows] >= level]
-    strong = strong[weights[strong].argsort(descending=True)[:_MOST_POINTS]]
-    points, share = means[strong].double().cpu().numpy(), weights[strong].double().cpu().numpy()
+    return max(groups(means[strong], weights[strong], gap), key=lambda box: box.share)
+
+
+def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
+    """Boxes of the groups that points form, each point within `gap` of others of its group.
+
+    Args:
+        means: centers, world units; at least one.
+        weight: of each, above 0.
+        gap: world units that divide two groups.
+    """
+    heaviest = weight.argsort(descending=True)[:_MOST_POINTS]
+    points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
     from sklearn.cluster import DBSCAN  # takes a second to import
 
-    groups = DBSCAN(eps=gap, min_samples=1).fit_predict(points, sample_weight=share / (share.sum() * _CORE))
-    if (groups < 0).all():  # no dense place: the heaviest Gaussian
-        groups = np.where(np.arange(len(groups)) == share.argmax(), 0, -1)
-    totals = np.bincount(groups[groups >= 0], weights=share[groups >= 0])
-    chosen = points[groups == totals.argmax()]
-    low, high = np.quantile(chosen, (_OUTLIERS, 1 - _OUTLIERS), axis=0, method="nearest")
-    return Box(tuple(low.tolist()), tuple(high.tolist()), float(totals.max() / share.sum()))
+    found = DBSCAN(eps=gap, min_samples=1).fit_predict(points, sample_weight=share / (share.sum() * _CORE))
+    if (found < 0).all():  # no dense place: the heaviest Gaussian
+        found = np.where(np.arange(len(found)) == share.argmax(), 0, -1)
+    totals = np.bincount(found[found >= 0], weights=share[found >= 0]) / share.sum()
+    return [_around(points[found == i], float(total)) for i, total in enumerate(totals)]
+
+
+def _around(points: Float64[Array, "n 3"], share: float) -> Box:
+    low, high = np.quantile(points, (_OUTLIERS, 1 - _OUTLIERS), axis=0, method="nearest")
+    return Box(tuple(low.tolist()), tuple(high.tolist()), share)
 
 
 def _high(scores: Float[Tensor, " n"], mass: Float[Tensor, " n"]) -> float:

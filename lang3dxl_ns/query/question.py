@@ -63,18 +63,20 @@ class Question:
         """Relevancy of every pixel to every prompt, 0…1.
 
         Args:
-            rendering: a view rendered with `channels`.
+            rendering: a view with `channels`, composited at its size or at another.
             foreground: pixels that may match, at any size; None for all.
 
         Pixels outside the foreground, and those that the scene hardly covers, are 0.
         """
         assert rendering.channels is not None
-        keep = rendering.alpha >= self.min_alpha
+        keep, size = rendering.alpha >= self.min_alpha, (rendering.camera.height, rendering.camera.width)
         if foreground is not None:
-            size = (rendering.camera.height, rendering.camera.width)
             there = F.interpolate(foreground[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
             keep = keep & there.to(keep.device)
-        return self._confined(self.engine.maps(rendering.channels, self.queries)) * keep
+        maps = self._confined(self.engine.maps(rendering.channels, self.queries))
+        if maps.shape[1:] != size:
+            maps = F.interpolate(maps[None].float(), size, mode="bilinear", align_corners=False)[0]
+        return maps * keep
 
     def _confined(self, relevancy: Float[Tensor, "all ..."]) -> Float[Tensor, "q ..."]:
         """Relevancy to the prompts, 0 where no foreground prompt matches."""

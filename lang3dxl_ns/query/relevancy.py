@@ -18,7 +18,7 @@ CANONICAL = ("object", "things", "stuff", "texture")
 TEMPERATURE = 10.0
 """As in LERF's code, for cosines of the spread `SPREAD`. Neither a Gaussian's rank nor the 0.5 contour
 depends on it."""
-SPREAD = 0.245
+SPREAD = 0.272
 """`spread` of the built-in CLIP's cosines in scenes that it knows."""
 _LEAST_SPREAD = 1e-4
 Decode = Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]]

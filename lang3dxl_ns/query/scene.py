@@ -34,7 +34,7 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import MARK_SIDE, Example, TaughtWord, Weights, known_word, learn, marks
-from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched
 from lang3dxl_ns.query.threshold import match_thresholds
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
@@ -168,7 +168,7 @@ class Scene:
         Raises:
             UserError: see `camera`; or there is no look of this photo.
         """
-        return self._view(self.camera(place, size, fov), self._name(place), look=look)
+        return self._view(self.camera(place, size, fov), self._name(place), look)
 
     def draw(
         self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
@@ -190,12 +190,11 @@ class Scene:
         self,
         camera: Camera,
         name: str | None,
-        channels: Float[Tensor, "n d"] | None = None,
         look: str | None = None,
     ) -> View:
         start = time.perf_counter()
         chosen = self._look(look)
-        return View(self.draw(camera, channels, chosen), name, time.perf_counter() - start)
+        return View(self.draw(camera, look=chosen), name, time.perf_counter() - start)
 
     def _look(self, photo: str | None) -> Look | None:
         if photo is None:
@@ -283,14 +282,20 @@ class Scene:
         return found if _several(texts, found) else found[0]
 
     def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
-        """Matches of a question's prompts in one view; see `query`."""
+        """Matches of a question's prompts in one view; see `query`.
+
+        Relevancies are composited with at most the pixels of the photos in training, then enlarged: between
+        these pixels nothing was learned, and needles too thin for them would stand out as lines.
+        """
         start = time.perf_counter()
         channels = question.channels
         seconds = time.perf_counter() - start
-        view = self._view(self.camera(place, size), self._name(place), channels)
+        view = self._view(self.camera(place, size), self._name(place))
         start = time.perf_counter()
         foreground = None if view.name is None else self.file.photo(view.name).foreground()
-        maps = question.maps(view.rendering, foreground).cpu().float().numpy()
+        small = resized(view.rendering.camera, self.trained_side)
+        carried = composite(self.splats, small, channels, self.backend)
+        maps = question.maps(replace(view.rendering, channels=carried), foreground).cpu().float().numpy()
         seconds += time.perf_counter() - start
         rows = zip(question.prompts, question.doubts, question.thresholds, maps, strict=True)
         return [
@@ -548,7 +553,7 @@ class Scene:
         if not synonyms or self.config.text.combine != "fallback":
             return synonyms
         if prompt.text not in self._doubt_alone:
-            alone = self.text.plain_queries([prompt.text]).to(self.device)
+            alone = self.text.plain_queries([searched(prompt.text)]).to(self.device)
             self._doubt_alone[prompt.text] = self.doubts.of(self.engine.of_gaussians(alone))[0]
         return synonyms if self._doubt_alone[prompt.text] > DOUBTFUL else []
 
@@ -585,7 +590,7 @@ class Scene:
         scores, threshold = question.relevancy[row], question.thresholds[row]
         means, closest = self.splats.means, self._ranked(question, row)
         views = [v for v in closest if v.area * self.visible[v.name].size >= _LEAST_PIXELS]
-        box = strongest_match(means, scores, self._mass, threshold, self._gap) if views else None
+        box = strongest_match(means, scores, self.mass, threshold, self.gap) if views else None
         return Found(
             question.prompts[row],
             views[:most],
@@ -649,7 +654,7 @@ class Scene:
         return filled_pixels(drawn, weight, len(self.splats))
 
     @cached_property
-    def _mass(self) -> Float[Tensor, " n"]:
+    def mass(self) -> Float[Tensor, " n"]:
         """Pixels that every Gaussian fills, over all views."""
         mass = self.splats.means.new_zeros(len(self.splats))
         for view in self.visible.values():
@@ -657,7 +662,13 @@ class Scene:
         return mass
 
     @cached_property
-    def _gap(self) -> float:
+    def trained_side(self) -> int:
+        """Longer side of the photos in training, pixels: their median."""
+        sides = sorted(max(p.camera.width, p.camera.height) for p in self.photos if p.split == "train")
+        return sides[len(sides) // 2] if sides else LARGEST
+
+    @cached_property
+    def gap(self) -> float:
         """Matches closer than this are connected: 3 % of the median distance at which the scene is seen,
         about eight pixels of a small view."""
         distances = torch.tensor([view.distance(self.splats.means) for view in self.visible.values()])

@@ -25,6 +25,8 @@ from lang3dxl_ns.query.teach import TaughtWord
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """`ImageTextEncoder.encode_texts`."""
 
+_SAME = 0.95
+"""Cosine of a vector with a phrase, from which they mean the same."""
 _QUOTED = r'"[^"]*"'
 _NEGATIVES = re.compile(rf"\s*\bnot\s+({_QUOTED}(?:\s*,\s*{_QUOTED})*)", re.IGNORECASE)
 _SINGLE_QUOTES = re.compile(r"‘([^‘’]*)’")
@@ -77,6 +79,34 @@ def _parse_prompt(part: str) -> Prompt:
 
 def _tidy(text: str) -> str:
     return " ".join(text.replace('"', " ").replace("\0", " ").split())
+
+
+# ── what CLIP can't tell ────────────────────────────────────────────────────────────────────────────────
+
+_PLACES = "left|right|front|back|rear|top|bottom|upper|lower|middle|central|nearest|farthest|first|last"
+_SIZES = "main|big|large|huge|small|tiny|biggest|largest|smallest"
+_COLORS = "red|orange|yellow|green|blue|purple|pink|brown|black|white|gray|grey|golden"
+_WHERE = re.compile(
+    rf"\s+(?:on|at|in|to|of|from|above|below|under|beside|behind|near)\s+(?:the\s+)?(?:{_PLACES})\b.*$"
+    rf"|^(?:(?:the|a)\s+)?(?:{_PLACES}|{_SIZES})\s+(?!of\b)(?=\S)",
+    re.IGNORECASE,
+)
+_COLOR = re.compile(rf"\b(?:{_COLORS})\b(?=\s+\S)", re.IGNORECASE)
+
+
+def searched(text: str) -> str:
+    """A prompt without what says which of several things is meant, by its place or size: *windows on the left
+    tower* is *windows*."""
+    return _WHERE.sub("", text).strip() or text
+
+
+def caution(text: str) -> str | None:
+    """A sentence about words in a prompt that CLIP can't tell, places, sizes and colors; None without."""
+    if (found := searched(text)) != text:
+        return f"places and sizes are not told apart: {found} is searched for everywhere"
+    if color := _COLOR.search(text):
+        return f"colors are hardly told apart: {color[0]} is likely to be ignored"
+    return None
 
 
 # ── synonyms ────────────────────────────────────────────────────────────────────────────────────────────
@@ -152,7 +182,8 @@ class TextEncoder:
         if self.config.synonyms == "off":
             return []
         if text not in self._synonyms:
-            self._synonyms[text] = [word for word in self._table(text) if word.lower() != text.lower()]
+            found = self._table(searched(text))
+            self._synonyms[text] = [word for word in found if word.lower() != text.lower()]
         return self._synonyms[text]
 
     def queries(self, prompts: Sequence[Prompt], known: Collection[str] = ()) -> Queries:
@@ -164,7 +195,10 @@ class TextEncoder:
             [self._positive(p, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
             self.vectors(self.config.negatives),
             [self.vectors(prompt.negatives) for prompt in prompts],
-            [self._against(prompt.text) for prompt in prompts],
+            [
+                self._against_all_but(p.vector) if p.vector is not None else self._against(p.text)
+                for p in prompts
+            ],
         ).taught([prompt.taught for prompt in prompts])
 
     def plain_queries(self, texts: Sequence[str]) -> Queries:
@@ -182,12 +216,18 @@ class TextEncoder:
         return Queries(words, (), ())
 
     def _against(self, text: str) -> list[int]:
-        return competitors(self.config.negatives, [text, *self.synonyms(text)])
+        return competitors(self.config.negatives, [searched(text), *self.synonyms(text)])
+
+    def _against_all_but(self, vector: Float[Tensor, " c"]) -> list[int]:
+        """Negatives that a vector competes with: those that don't mean the same."""
+        phrases = self.vectors(self.config.negatives)
+        cosines = phrases @ F.normalize(vector.to(phrases), dim=0)
+        return (cosines < _SAME).nonzero().flatten().tolist() or list(range(len(phrases)))
 
     def _positive(self, prompt: Prompt, synonyms: list[str]) -> Float[Tensor, "s c"]:
         if prompt.vector is not None:
             return prompt.vector.to(self.vectors(self.config.negatives))[None]
-        words = [*synonyms, prompt.text]
+        words = [*synonyms, searched(prompt.text) if prompt.taught is None else prompt.text]
         return self.vectors([", ".join(words)] if self.config.combine == "joined" else words)
 
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:

@@ -74,6 +74,15 @@ def test_a_scene_without_known_gaussians_doubts_everything():
     assert scene_of(torch.zeros(GAUSSIANS, CHANNELS), {"thing": torch.ones(CHANNELS)}).ask("thing") == [1.0]
 
 
+@pytest.mark.parametrize(("level", "expected"), [(0.0, 1.0), (0.099, 1.0), (0.101, 1 / 61), (0.9, 1 / 61)])
+def test_what_fits_nowhere_is_doubted_though_unrelated_words_fit_even_less(level, expected):
+    nothing = Doubts(
+        lambda queries: torch.zeros(len(queries), GAUSSIANS),
+        lambda texts: Queries.of([torch.ones(1, 2)] * len(texts), torch.ones(1, 2)),
+    )
+    assert nothing.of(torch.full((1, GAUSSIANS), level)) == pytest.approx([expected])
+
+
 def test_doubt_is_said_with_the_text_and_the_share():
     said = doubtful("blorptag", 0.84)
     assert said is not None and "84%" in said and "'blorptag'" in said

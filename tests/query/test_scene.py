@@ -58,6 +58,20 @@ def test_words_are_found_where_they_are_painted(scene):
         assert match.score == pytest.approx(float(match.relevancy.max()))
 
 
+def test_answers_do_not_depend_on_the_size_of_the_picture():
+    """Needles far thinner than a pixel in training cover little in large pictures, and nothing is learned of
+    what lies between the pixels."""
+    splats = painted_splats()
+    needles = replace(splats, scales=splats.scales * torch.tensor([0.2, 3.0, 1.0]))
+    scene = painted_scene(splats=needles, config=QueryConfig(min_alpha=0))
+    small = scene.query("dome", "all/0003.jpg", size=96).relevancy
+    for size in (192, 288, 480):
+        found = scene.query("dome", "all/0003.jpg", size=size)
+        assert found.view.pixels.shape[0] == size
+        expected = F.interpolate(torch.from_numpy(small)[None, None], (size, size), mode="bilinear")[0, 0]
+        np.testing.assert_allclose(found.relevancy, expected, atol=1e-5)
+
+
 def test_one_text_has_one_answer_and_several_have_a_list(scene):
     assert scene.query("dome", "0003").prompt.text == "dome"
     assert scene.find("dome").prompt.text == "dome"

@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.text import Prompt, SynonymTable, TextConfig, TextEncoder, parse_prompts
+from lang3dxl_ns.query.text import (
+    Prompt,
+    SynonymTable,
+    TextConfig,
+    TextEncoder,
+    caution,
+    parse_prompts,
+    searched,
+)
 
 
 @pytest.mark.parametrize(
@@ -121,3 +129,30 @@ def test_every_text_is_encoded_once(encode):
     for _ in range(3):
         encoder.queries([Prompt("dome"), Prompt("lintel", ("dome",))])
     assert len(encode.asked) == len(set(encode.asked))
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [
+        ("windows on the left tower", "windows"),
+        ("the big door at the front", "door"),
+        ("main entrance", "entrance"),
+        ("upper windows", "windows"),
+        ("the left tower", "tower"),
+        *[
+            (whole, whole)
+            for whole in ("rose window", "left", "clock on the tower", "table top", "top", "top of a column")
+        ],
+    ],
+)
+def test_where_a_thing_is_is_not_searched_for_and_that_is_said(typed, expected, encode):
+    assert searched(typed) == expected
+    assert (caution(typed) is None) == (typed == expected)
+    encoder = TextEncoder(encode)
+    queries = encoder.queries([Prompt(typed)])
+    torch.testing.assert_close(queries.vectors[queries.positive[0][-1]], encoder.vectors([expected])[0])
+
+
+@pytest.mark.parametrize(("typed", "said"), [("red roof", True), ("red", False), ("colored glass", False)])
+def test_colors_are_said_to_be_ignored(typed, said):
+    assert bool(caution(typed)) is said and searched(typed) == typed

@@ -20,7 +20,7 @@ from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import QueryConfig, Scene, text_encoder
-from lang3dxl_ns.query.text import EncodeTexts
+from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 
 
@@ -157,7 +157,8 @@ class Conversation:
             best = max((view.score for view in found.views), default=0.0)
             where = f"{count} good views, best {best:.2f}" if count else "nothing in the scene looks like it"
             lines.append(f"**{plain(text)}**: {where}")
-            lines += [plain(line)] if (line := doubtful(text, found.doubt)) else []
+            told = (None if found.prompt.taught else caution(text), doubtful(text, found.doubt))
+            lines += [plain(line) for line in told if line]
         return "  \n".join(lines)
 
     def status(self) -> str:

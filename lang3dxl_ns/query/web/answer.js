@@ -1,6 +1,6 @@
 // Answers: cosines to relevancy, the threshold from which a place matches, and doubt, as in Python's query/.
 
-const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.35, ELSE = 0.25, BEST = 0.005;
+const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.35, ELSE = 0.25, BEST = 0.005, LEAST_PEAK = 0.1;
 const TIE = 0.999; // numbers of 16 bits: what is equal in Python may differ by less than this
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
@@ -38,7 +38,8 @@ export class Answers {
     const top = Math.max(Math.ceil(BEST * count), 1);
     for (let i = count - top; i < count; i++) fit += sorted[i] / top;
     const { unrelated } = this.words;
-    const doubt = (1 + unrelated.filter((other) => other >= fit * TIE).length) / (1 + unrelated.length);
+    const asWell = unrelated.filter((other) => other >= fit * TIE).length;
+    const doubt = fit < LEAST_PEAK ? 1 : (1 + asWell) / (1 + unrelated.length);
     const low = sorted[Math.floor(ELSE * (count - 1))];
     const own = doubt > DOUBTFUL || named ? EVEN : Math.min(low + SHARE * (fit - low), EVEN);
     const level = threshold ?? this.words.threshold ?? own;

@@ -20,6 +20,7 @@ export const explain = ({ count, known, live }) =>
 function doubtIn({ examples, open, doubt, doubtful }) {
   const count = examples && `${examples.length} example${examples.length > 1 ? "s" : ""}`;
   if (examples) return open ? `${count}: click for more, with Alt for what it is not.` : `${count}.`;
+  if (doubt === 1) return "Doubtful: it fits no place. It may not be here, or this scene's CLIP may not know the word.";
   if (doubtful) return `Doubtful: ${percent(doubt)} of unrelated words fit this scene as well. It may not be here, or this scene's CLIP may not know the word.`;
   return `Fits better than ${percent(1 - doubt)} of unrelated words.`;
 }

@@ -121,7 +121,7 @@ class Page:
             "temperature": scene.engine.temperature,
             "threshold": scene.config.threshold,
             "unrelated": scene.doubts._unrelated.tolist(),
-            "gap": scene._gap,
+            "gap": scene.gap,
             "pixels": [LEAST_PIXELS, PIXEL_STEPS],
         }
 

@@ -1,0 +1,84 @@
+"""Scores of answers as a user gets them, by the scene's own thresholds: masks, selected Gaussians, boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.score_scene import truths_of
+from lang3dxl_ns.evaluation.scores import overlap
+from lang3dxl_ns.query.places import Box, groups
+from lang3dxl_ns.query.run_file import ScenePhoto
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.rendering.gathering import lift_masks
+from lang3dxl_ns.rendering.render import composite
+from lang3dxl_ns.scene.camera import Camera
+
+_LEAST_SHARE = 0.03
+"""Share of all that is labeled with a word, below which a group is no thing of its own."""
+Labels = list[tuple[Camera, Bool[Tensor, "h w"]]]
+
+
+def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePhoto]) -> dict[str, float]:
+    """Figures of every category that the labels show, 0…1:
+
+    - `mask_iou_{category}`: IoU of the mask of `Scene.matches` with the label, mean over photos.
+    - `selection_iou_{category}`: IoU of the Gaussians that match with those that the labels mark, most of
+      whose pixels in the labeled photos are marked. Gaussians weigh as many pixels as they fill.
+    - `box_iou_{category}`: IoU of the box of `Scene.find` with that of the labeled thing it fits best.
+
+    Args:
+        scene: the scene.
+        truth: labels of its photos.
+        photos: the labeled photos to use.
+    """
+    prompts = [Prompt(category) for category in truth.categories]
+    question = scene.ask(prompts)
+    labels: dict[str, Labels] = {category: [] for category in truth.categories}
+    ious: dict[str, list[float]] = {category: [] for category in truth.categories}
+    for photo in photos:
+        camera = photo.camera
+        truths = truths_of(truth, photo.photo(), (camera.height, camera.width))
+        longest = max(camera.height, camera.width)
+        for category, match in zip(
+            truth.categories, scene.matches(question, photo.name, longest), strict=True
+        ):
+            if category in truths:
+                labels[category].append((camera, torch.from_numpy(truths[category].mask).to(scene.device)))
+                if truths[category].mask.any():
+                    ious[category].append(overlap(match.mask, truths[category].mask)["iou"])
+    figures: dict[str, float] = {}
+    for category, found in zip(truth.categories, scene.places(question), strict=True):
+        marked = _marked(scene, labels[category])
+        if not ious[category] or not marked.any():
+            continue
+        chosen, mass = torch.from_numpy(found.gaussians).to(marked.device), scene.mass
+        figures[f"mask_iou_{category}"] = float(np.mean(ious[category]))
+        figures[f"selection_iou_{category}"] = float(
+            mass[chosen & marked].sum() / mass[chosen | marked].sum()
+        )
+        things = groups(scene.splats.means[marked], mass[marked], scene.gap)
+        fits = [box_iou(found.box, box) for box in things if box.share >= _LEAST_SHARE] if found.box else []
+        figures[f"box_iou_{category}"] = max(fits, default=0.0)
+    return figures
+
+
+def _marked(scene: Scene, labels: Labels) -> Bool[Tensor, " n"]:
+    """Gaussians most of whose pixels have the label."""
+    views = [(partial(composite, scene.splats, cam, backend=scene.backend), mask) for cam, mask in labels]
+    return lift_masks(len(scene.splats), views, scene.splats.means) > 0.5
+
+
+def box_iou(a: Box, b: Box) -> float:
+    """Intersection over union of two boxes' volumes; 0 if both are flat."""
+    low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
+    both = float(np.prod((high - low).clip(0)))
+    whole = sum(float(np.prod(np.subtract(box.high, box.low))) for box in (a, b)) - both
+    return both / whole if whole > 0 else 0.0

@@ -1,0 +1,67 @@
+"""Scores of masks, selected Gaussians and boxes, on a scene with known answers."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from painted_scene import DOME, WINDOWS, painted_scene, painted_splats
+from PIL import Image
+
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.selections import box_iou, score_selections
+from lang3dxl_ns.query.places import Box
+
+NAMES = ("dome", "window")
+
+
+def label(scene, folder: Path, shift: float = 0.0) -> GroundTruth:
+    """Exact labels of two photos, drawn from where the words are painted, moved by `shift` units."""
+    for name in ("all/0003.jpg", "left/0001.jpg"):
+        view = scene.file.photo(name)
+        pixels = torch.stack(
+            torch.meshgrid(torch.arange(96) + 0.5, torch.arange(96) + 0.5, indexing="xy"), dim=-1
+        )
+        lens, pose = view.lens, torch.tensor(view.camera_to_world)
+        x = pose[0, 3] + 5 * (pixels[..., 0] - 48) / lens.fx
+        y = pose[1, 3] + 5 * (pixels[..., 1] - 48) / lens.fy
+        depth = scene.splats.means[0, 2] - pose[2, 3]
+        y = y if depth > 0 else 2 * pose[1, 3] - y
+        for word, places in zip(NAMES, ([DOME], WINDOWS), strict=True):
+            mask = sum(((x - shift > a) & (x - shift < b) & (y > c) & (y < d)) for a, b, c, d in places) > 0
+            path = folder / word / Path(name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(mask.numpy().astype(np.uint8) * 255).save(path)
+    return GroundTruth(folder, "plain")
+
+
+def scored(tmp_path, shift: float = 0.0) -> dict[str, float]:
+    flat = painted_splats()
+    depth = 0.1 * torch.rand(len(flat.means), generator=torch.Generator().manual_seed(0))  # boxes have volume
+    scene = painted_scene(splats=replace(flat, means=flat.means + depth[:, None] * torch.tensor([0, 0, 1.0])))
+    truth = label(scene, tmp_path / "ground_truth", shift)
+    return score_selections(scene, truth, [p for p in scene.photos if truth.key(p.name) is not None])
+
+
+def test_a_scene_that_knows_the_answers_gets_nearly_full_marks(tmp_path):
+    figures = scored(tmp_path)
+    assert set(figures) >= {f"{what}_iou_{w}" for what in ("mask", "selection", "box") for w in NAMES}
+    assert min(figures.values()) > 0.7, figures
+
+
+def test_labels_elsewhere_get_none(tmp_path):
+    assert max(scored(tmp_path, shift=-1.6).values()) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("low", "expected"), [((0.0, 0.0, 0.0), 1.0), ((1.0, 0.0, 0.0), 1 / 3), ((0.0, 3.0, 0.0), 0.0)]
+)
+def test_boxes_overlap_by_volume(low, expected):
+    here, there = (Box(at, tuple(x + 2 for x in at), 1.0) for at in ((0.0, 0.0, 0.0), low))
+    assert box_iou(here, there) == box_iou(there, here) == pytest.approx(expected)
+
+
+def test_flat_boxes_have_no_overlap():
+    flat = Box((0.0, 0.0, 0.0), (1.0, 1.0, 0.0), 1.0)
+    assert box_iou(flat, flat) == 0.0
