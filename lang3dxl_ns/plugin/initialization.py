@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import RGB2SH, num_sh_bases
 from lang3dxl_ns.scene.geometry import sphere_around
 
@@ -20,7 +20,7 @@ FEWEST = 4
 
 
 def seed_positions(
-    config: Lang3DXLModelConfig, seed_points: tuple[Tensor, Tensor] | None
+    config: ModelSettings, seed_points: tuple[Tensor, Tensor] | None
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Initial positions of Gaussians and their colors (0…1): the scene's points, or random ones in a box.
 
@@ -39,7 +39,7 @@ def seed_positions(
 
 
 def initial_gaussians(
-    config: Lang3DXLModelConfig,
+    config: ModelSettings,
     means: Float[Tensor, "n 3"],
     colors: Float[Tensor, "n 3"],
     sky_opacity: float = FIRST_OPACITY,
@@ -63,7 +63,7 @@ def initial_gaussians(
     }
 
 
-def color_parameters(config: Lang3DXLModelConfig, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+def color_parameters(config: ModelSettings, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Colors (0…1) as the model stores them: harmonics of degree 0, or logits where these are all."""
     return RGB2SH(colors) if config.sh_degree > 0 else torch.logit(colors, eps=1e-4)
 

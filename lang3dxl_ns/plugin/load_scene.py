@@ -18,8 +18,7 @@ from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import check_regular
 from lang3dxl_ns.plugin.handover import SceneFacts
-from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.saved_config import read_model_config
 from lang3dxl_ns.query.find_run import find_config
 from lang3dxl_ns.query.query_config import QueryConfig

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import isqrt
 from typing import Any
 
@@ -35,7 +36,7 @@ from lang3dxl_ns.plugin.initialization import (
     initial_gaussians,
     seed_positions,
 )
-from lang3dxl_ns.plugin.model_config import make_strategy
+from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import FeatureStatistics
@@ -43,6 +44,13 @@ from lang3dxl_ns.scene.geometry import center_and_radius
 
 DECODE_SIZES = 5
 """Sizes at which code maps are decoded in training."""
+
+
+@dataclass
+class Lang3DXLModelConfig(ModelSettings):
+    """Settings of the model."""
+
+    _target: type = field(default_factory=lambda: Lang3DXLModel)
 
 
 class Lang3DXLModel(RenderingModel):

@@ -21,10 +21,9 @@ SHORT_FIELD_RUN = 5_000
 
 @without(*OF_SPLATFACTO)
 @dataclass
-class Lang3DXLModelConfig(SplatfactoModelConfig):
+class ModelSettings(SplatfactoModelConfig):
     """Splatfacto's settings, with the method's schedule and the semantic components."""
 
-    _target: type = field(default_factory=lambda: _model_class())
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     """The feature decoder: the semantic field, or a baseline."""
     semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
@@ -108,7 +107,7 @@ class Lang3DXLModelConfig(SplatfactoModelConfig):
             self.decode_size = (round(56 + 24 * x), round(72 + 48 * x))
 
 
-def make_strategy(config: Lang3DXLModelConfig) -> Densification:
+def make_strategy(config: ModelSettings) -> Densification:
     """Densification with the run's schedule."""
     steps = config.total_steps
     assert config.densify_grad_thresh is not None  # chosen by the length of the run
@@ -129,9 +128,3 @@ def make_strategy(config: Lang3DXLModelConfig) -> Densification:
         absgrad=config.use_absgrad,
         verbose=False,
     )
-
-
-def _model_class() -> type:
-    from lang3dxl_ns.plugin.model import Lang3DXLModel  # circular import otherwise
-
-    return Lang3DXLModel

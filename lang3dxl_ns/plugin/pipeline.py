@@ -23,8 +23,7 @@ from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataMana
 from lang3dxl_ns.plugin.describe_scene import describe_scene
 from lang3dxl_ns.plugin.evaluation import Evaluation, Split
 from lang3dxl_ns.plugin.lift_features import learn_from_photos, start_codes
-from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.viewer.panel import AskPanel
 from lang3dxl_ns.query.answer import pictures

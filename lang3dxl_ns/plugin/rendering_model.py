@@ -23,7 +23,7 @@ from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.handover import SceneFacts
-from lang3dxl_ns.plugin.model_config import Lang3DXLModelConfig
+from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile
@@ -62,7 +62,7 @@ class RenderingModel(SplatfactoModel):
     `get_outputs`.
     """
 
-    config: Lang3DXLModelConfig
+    config: ModelSettings
     semantic_field: Decoder | None
     appearance: AppearanceField | None
     sky: Sky | None

@@ -29,6 +29,7 @@ _MOVED = {
     f"lang3dxl_ns.plugin.{old}": f"lang3dxl_ns.plugin.{new}"
     for old, new in {
         "datamanager_config.Lang3DXLDataManagerConfig": "datamanager.Lang3DXLDataManagerConfig",
+        "model_config.Lang3DXLModelConfig": "model.Lang3DXLModelConfig",
     }.items()
 }
 """Where settings are that earlier versions kept elsewhere."""

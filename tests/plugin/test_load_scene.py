@@ -123,9 +123,9 @@ def test_the_files_frame_leads_back_to_colmaps(scene, trainer):
 
 
 def test_a_query_is_what_evaluation_scores(scene, trainer, tiny_clip):
-    """The same words, vectors and formula as ns-eval's average precision."""
+    """The same words, vectors and formula as ns-eval's average precision, at the size of training."""
     scorer = open_scorer(SimpleNamespace(categories=["dome", "door"]), str(tiny_clip), "cpu")
-    pipeline, camera = trainer.pipeline, scene.camera("photo_003.jpg")
+    pipeline, camera = trainer.pipeline, scene.camera("photo_003.jpg", size=scene.trained_side)
     pipeline.eval()
     maps = pipeline.evaluation.relevancy(view_of(camera), scorer.queries, scorer.yardstick)
     for match, expected in zip(scene.query("dome; door", camera), maps, strict=True):
