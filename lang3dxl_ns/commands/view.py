@@ -5,13 +5,11 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import tyro
 
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.query.query_config import QueryConfig
 
 
 @dataclass(kw_only=True)
@@ -34,7 +32,6 @@ class View:
     """Port to serve at; by default a free one from 7007 on."""
     clip: str | None = None
     """Name or folder of the scene's CLIP, if it is not where the scene says."""
-    settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene, provenance_of
@@ -44,7 +41,7 @@ class View:
 
         check_address(self.host, self.port)  # fail now rather than after the work
         words = read_vocabulary(self.vocabulary) if self.vocabulary else ()
-        scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        scene = load_scene(self.scene, clip=self.clip)
         page = Page(scene, self.text, words, provenance=provenance_of(self.scene), live=True)
         server = PageServer(page, self.host, self.port)
         who = "anyone with this address" if server.access.needs_token else "this machine only"
