@@ -66,31 +66,21 @@ def make_decoder(
 
     center, radius: of the scene, world units.
     """
-    decoder = _make(config, settings, clip_dim, dense_dim, center, radius)
+    if config.name == "feature3dgs":
+        decoder: Decoder = Feature3DGS(clip_dim, dense_dim)
+    elif config.name == "fmgs":
+        decoder = PlaceField(settings, clip_dim, dense_dim, center, radius, config.alignment_weight)
+    elif config.name == "langsplat":
+        decoder = LangSplat(clip_dim, config.autoencoder_steps)
+    elif config.name == "direct":
+        decoder = DirectFeatures(clip_dim, dense_dim)
+    elif config.name == "lifting":
+        decoder = LiftedFeatures(clip_dim, dense_dim)
+    elif config.name == "paper":
+        decoder = SemanticField(settings, clip_dim, dense_dim)
+    elif config.name == "gathered":
+        decoder = CompressedField(settings, clip_dim, config.compression)
+    else:
+        raise UserError(f"there is no feature decoder {config.name!r}: choose one of {', '.join(NAMES)}")
     decoder.name = config.name
     return decoder
-
-
-def _make(
-    config: DecoderConfig,
-    settings: SemanticFieldConfig,
-    clip_dim: int,
-    dense_dim: int,
-    center: Float[Tensor, "3"],
-    radius: float,
-) -> Decoder:
-    if config.name == "feature3dgs":
-        return Feature3DGS(clip_dim, dense_dim)
-    if config.name == "fmgs":
-        return PlaceField(settings, clip_dim, dense_dim, center, radius, config.alignment_weight)
-    if config.name == "langsplat":
-        return LangSplat(clip_dim, config.autoencoder_steps)
-    if config.name == "direct":
-        return DirectFeatures(clip_dim, dense_dim)
-    if config.name == "lifting":
-        return LiftedFeatures(clip_dim, dense_dim)
-    if config.name == "paper":
-        return SemanticField(settings, clip_dim, dense_dim)
-    if config.name == "gathered":
-        return CompressedField(settings, clip_dim, config.compression)
-    raise UserError(f"there is no feature decoder {config.name!r}: choose one of {', '.join(NAMES)}")
