@@ -6,7 +6,7 @@ const FLUENT = 40, COARSEST = 0.3, STILL = 150; // milliseconds of a frame, shar
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 
 export class View extends EventTarget {
-  /** about: the page's description; frame: the element to fill. Fires `moved` and `click`. */
+  /** about: the page's description; frame: the element to fill. Fires `moved`, `drawn` and `click`. */
   constructor(about, frame) {
     super();
     Object.assign(this, { about, frame });
@@ -54,13 +54,15 @@ export class View extends EventTarget {
   /** Colors and opacities of all splats, four bytes each, before heat. */
   light(colors) {
     this.plain = colors;
-    this.recolor();
+    this.layers = null;
+    this.recolor(this.shown);
   }
 
   /** Show heat: layers of { relevancy, threshold, peak, color }, the strongest where several match. */
-  recolor(layers = this.layers ?? []) {
-    this.layers = layers;
-    if (!this.splats) return;
+  recolor(layers = []) {
+    const told = layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color]);
+    if (!this.splats || (told.length === this.layers?.length && told.every((value, k) => value === this.layers[k]))) return;
+    Object.assign(this, { layers: told, shown: layers });
     for (let i = 0; i < this.plain.length / 4; i++) {
       let best = 0, chosen = null;
       for (const layer of layers) {
@@ -172,6 +174,7 @@ export class View extends EventTarget {
     if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
     gl.deleteSync(fence);
     this.drawing = null;
+    this.dispatchEvent(new Event("drawn"));
     if (share === 1 || !this.measured) this.cost = Math.min((performance.now() - start) / share ** 2, 2000);
     this.measured ||= share === 1;
     this.controls.enableDamping = !still.matches && this.cost < 2 * FLUENT; // it takes a hundred frames
