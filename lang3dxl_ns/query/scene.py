@@ -461,8 +461,8 @@ class Scene:
         cosines = queries.cosines(share[rows] @ features)
         scores = queries.relevancy_of_cosines(cosines, self.engine.temperature)
         negatives = self.text.config.negatives
-        named = max((float(score) for word, score in zip(words, scores, strict=True) if word != "sky"), default=0)
-        if named <= CLEAR and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
+        clear = any(score > CLEAR for word, score in zip(words, scores, strict=True) if word != "sky")
+        if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
             return []
         best = scores.topk(min(most, len(words)))
         return [(words[int(i)], float(score)) for score, i in zip(best.values, best.indices, strict=True)]

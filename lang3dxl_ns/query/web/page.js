@@ -396,14 +396,12 @@ async function begin() {
 
 const drawing = open(), reading = drawing.then(readMeaning);
 window.lang3dxl = {
-  drawing,
   ready: reading.then(begin),
   ask,
   whatIs,
-  get resting() {
-    return view.resting;
+  get view() {
+    return view;
   },
-  relevancy: async (text) => [...prompts.find((prompt) => prompt.text === text).relevancy],
   get seconds() {
     return about.seconds;
   },

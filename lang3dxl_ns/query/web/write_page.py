@@ -20,6 +20,7 @@ from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.negatives import NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.scene_file import Provenance
+from lang3dxl_ns.query.teach import TaughtWord, known_word
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
 from lang3dxl_ns.query.web.pack import (
@@ -38,7 +39,7 @@ from lang3dxl_ns.query.web.pack import (
 _HERE = Path(__file__).parent
 _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
-"""For the views that the page flies to, and again for the photos' lightings; beyond it, evenly chosen ones."""
+"""For the views that the page flies to, and again for the photos' lightings; beyond it, a part, evenly chosen."""
 _TEXTS = 256
 """Texts encoded at a time."""
 MOST_TEXT = 2_000
@@ -152,13 +153,13 @@ class Page:
         prompts = [*self.prompts, *self._foreground]
         asked = [plain(phrase) for prompt in prompts for phrase in (prompt.text, *prompt.negatives)]
         naming = list(dict.fromkeys(filter(None, map(plain, [*shipped_vocabulary(), *self._words, *asked]))))
-        taught = {plain(word.name).lower(): word for word in self.scene.words.values()}
-        others = [*taught, *common_words(), *map(plain, self._more)]
+        taught = self.scene.words
+        others = [*(plain(word.name) for word in taught.values()), *common_words(), *map(plain, self._more)]
         words = list(dict.fromkeys([*naming, *filter(None, others)]))
         own = torch.cat([*self._encoded(meaning, negatives), *self._encoded(meaning, words)])
         special, extra = {}, [own]
         for i, word in enumerate(words):
-            if i < len(naming) or word.lower() in taught:
+            if i < len(naming) or known_word(word) in taught:
                 near, against = self._meant(meaning, word)
             else:
                 near, against = own[:1], competitors(negatives, [word])
@@ -169,12 +170,9 @@ class Page:
         described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
         described["nothing"] = [i for i, phrase in enumerate(negatives) if phrase in NOTHING]
         described["taught"] = {
-            i: {
-                "vector": meaning.of_texts(taught[word.lower()].vector[None].to(self.scene.device))[0].tolist(),
-                **{name: getattr(taught[word.lower()], name) for name in ("name", "bias", "text", "doubt")},
-            }
+            i: self._learned(meaning, taught[known_word(word)])
             for i, word in enumerate(words)
-            if word.lower() in taught
+            if known_word(word) in taught
         }
         return {
             "vocabulary.json": json.dumps(described).encode(),
@@ -185,6 +183,11 @@ class Page:
         """Vectors that are searched for along with a word, and the negatives that it competes with."""
         queries = self.scene.queries(self.scene.prompts([Prompt(word)]))
         return meaning.of_texts(queries.vectors[list(queries.positive[0])]).cpu(), list(queries.negative[0])
+
+    def _learned(self, meaning: PackedMeaning, word: TaughtWord) -> dict[str, Any]:
+        """What examples taught, in the scene's own numbers."""
+        vector = meaning.of_texts(word.vector[None].to(self.scene.device))[0].tolist()
+        return {"vector": vector, "bias": word.bias, "text": word.text, "doubt": word.doubt}
 
     def _encoded(self, meaning: PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
         parts = [texts[row : row + _TEXTS] for row in range(0, len(texts), _TEXTS)]
