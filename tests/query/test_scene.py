@@ -165,7 +165,7 @@ def test_nothing_is_named_at_the_sky_and_where_nothing_has_a_meaning(scene):
         other = painted_scene(codes=torch.where(dome[:, None], changed, codes))
         assert other.what_is(*place) == []
         column, row = other.query("windows", "left/0001.jpg").peak
-        assert other.what_is("left/0001.jpg", column, row)[0][0] == "window"
+        assert other.what_is("left/0001.jpg", column, row)[0][0] in ("window", "windows")
 
 
 def test_features_are_unit_vectors_and_unseen_gaussians_have_none(scene):

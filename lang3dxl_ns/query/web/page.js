@@ -70,7 +70,7 @@ async function ask(typed) {
     }
     if (!old) prompts.push(prompt);
     remember(text);
-    draw();
+    draw(prompt);
   }
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
@@ -95,11 +95,13 @@ async function attempt(work) {
 
 // ── showing ──
 
-function draw() {
+/** Show all prompts; newest: the one to scroll to, where the panel is small. */
+function draw(newest = null) {
   const acts = { fly, remove, rename, setThreshold, teach, undo, forget };
   for (const prompt of prompts) prompt.card = promptCard(prompt, acts);
   $("prompts").replaceChildren(...prompts.map(({ card }) => card));
   view.recolor(prompts.filter((prompt) => prompt.relevancy));
+  newest?.card.scrollIntoView({ block: "nearest" });
   drawBoxes();
   writeAddress();
 }
@@ -193,7 +195,7 @@ async function addExample(prompt, without) {
   prompt.examples.push({ rows: latest.rows, without: Boolean(without) });
   await answer(prompt);
   keepWord(prompt);
-  draw();
+  draw(prompt);
 }
 
 /** Take the latest example back. */
