@@ -132,8 +132,8 @@ class Query:
 
 
 def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:
-    """Prompts of --text, each with the negatives of --not."""
-    prompts = [prompt for text in texts for prompt in parse_prompts(text)]
+    """Prompts of --text, each once and with the negatives of --not."""
+    prompts = dict.fromkeys(prompt for text in texts for prompt in parse_prompts(text))
     return [replace(prompt, negatives=(*prompt.negatives, *apart_from)) for prompt in prompts]
 
 
