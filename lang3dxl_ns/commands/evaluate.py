@@ -144,12 +144,7 @@ class EvaluatePool:
         if not any("map" in results for results in scenes.values()):
             raise UserError(f"no prompt was scored in {', '.join(scenes)}: there is nothing to combine")
         pooled = pool({name: list(results["photos"].values()) for name, results in scenes.items()})
-        notes = [
-            f"- {name}: {p.get('evaluated_photos')} photos, {p.get('seen_in_training', 'unknown')} of them "
-            f"seen in training; foreground: {p.get('foreground')}"
-            for name, p in protocols.items()
-        ]
-        table = "\n".join([pooled_table(pooled), "", *notes])
+        table = "\n".join([pooled_table(pooled), "", *(_told(*scene) for scene in protocols.items())])
         write_report(self.out, REPORT, table, pooled | {"protocols": protocols})
         print(f"{table}\n\nWrote {self.out / REPORT}.md")
 
@@ -182,6 +177,13 @@ Evaluate = (
     | Annotated[EvaluatePool, tyro.conf.subcommand("pool")]
     | Annotated[EvaluateSplit, tyro.conf.subcommand("split")]
 )
+
+
+def _told(name: str, protocol: dict[str, Any]) -> str:
+    """What a report says of how its scene was scored."""
+    labels = {"evaluated_photos": "photos", "seen_in_training": "seen in training", "foreground": "foreground"}
+    known = [f"{label} {protocol[key]}" for key, label in labels.items() if protocol.get(key) is not None]
+    return f"- {name}: {', '.join(known) or 'its report does not tell how it was scored'}"
 
 
 def _scene_name(folder: Path) -> str:
