@@ -181,8 +181,8 @@ Evaluate = (
 
 def _told(name: str, protocol: dict[str, Any]) -> str:
     """What a report says of how its scene was scored."""
-    labels = {"evaluated_photos": "photos", "seen_in_training": "seen in training", "foreground": "foreground"}
-    known = [f"{label} {protocol[key]}" for key, label in labels.items() if protocol.get(key) is not None]
+    keys = ("evaluated_photos", "seen_in_training", "foreground")
+    known = [f"{key.replace('_', ' ')}: {protocol[key]}" for key in keys if protocol.get(key) is not None]
     return f"- {name}: {', '.join(known) or 'its report does not tell how it was scored'}"
 
 
