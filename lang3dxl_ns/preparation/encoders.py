@@ -215,7 +215,7 @@ def _tokenizer(files: ModelFiles) -> Any:
             f"{files.folder} has no tokenizer ({', '.join(' and '.join(names) for names in _VOCABULARIES)}): "
             "copy these files from the model that this one was fine-tuned from"
         )
-    remedy = "those of SigLIP and TIPSv2 need `pip install sentencepiece protobuf`; otherwise download the model again"
+    remedy = "SigLIP and TIPSv2 need `pip install sentencepiece protobuf`; otherwise download the model again"
     with whole(f"the tokenizer in {files.folder} can't be read", remedy):
         return AutoTokenizer.from_pretrained(files.folder, local_files_only=True, trust_remote_code=False)
 
