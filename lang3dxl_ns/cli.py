@@ -22,6 +22,7 @@ import tyro
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.settings_help import asked_for_all
 
 BENCHMARKS = {
     "training": ("benchmarks.training:TrainingBenchmark", "A training step by its parts."),
@@ -76,7 +77,7 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `lang3dxl` command."""
-    words = sys.argv[1:] if arguments is None else arguments
+    words = asked_for_all(sys.argv[1:] if arguments is None else arguments)
     silence_libraries()
     accept_any_console()
     if words[:1] == ["--version"]:

@@ -11,11 +11,13 @@ from statistics import median
 from typing import Any
 
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+from lang3dxl_ns.common.settings_help import showing
 
 PARTS = ("data", "render", "appearance", "decode", "downsample", "losses", "backward", "optimizer")
 """Parts of a step; appearance is within the rendering."""
 
 
+@showing("data", "out", "clip", "iterations", "threads")
 @dataclass
 class TrainingBenchmark:
     """Train with and without semantics, evaluate on held-out photos, and time every part of a step."""

@@ -11,6 +11,7 @@ import tyro
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, write_report
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import average, pool
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
 from lang3dxl_ns.evaluation.report import pooled_table, read_results, scene_table
@@ -19,6 +20,7 @@ REPORT = "scores"
 """Report file name, without suffix."""
 
 
+@showing("maps", "ground_truth", "layout", "photos", "masks", "out")
 @dataclass(kw_only=True)
 class EvaluateMaps:
     """Score relevancy maps made by any system.
