@@ -13,6 +13,7 @@ from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerC
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from lang3dxl_ns.common.settings_help import asked_for_all
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.saved_config import check_command_line
@@ -144,6 +145,8 @@ lang3dxl_paper = MethodSpecification(
     description="Lang3D-XL as in its paper: codes trained with the scene, composited, then decoded.",
 )
 METHODS = {"lang3dxl": lang3dxl, "lang3dxl-paper": lang3dxl_paper}
+if sys.argv[1:2] and sys.argv[1] in METHODS:
+    sys.argv[2:] = asked_for_all(sys.argv[2:])
 
 
 def run_config(
