@@ -11,4 +11,4 @@ def test_decision_published_and_training_landmarks_are_disjoint():
         assert seed in SPLITS["test"]
     assert (
         min(seed for seed, _ in VALIDATION.values()) >= 250
-    )  # those below are reported in docs/small_clip.md
+    )  # those below are reported in docs/lab/small_clip.md
