@@ -107,7 +107,7 @@ def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
 
 
 def _paper_config() -> Lang3DXLTrainerConfig:
-    """Lang3D-XL as printed and, where the paper is silent, as released: docs/deviations.md has every line.
+    """Lang3D-XL as printed and, where the paper is silent, as released: docs/deviations.md says where.
 
     A run of any length shrinks or stretches the schedule of 70,000 iterations. Runs of under 30,000 learn at
     the rates for short runs.
