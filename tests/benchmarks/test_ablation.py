@@ -112,6 +112,17 @@ def test_no_runs_at_a_time_is_an_error(tmp_path):
         make_all(runs_of(FULL), Counting(tmp_path, []), lambda *_: None, workers=0)
 
 
+def test_a_stopped_comparison_has_every_row_on_every_scene_once_before_any_twice(tmp_path):
+    scenes = {name: tmp_path / name for name in ("a", "b")}
+    rows = [BY_NAME[name] for name in (FULL, "fmgs", CLIPSEG, TEACHER)]
+    runs = Ablation(tmp_path, seeds=2, steps=(6, 4)).runs(scenes, rows)
+    assert [run.seed for run in runs] == [0] * 10 + [1] * 8  # segmenters once, bounds never
+    made: list[str] = []
+    make_all(runs[:3], Counting(tmp_path, made), lambda *_: None)
+    make_all(runs, Counting(tmp_path, made), lambda *_: None)
+    assert sorted(made) == sorted(run.name for run in runs)
+
+
 def test_clipsegs_folder_decides_about_its_own_row_alone(tmp_path):
     made: list[str] = []
     runs = runs_of(FULL, CLIPSEG, LANGSAM)
@@ -208,6 +219,14 @@ def test_a_seed_that_lacks_a_scene_is_left_out_of_the_mean_over_scenes(tmp_path)
     write_ablation(tmp_path, "", [BY_NAME[FULL]], figures, {})
     (full,) = json.loads((tmp_path / "ablation.json").read_text())["lengths"]["1200"]
     assert full["mean"]["map"] == {"mean": pytest.approx(0.15), "std": 0.0, "runs": 1}
+
+
+def test_scenes_of_one_family_have_a_mean_and_the_deviation_between_them(tmp_path):
+    scores = {"hall-1": 0.2, "hall-2": 0.4, "mosque-1": 0.5}
+    figures = {Run(BY_NAME[FULL], Path(s), s, 0): {"map": value} for s, value in scores.items()}
+    write_ablation(tmp_path, "", [BY_NAME[FULL]], figures, {})
+    text = (tmp_path / "ablation.md").read_text()
+    assert "| mAP by family | hall | mosque |" in text and "| 0.300 ± 0.141 | 0.500 |" in text
 
 
 def test_a_line_of_the_table_is_a_run():
