@@ -14,8 +14,9 @@ export function say(message) {
   document.getElementById("status").textContent = message;
 }
 
-export const explain = ({ count, known, live }) =>
-  `${count.toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`);
+export const explain = ({ count, known, live, foreground }) =>
+  `${count.toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`) +
+  (foreground.length ? ` Matches lie on ${foreground.map(([text]) => shown(text)).join(" or ")}.` : "");
 
 function doubtIn({ examples, open, taught, doubt, doubtful }) {
   const count = examples && `${examples.length} example${examples.length > 1 ? "s" : ""}`;
