@@ -170,7 +170,7 @@ async function tell({ x, y, without }) {
   const buttons = words.map(([word, score]) =>
     element("button", { className: "small", onclick: () => attempt(() => ask(word)) }, `${word} ${percent(score)}`));
   const like = element("button", { className: "small", onclick: likeThis }, "Like this");
-  $("here").replaceChildren(element("p", {}, words.length ? "Here, words that fit best:" : "Nothing is there."),
+  $("here").replaceChildren(element("p", {}, words.length ? "Here, words that fit best:" : `Nothing is there${rows.length ? " that has a name" : ""}.`),
     element("div", {}, ...buttons, ...(rows.length ? [like] : []))); // prettier-ignore
   $("here").hidden = false;
 }
