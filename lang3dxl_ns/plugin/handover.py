@@ -51,6 +51,16 @@ class SceneFacts:
     dense_targets: Callable[[], Iterator[Float[Tensor, "t t d"]]] | None = None
     """Their dense features; None without a dense encoder."""
 
+    def wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
+        """Whether a scene has an optional component.
+
+        Args:
+            component: its name among `needs`.
+            choice: the setting, `on`, `off` or `auto`.
+            unmeasured: the answer to `auto` where the need wasn't measured.
+        """
+        return self.needs.get(component, unmeasured) if choice == "auto" else choice == "on"
+
     def into(self, metadata: dict[str, Any]) -> None:
         """Put them where nerfstudio carries them from dataset to model."""
         metadata[_KEY] = self

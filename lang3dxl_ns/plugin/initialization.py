@@ -39,10 +39,7 @@ def seed_positions(
 
 
 def initial_gaussians(
-    config: ModelSettings,
-    means: Float[Tensor, "n 3"],
-    colors: Float[Tensor, "n 3"],
-    sky_opacity: float = FIRST_OPACITY,
+    config: ModelSettings, means: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"]
 ) -> dict[str, Parameter]:
     """The sky's Gaussians, and one per position (at least `FEWEST`), as wide as the mean distance to its
     three nearest neighbors."""
@@ -50,8 +47,6 @@ def initial_gaussians(
     means = torch.cat([sky, means])
     colors = torch.cat([torch.full_like(sky, 0.5), colors])
     n = len(means)
-    opacities = torch.full((n, 1), FIRST_OPACITY)
-    opacities[: len(sky)] = sky_opacity
     return {
         "means": Parameter(means),
         "scales": Parameter(_spacing(means).log().repeat(1, 3)),
@@ -59,7 +54,7 @@ def initial_gaussians(
         "quats": Parameter(F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)),
         "features_dc": Parameter(color_parameters(config, colors)),
         "features_rest": Parameter(torch.zeros(n, num_sh_bases(config.sh_degree) - 1, 3)),
-        "opacities": Parameter(torch.logit(opacities)),
+        "opacities": Parameter(torch.logit(torch.full((n, 1), FIRST_OPACITY))),
     }
 
 

@@ -18,10 +18,12 @@ from torch import Tensor
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField
+from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
@@ -63,7 +65,13 @@ class RenderingModel(SplatfactoModel):
     """
 
     config: ModelSettings
+    strategy: Densification
+    extent: tuple[Float[Tensor, "3"], float]
+    """The scene's center, and the distance from it that contains most of the scene."""
     semantic_field: Decoder | None
+    downsampler: AttenuatedDownsampler | None
+    clip_mean: Tensor
+    dense_mean: Tensor
     appearance: AppearanceField | None
     sky: Sky | None
     """The first Gaussians' colors; None: there is no sky, or it was trained like all Gaussians."""
