@@ -22,6 +22,7 @@ from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.coco import CocoLabels
 from lang3dxl_ns.query.doubt import doubtful
+from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.match import Match, save_picture, together
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import read_camera_path
@@ -234,7 +235,8 @@ class Export:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         if self.scene_file is not None:
-            size = write_scene(self.scene_file, scene, self._told())
+            kept = with_words_of(scene, self.scene_file)
+            size = write_scene(self.scene_file, kept, self._told())
             say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: lang3dxl query {self.scene_file}")
         if self.web is not None:
             own = read_vocabulary(self.vocabulary) if self.vocabulary else ()

@@ -44,6 +44,7 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.plugin.step_guard import StepGuard
 from lang3dxl_ns.preparation.needs import write_needs
+from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
 
@@ -368,11 +369,14 @@ class Lang3DXLTrainer(Trainer):
         super()._after_train()  # saves first
 
     def write_scene(self) -> None:
-        """Write the trained scene as one file into the run's folder, to ask and to share."""
+        """Write the trained scene as one file into the run's folder, to ask and to share. It keeps the words
+        taught in an earlier file there, or in that of the run that this one resumed."""
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
         how = f"{self.config.method_name}, {config.decoder.name}, {self.config.max_num_iterations} iterations"
-        scene = self.pipeline.model.scene(self.pipeline.scene_file)
+        scene, checkpoint = self.pipeline.model.scene(self.pipeline.scene_file), self._checkpoint_to_load()
+        for folder in (self.base_dir, *([] if checkpoint is None else [checkpoint.parents[1]])):
+            scene = with_words_of(scene, folder / path.name)
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
         size = write_scene(path, scene, told)
         say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)", *self._next_steps())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -380,6 +381,20 @@ class Scene(ViewedScene):
         changed = copy.copy(self)
         changed.words = {known_word(word.name): word for word in words}
         return changed
+
+    def carrying(self, word: TaughtWord) -> Scene:
+        """A scene with a word that was taught elsewhere: learned anew if it was taught in these photos,
+        otherwise, or if its marks show nothing any more, as it was learned there.
+
+        Raises:
+            UserError: it was learned with another CLIP.
+        """
+        if word.examples and word.scene == Path(self.file.data).name:
+            with suppress(UserError):
+                return self.teach(word.name, word.examples)
+        if word.clip != self.file.clip_identity:
+            raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
+        return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
 
     def unsure(self, word: str) -> str:
         """The training photo in which a taught word is least sure: the next one to mark.
