@@ -51,10 +51,10 @@ def lens_of(cameras: Cameras, index: int) -> Lens:
     )
 
 
-def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"]) -> Camera:
-    """The lens of a nerfstudio camera at a (possibly refined) pose, camera → world; where these are."""
+def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
+    """The lens of a nerfstudio camera at its pose, or another (refined) one, camera → world."""
     return Camera(
-        view_matrix=view_matrix(pose),
+        view_matrix=view_matrix(camera.camera_to_worlds[0] if pose is None else pose),
         intrinsics=camera.get_intrinsics_matrices()[0],
         width=int(camera.width.item()),
         height=int(camera.height.item()),

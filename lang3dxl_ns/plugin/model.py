@@ -24,12 +24,12 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
-from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.initialization import color_parameters, initial_gaussians, seed_positions
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
 from lang3dxl_ns.plugin.optional_components import COMPONENTS
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
+from lang3dxl_ns.preparation.handover import Batch
 from lang3dxl_ns.scene.geometry import center_and_radius
 
 DECODE_SIZES = 5

@@ -23,9 +23,9 @@ from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.sky import OPACITY, Sky
-from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
+from lang3dxl_ns.preparation.handover import SceneFacts
 
 
 class Component(ABC):

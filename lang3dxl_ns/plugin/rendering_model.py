@@ -24,9 +24,9 @@ from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.densification import Densification
-from lang3dxl_ns.plugin.handover import SceneFacts
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
+from lang3dxl_ns.preparation.handover import SceneFacts
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene
@@ -268,7 +268,7 @@ class RenderingModel(SplatfactoModel):
         downscale = self._get_downscale_factor()
         if downscale != 1:
             camera.rescale_output_resolution(1 / downscale)
-        view = to_rasterizer(camera, camera.camera_to_worlds[0] if pose is None else pose)
+        view = to_rasterizer(camera, pose)
         if downscale != 1:
             camera.rescale_output_resolution(downscale)
         return view
