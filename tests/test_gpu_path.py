@@ -339,7 +339,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
     from contextlib import nullcontext
 
     from lang3dxl_ns.plugin.cameras import view_of
-    from lang3dxl_ns.plugin.viewer.session import Conversation
+    from lang3dxl_ns.query.conversation import Conversation
 
     pipeline = default.pipeline
     model = pipeline.model.eval()

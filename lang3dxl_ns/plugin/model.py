@@ -22,9 +22,9 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
+from lang3dxl_ns.components.initialization import color_parameters, initial_gaussians, seed_positions
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
-from lang3dxl_ns.plugin.initialization import color_parameters, initial_gaussians, seed_positions
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
 from lang3dxl_ns.plugin.optional_components import COMPONENTS
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
@@ -48,12 +48,15 @@ class Lang3DXLModel(RenderingModel):
 
     def populate_modules(self) -> None:
         """Build Gaussians, strategy, components and metrics (on the CPU; the pipeline moves them)."""
-        self.config.fit_to_run(self.config.total_steps)
-        if not self.facts.wants("view dependence", self.config.view_dependence):
-            self.config.sh_degree = 0
-        means, colors = seed_positions(self.config, self.seed_points)
+        c = self.config
+        c.fit_to_run(c.total_steps)
+        if not self.facts.wants("view dependence", c.view_dependence):
+            c.sh_degree = 0
+        points = None if c.random_init else self.seed_points
+        means, colors = seed_positions(points, c.num_random, c.random_scale)
         self.extent = center_and_radius(means)
-        self.gauss_params = nn.ParameterDict(initial_gaussians(self.config, means, colors))
+        first = initial_gaussians(means, colors, c.sky_gaussians, c.sh_degree)
+        self.gauss_params = nn.ParameterDict(first)
         self.strategy = make_strategy(self.config)
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
         for component in COMPONENTS:
@@ -90,7 +93,7 @@ class Lang3DXLModel(RenderingModel):
                 CONSOLE.log(f"Step {step}: {before} → {self.num_points} Gaussians")
         if self.sky is not None:
             with torch.no_grad():
-                colors = color_parameters(self.config, self.sky.colors)
+                colors = color_parameters(self.sky.colors, self.config.sh_degree)
                 self.gauss_params["features_dc"][: len(self.sky)] = colors
 
     def forget_gathered_codes(self) -> None:

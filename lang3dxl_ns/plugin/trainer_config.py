@@ -25,12 +25,13 @@ from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
-from lang3dxl_ns.plugin.saved_config import load_configs, read_config
+from lang3dxl_ns.plugin.saved_config import read_config
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.query.run_checkpoint import check_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE
+from lang3dxl_ns.query.run_settings import load_configs
 from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
 from lang3dxl_ns.scene.camera import Camera
 

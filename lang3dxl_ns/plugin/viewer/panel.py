@@ -17,7 +17,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.viewer.frame_size import keep_frames_recognizable
-from lang3dxl_ns.plugin.viewer.session import Conversation, plain
+from lang3dxl_ns.query.conversation import Conversation, plain
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.run_file import SceneFile

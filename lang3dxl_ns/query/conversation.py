@@ -1,4 +1,4 @@
-"""Query session of nerfstudio's viewer: questions to snapshots of a model, without user interface."""
+"""Questions to snapshots of a model that may be in training, without user interface."""
 
 from __future__ import annotations
 
@@ -9,19 +9,51 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.query.answer import pictures
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
+from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import SceneFile
-from lang3dxl_ns.query.scene import QueryConfig, Scene, text_encoder
+from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
+
+
+class AskedModel(Protocol):
+    """A model of a scene, as far as questions go."""
+
+    training: bool
+    step: int
+    """Iterations so far."""
+
+    @property
+    def config(self) -> Any:
+        """Settings, with the run's `total_steps`."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where it is."""
+
+    @property
+    def semantic_field(self) -> Decoder | None:
+        """The feature decoder; None without semantics."""
+
+    def train(self, mode: bool = True) -> Any:
+        """Set whether it is in training."""
+
+    @property
+    def scene(self) -> Callable[..., Scene]:
+        """Makes the present state a scene of its own."""
+
+    def forget_gathered_codes(self) -> None:
+        """Remove the codes that were made for a question."""
 
 
 class Conversation:
@@ -45,7 +77,7 @@ class Conversation:
 
     def __init__(
         self,
-        model: Lang3DXLModel,
+        model: AskedModel,
         file: SceneFile,
         run: Path,
         lock: AbstractContextManager,
@@ -112,7 +144,7 @@ class Conversation:
         field = self._model.semantic_field
         with self._lock, torch.no_grad():
             training = self._model.training
-            self._model.eval()
+            self._model.train(False)
             try:
                 if learning and field is not None and field.needs_lifting:
                     self._watch("gathering the photos' features onto the present scene…")

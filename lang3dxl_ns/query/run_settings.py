@@ -1,0 +1,295 @@
+"""Loading of a run's config.yml without executing code."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import yaml
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_text
+
+TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
+_PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
+_PYTHON = "tag:yaml.org,2002:python/"
+_MOVED = {
+    f"lang3dxl_ns.plugin.{old}": f"lang3dxl_ns.plugin.{new}"
+    for old, new in {
+        "datamanager_config.Lang3DXLDataManagerConfig": "datamanager.Lang3DXLDataManagerConfig",
+        "model_config.Lang3DXLModelConfig": "model.Lang3DXLModelConfig",
+    }.items()
+}
+"""Where settings are that earlier versions kept elsewhere."""
+_UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
+"""nerfstudio's classes that unpickle what they read."""
+
+
+def read_model_config(path: Path) -> tuple[Any, Path]:
+    """The model's settings of a run, and the folder of its checkpoints, relative to the run's: as
+    `read_settings`, but without loading what the other settings belong to. Settings that an earlier version
+    did not have take their defaults: the checkpoint beside the file tells whether they fit."""
+    model, checkpoints = read_settings(path, [("pipeline", "model"), ("relative_model_dir",)], complete=True)
+    if not is_dataclass(model) or not isinstance(checkpoints, Path):
+        raise no_config(path)
+    return model, checkpoints
+
+
+def read_settings(path: Path, places: Sequence[Sequence[str]], complete: bool = False) -> list[Any]:
+    """Settings in a run's config.yml. The file is parsed as data only: settings, paths, and classes by name
+    from nerfstudio and this package (nerfstudio's own commands call whatever a file names).
+
+    Args:
+        path: the file.
+        places: which settings, each named from the outermost in; () for all. None where there are none.
+        complete: give missing settings their defaults.
+
+    Raises:
+        UserError: the file is missing, damaged, or of another version, or asks for more than settings.
+    """
+    try:
+        found = _construct(read_text(path), places)
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
+        raise UserError(f"{path} is not a file: pass the config.yml of a run") from error
+    except (
+        *(yaml.YAMLError, OSError, LookupError, TypeError, AttributeError, ValueError),
+        *(RecursionError, ImportError),
+    ) as error:
+        raise UserError(
+            f"{path} can't be read ({error}): it is damaged, or from a version of lang3dxl-ns whose settings "
+            "are no longer known; restore it, open it with that version, or train anew"
+        ) from error
+    for settings in found if complete else ():
+        if is_dataclass(settings):
+            _complete(settings)
+    odd = (line for settings in found if is_dataclass(settings) for line in _differences(settings))
+    if first := next(odd, None):
+        raise UserError(
+            f"{path} {first}: it is truncated, or from another version of lang3dxl-ns; copy it again, open "
+            "it with that version, or train anew"
+        )
+    return found
+
+
+def _construct(text: str, places: Sequence[Sequence[str]]) -> list[Any]:
+    loader = _SettingsLoader(text)
+    try:
+        root = loader.get_single_node()
+        if why := _asks_for(root):
+            raise yaml.constructor.ConstructorError(None, None, f"it asks to {why}")
+        nodes = [_at(root, place) for place in places]
+        return [None if node is None else loader.construct_document(node) for node in nodes]
+    finally:
+        loader.dispose()
+
+
+def _at(node: yaml.Node | None, place: Sequence[str]) -> yaml.Node | None:
+    for name in place:
+        pairs = node.value if isinstance(node, yaml.MappingNode) else []
+        node = next((value for key, value in pairs if key.value == name), None)
+    return node
+
+
+def no_config(path: Path) -> UserError:
+    """The error of a file that holds other settings than a run's."""
+    return UserError(f"{path} is not the config.yml of a nerfstudio run")
+
+
+def _differences(settings: Any, place: str = "") -> Iterator[str]:
+    """Settings that a file lacks or should not have, by their dotted names."""
+    known = {field.name for field in fields(settings)}
+    hints = _hints(type(settings))  # type: ignore[arg-type]
+    yield from (f"lacks the setting {place}{name}" for name in sorted(known - set(vars(settings))))
+    yield from (f"has the unknown setting {place}{name}" for name in sorted(set(vars(settings)) - known))
+    for name in sorted(known):
+        value = getattr(settings, name)
+        if name == "_target" and value is not _default(settings, name):
+            yield f"would start {place}{name} {value!r}"
+        if is_dataclass(value) and not isinstance(value, type):
+            yield from _differences(value, f"{place}{name}.")
+        elif name in hints and not _fits(value, hints[name]) and _fits(_default(settings, name), hints[name]):
+            yield f"sets {place}{name} to {str(value)[:40]!r}, of another kind than this setting"
+
+
+def _complete(settings: Any) -> None:
+    """Give the settings that a file lacks their defaults."""
+    for field in fields(settings):
+        if field.name not in vars(settings):
+            setattr(settings, field.name, _default(settings, field.name))
+        value = getattr(settings, field.name)
+        if is_dataclass(value) and not isinstance(value, type):
+            _complete(value)
+
+
+def _default(settings: Any, name: str) -> Any:
+    (known,) = (field for field in fields(settings) if field.name == name)
+    return known.default if known.default_factory is MISSING else known.default_factory()
+
+
+@cache
+def _hints(settings: type) -> dict[str, Any]:
+    try:
+        return get_type_hints(settings)
+    except NameError:  # a type that another package imports for its type checker alone
+        return {}
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of a setting's type, where that is a plain one."""
+    kind, parts = get_origin(hint), get_args(hint)
+    if kind is Literal:
+        return value in parts
+    if kind in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if kind is Annotated:
+        return _fits(value, parts[0])
+    if kind is tuple and isinstance(value, tuple) and ... not in parts:
+        return len(value) == len(parts) and all(map(_fits, value, parts))
+    if hint is float:
+        return type(value) in (int, float) and not math.isnan(value)
+    if hint is int:
+        return type(value) is int
+    kind = kind or hint
+    return isinstance(value, kind) if isinstance(kind, type) and kind is not type else True
+
+
+def check_command_line(arguments: Sequence[str]) -> None:
+    """Exit from an `ns-…` command whose `--load-config` file is a run of this method's and asks for more than
+    settings, or can't be looked at before nerfstudio reads it: a pipe, or a device.
+
+    nerfstudio calls whatever such a file names. It imports the methods first, this one among them, which is
+    the earliest moment a plugin can check. The YAML nodes are inspected, not constructed. Files that do not
+    name this package are left to nerfstudio.
+    """
+    for path in load_configs(arguments):
+        if os.environ.get(TRUST_VARIABLE) != "1" and (why := _file_asks_for(path)):
+            sys.exit(
+                f"Error: {path} {why}: nothing in it was run. If you trust its author, set {TRUST_VARIABLE}=1"
+            )
+
+
+def load_configs(arguments: Sequence[str]) -> Iterator[Path]:
+    """Files that the arguments of a command name with --load-config."""
+    for i, argument in enumerate(arguments):
+        option, equals, value = argument.partition("=")
+        if option.replace("_", "-") == "--load-config":
+            path = Path(value if equals else "".join(arguments[i + 1 : i + 2]))
+            if path.exists() and not path.is_dir():
+                yield path
+
+
+def _file_asks_for(path: Path) -> str | None:
+    try:
+        text = read_text(path)
+        why = _asks_for(yaml.compose(text, Loader=yaml.Loader)) if "lang3dxl" in text.lower() else None
+        return why and f"asks to {why}, which settings never need"
+    except yaml.YAMLError:
+        return None  # the command can't read it either
+    except (OSError, ValueError) as error:
+        return f"can't be checked before it is used ({error})"
+    except RecursionError:  # the command, called from fewer functions, might
+        return "asks to nest more deeply than settings do"
+
+
+def _asks_for(root: yaml.Node | None) -> str | None:
+    """What settings should not ask for, in a few words; None if there is nothing."""
+    known = {"torch", *_PACKAGES, *_plugins()}
+    for tag in _tags(root):
+        kind, _, name = tag.removeprefix(_PYTHON).partition(":")
+        package, last = name.partition(".")[0], name.rpartition(".")[2]
+        if kind == "module":
+            return f"load the module {name}"
+        if last in _UNSAFE:
+            return f"load {name}"
+        if kind in ("object/apply", "object/new") and not _is_harmless(name, known):
+            return f"call {name}"
+        if kind == "object" and not (package in known and last[:1].isupper()):
+            return f"make a {name}"
+        if kind == "name" and not (package in known and (last[:1].isupper() or _is_settings_function(name))):
+            return f"load {name}"
+    return None
+
+
+def _tags(node: yaml.Node | None) -> Iterator[str]:
+    """The Python tags of a file's nodes."""
+    waiting, seen = [node], set()
+    while waiting:
+        node = waiting.pop()
+        if node is None or id(node) in seen:
+            continue
+        seen.add(id(node))
+        if node.tag.startswith(_PYTHON):
+            yield node.tag
+        if isinstance(node, yaml.MappingNode):
+            waiting += [part for pair in node.value for part in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            waiting += node.value
+
+
+def _is_harmless(name: str, known: set[str]) -> bool:
+    """Whether this constructs a path, a member of an enumeration, or a class of another plugin."""
+    if name == "_operator.getitem":  # how types are written in nerfstudio's own settings
+        return True
+    module, _, last = name.rpartition(".")
+    if module.partition(".")[0] not in known or not last[:1].isupper():
+        return False
+    if module in sys.modules:
+        kind = getattr(sys.modules[module], last, None)
+        return isinstance(kind, type) and issubclass(kind, PurePath | Enum)
+    return module.partition(".")[0] in _plugins() - {"lang3dxl_ns"}
+
+
+def _is_settings_function(name: str) -> bool:
+    """Whether this is the one function in nerfstudio's settings, or may be one in another plugin's."""
+    ours = ("nerfstudio.", "torch.", "lang3dxl_ns.", "pathlib.")
+    return name == "nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate" or not name.startswith(ours)
+
+
+def _plugins() -> set[str]:
+    """Installed packages that provide methods and data parsers for nerfstudio."""
+    groups = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
+    modules = [point.module for group in groups for point in entry_points(group=group)]
+    for definition in os.environ.get("NERFSTUDIO_METHOD_CONFIGS", "").split(","):
+        modules.append(definition.partition("=")[2].partition(":")[0])
+    return {module.partition(".")[0] for module in modules if module}
+
+
+class _SettingsLoader(yaml.UnsafeLoader):
+    """Constructs only settings, paths and enumeration members."""
+
+    def find_python_name(self, name: str, mark: Any) -> Any:  # type: ignore[override]
+        """A class from the packages that define settings."""
+        name = _MOVED.get(name, name)
+        if not name.startswith(tuple(f"{package}." for package in _PACKAGES)):
+            raise yaml.constructor.ConstructorError(None, None, f"it asks for {name}", mark)
+        found = super().find_python_name(name, mark)
+        if not isinstance(found, type) or found.__name__ in _UNSAFE:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"it asks for {name}, which is no class of settings", mark
+            )
+        return found
+
+    def find_python_module(self, name: str, mark: Any) -> Any:  # type: ignore[override]
+        """Modules are rejected: settings contain none."""
+        raise yaml.constructor.ConstructorError(None, None, f"it asks for the module {name}", mark)
+
+    def make_python_instance(
+        self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False
+    ) -> Any:
+        """Settings (without calling them), paths and enumeration members."""
+        kind = self.find_python_name(suffix, node.start_mark)
+        if not (is_dataclass(kind) and newobj) and not issubclass(kind, PurePath | Enum):
+            raise yaml.constructor.ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+        if issubclass(kind, PurePath):  # of whichever system the run was made on
+            written = PureWindowsPath if issubclass(kind, PureWindowsPath) else PurePosixPath
+            return Path(written(*args).as_posix())
+        return super().make_python_instance(suffix, node, args, kwds, newobj)
