@@ -62,7 +62,7 @@ class Component(ABC):
 
 class SmoothSky(Component):
     """The sky's colors as one smooth function, only where photos share one light: elsewhere it costs words
-    (docs/training.md). Without it the sky's Gaussians are trained like all others."""
+    (docs/lab/short_and_long_runs.md). Without it the sky's Gaussians are trained like all others."""
 
     def wanted(self, config: ModelSettings, facts: SceneFacts) -> bool:
         return config.sky_gaussians > 0 and not Lighting().wanted(config, facts)
