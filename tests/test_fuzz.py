@@ -24,7 +24,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.methods import lang3dxl
-from lang3dxl_ns.plugin.saved_config import read_config
+from lang3dxl_ns.plugin.trainer_config import read_config
 from lang3dxl_ns.preparation.regions import FolderRegions
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.query.run_checkpoint import check_checkpoint, read_checkpoint

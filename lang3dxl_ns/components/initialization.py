@@ -21,15 +21,10 @@ FEWEST = 4
 def seed_positions(
     points: tuple[Tensor, Tensor] | None, count: int, side: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Initial positions of Gaussians and their colors (0…1).
+    """Initial positions of Gaussians and their colors (0…1): those of points with colors in bytes or, without
+    points, `count` random ones in a box of a side, world units.
 
-    Args:
-        points: the scene's points, and their colors as bytes; None for random ones.
-        count: how many random ones to make.
-        side: of the box that they are in, world units.
-
-    Raises:
-        UserError: the scene has too few points.
+    Raises UserError if there are too few points.
     """
     if points is None:
         return (torch.rand(count, 3) - 0.5) * side, torch.rand(count, 3)

@@ -75,12 +75,9 @@ class HalfImageProtocol:
         vector = self.fit(camera, photo[:, :middle], None if mask is None else mask[:, :middle])
         synchronize()
         seconds = perf_counter() - start
+        look = Look(self.field, vector)
         rendering = render_in_look(
-            self.splats,
-            camera,
-            Look(self.field, vector),
-            background=self.background,
-            backend=self.backend,
+            self.splats, camera, look, background=self.background, backend=self.backend
         ).rgb
         scores = self.metrics(rendering[:, middle:], photo[:, middle:])
         figures = {f"half_{name}": value for name, value in scores.items()} | {"fit_seconds": seconds}

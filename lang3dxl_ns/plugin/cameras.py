@@ -9,7 +9,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from lang3dxl_ns.scene.camera import Camera, Lens, camera_to_world, view_matrix
+from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 
 
 def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4"]) -> Cameras:
@@ -27,13 +27,6 @@ def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4
         width=column("width"),
         height=column("height"),
     )
-
-
-def view_of(camera: Camera) -> Cameras:
-    """One of our cameras as a nerfstudio camera."""
-    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
-    lens = Lens(camera.width, camera.height, fx, fy, cx, cy)
-    return to_nerfstudio([lens], camera_to_world(camera.view_matrix.cpu())[None])
 
 
 def lens_of(cameras: Cameras, index: int) -> Lens:

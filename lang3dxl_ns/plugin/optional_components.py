@@ -31,6 +31,9 @@ from lang3dxl_ns.preparation.handover import SceneFacts
 class Component(ABC):
     """A part that a model may have."""
 
+    attributes: tuple[str, ...]
+    """Of the model; None where it doesn't have the part."""
+
     @abstractmethod
     def wanted(self, config: ModelSettings, facts: SceneFacts) -> bool:
         """Whether a new model of this scene has it."""
@@ -39,20 +42,16 @@ class Component(ABC):
     def build(self, model: RenderingModel) -> None:
         """Add it, on the CPU, to a new model whose Gaussians and strategy are made."""
 
-    @abstractmethod
     def leave_out(self, model: RenderingModel) -> None:
         """Let the model have none."""
+        for name in self.attributes:
+            setattr(model, name, None)
 
     @abstractmethod
     def load(self, model: RenderingModel, state: Mapping[str, Any]) -> None:
-        """Add, replace or leave it out, so that a checkpoint fits.
+        """Add, replace or leave it out, so that a checkpoint (tensors by their names in the model) fits.
 
-        Args:
-            model: a model, whose Gaussians are not loaded yet.
-            state: the checkpoint's tensors by their names in the model.
-
-        Raises:
-            UserError: the model's settings contradict the checkpoint.
+        Raises UserError if the model's settings contradict the checkpoint.
         """
 
     @abstractmethod
@@ -64,17 +63,19 @@ class SmoothSky(Component):
     """The sky's colors as one smooth function, only where photos share one light: elsewhere it costs words
     (docs/lab/short_and_long_runs.md). Without it the sky's Gaussians are trained like all others."""
 
+    attributes = ("sky",)
+
     def wanted(self, config: ModelSettings, facts: SceneFacts) -> bool:
         return config.sky_gaussians > 0 and not Lighting().wanted(config, facts)
 
     def build(self, model: RenderingModel) -> None:
         count = model.config.sky_gaussians
         self._put(model, Sky(model.means.detach()[:count] - model.extent[0]))
-        opacities = model.gauss_params["opacities"].data
-        opacities[:count] = torch.logit(torch.tensor(OPACITY))
+        model.gauss_params["opacities"].data[:count] = torch.logit(torch.tensor(OPACITY))
 
     def leave_out(self, model: RenderingModel) -> None:
-        self._put(model, None)
+        super().leave_out(model)
+        model.strategy.still = 0
 
     def load(self, model: RenderingModel, state: Mapping[str, Any]) -> None:
         saved = state.get("sky.directions")
@@ -86,14 +87,15 @@ class SmoothSky(Component):
     def parameters(self, model: RenderingModel) -> dict[str, list[Parameter]]:
         return {} if model.sky is None else {"sky": [model.sky.harmonics]}
 
-    def _put(self, model: RenderingModel, sky: Sky | None) -> None:
-        model.sky = sky
-        model.strategy.still = 0 if sky is None else len(sky)
+    def _put(self, model: RenderingModel, sky: Sky) -> None:
+        model.sky, model.strategy.still = sky, len(sky)
 
 
 class CameraRefinement(Component):
     """Corrections of the training cameras. nerfstudio's viewer wants an optimizer of cameras in any case:
     without refinement it is one that is off."""
+
+    attributes = ("camera_optimizer",)
 
     def wanted(self, config: ModelSettings, facts: SceneFacts) -> bool:
         choice = config.camera_optimization
@@ -123,6 +125,8 @@ class Semantics(Component):
     """Codes of the Gaussians, the feature decoder, and the downsampler of training; where there are
     targets."""
 
+    attributes = ("semantic_field", "downsampler")
+
     def wanted(self, config: ModelSettings, facts: SceneFacts) -> bool:
         return facts.statistics is not None
 
@@ -139,9 +143,6 @@ class Semantics(Component):
         with part("learn targets"):
             model.semantic_field.learn_targets(targets)
         self._carry(model)
-
-    def leave_out(self, model: RenderingModel) -> None:
-        model.semantic_field = model.downsampler = None
 
     def load(self, model: RenderingModel, state: Mapping[str, Any]) -> None:
         if "clip_mean" not in state:
@@ -197,6 +198,8 @@ class Semantics(Component):
 class Lighting(Component):
     """Colors that depend on each photo's light."""
 
+    attributes = ("appearance",)
+
     def wanted(self, config: ModelSettings, facts: SceneFacts) -> bool:
         return facts.wants("appearance", config.appearance.use)
 
@@ -205,9 +208,6 @@ class Lighting(Component):
         model.appearance = AppearanceField(
             model.config.appearance, model.facts.names, *model.extent, generator=generator
         )
-
-    def leave_out(self, model: RenderingModel) -> None:
-        model.appearance = None
 
     def load(self, model: RenderingModel, state: Mapping[str, Any]) -> None:
         """`auto` follows the checkpoint; `on` and `off` must agree with it."""

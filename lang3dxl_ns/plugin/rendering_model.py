@@ -46,10 +46,6 @@ class Answers(Protocol):
     def shows_bottleneck(self) -> bool:
         """Whether anyone views the picture of the codes, which costs three more channels."""
 
-    @property
-    def look(self) -> str | None:
-        """Photo whose lighting is shown; None: by the appearance's rule."""
-
     def channels(self) -> Float[Tensor, "n d"] | None:
         """Values of the Gaussians to composite; None without prompts."""
 
@@ -165,8 +161,7 @@ class RenderingModel(SplatfactoModel):
             return self.get_outputs(camera)  # type: ignore[return-value]
         asked = answers.channels()
         colors = self._code_colors() if answers.shows_bottleneck else None
-        look = None if answers.look is None or self.looks is None else self.looks.of_photo(answers.look)
-        rendering, outputs = self._shown(camera, look, asked, colors)
+        rendering, outputs = self._shown(camera, asked, colors)
         found = answers.outputs(rendering, time.perf_counter() - start)
         return {"rgb": outputs["rgb"], **found, **outputs}
 
@@ -175,7 +170,7 @@ class RenderingModel(SplatfactoModel):
         decoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
         if self.training:
             return self._training_outputs(camera)
-        return self._shown(camera, None, None, self._code_colors())[1]
+        return self._shown(camera, None, self._code_colors())[1]
 
     def seen(
         self, camera: Cameras, look: Look | None = None, channels: Float[Tensor, "n d"] | None = None
@@ -197,13 +192,12 @@ class RenderingModel(SplatfactoModel):
     def _shown(
         self,
         camera: Cameras,
-        look: Look | None,
         asked: Float[Tensor, "n d"] | None,
         colors: Float[Tensor, "n 3"] | None,
     ) -> tuple[Rendering, dict[str, Tensor]]:
         """A rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
         parts = [part for part in (asked, colors) if part is not None]
-        rendering = self.seen(camera, look, torch.cat(parts, dim=1) if parts else None)
+        rendering = self.seen(camera, channels=torch.cat(parts, dim=1) if parts else None)
         background = self._get_background_color().expand_as(rendering.rgb)
         depth = rendering.depth
         outputs = {

@@ -194,11 +194,6 @@ class Lang3DXLTrainer(Trainer):
             raise UserError(f"there is no checkpoint {path}: pass the folder nerfstudio_models of a run")
         return path
 
-    @property
-    def first_iteration(self) -> int:
-        """First iteration: 0, or the one after the loaded checkpoint."""
-        return self._start_step
-
     def setup_optimizers(self) -> Optimizers:
         """The optimizers, with the guard before them."""
         self.guard = StepGuard(self.config.max_skipped_steps, lambda message: CONSOLE.log(escape(message)))

@@ -52,13 +52,8 @@ class SceneFacts:
     """Their dense features; None without a dense encoder."""
 
     def wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
-        """Whether a scene has an optional component.
-
-        Args:
-            component: its name among `needs`.
-            choice: the setting, `on`, `off` or `auto`.
-            unmeasured: the answer to `auto` where the need wasn't measured.
-        """
+        """Whether a component (named as in `needs`) is to be built, for the setting `on`, `off` or `auto`:
+        then by its need, or `unmeasured`."""
         return self.needs.get(component, unmeasured) if choice == "auto" else choice == "on"
 
     def into(self, metadata: dict[str, Any]) -> None:

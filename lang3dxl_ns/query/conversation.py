@@ -9,12 +9,11 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.query.answer import pictures
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
@@ -26,36 +25,6 @@ from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 
 
-class AskedModel(Protocol):
-    """A model of a scene, as far as questions go."""
-
-    training: bool
-    step: int
-    """Iterations so far."""
-
-    @property
-    def config(self) -> Any:
-        """Settings, with the run's `total_steps`."""
-
-    @property
-    def device(self) -> torch.device:
-        """Where it is."""
-
-    @property
-    def semantic_field(self) -> Decoder | None:
-        """The feature decoder; None without semantics."""
-
-    def train(self, mode: bool = True) -> Any:
-        """Set whether it is in training."""
-
-    @property
-    def scene(self) -> Callable[..., Scene]:
-        """Makes the present state a scene of its own."""
-
-    def forget_gathered_codes(self) -> None:
-        """Remove the codes that were made for a question."""
-
-
 class Conversation:
     """Questions to a model, which may be in training in another thread.
 
@@ -63,7 +32,7 @@ class Conversation:
     waits for training. If the model trains and its words don't, they are learned from the photos first.
 
     Args:
-        model: the model.
+        model: a `Lang3DXLModel`, trained or in training.
         file: photos, cameras and CLIP.
         run: folder of the run, for what is computed once.
         lock: held while using the model.
@@ -73,11 +42,9 @@ class Conversation:
         watch: called with a short description of slow work.
     """
 
-    look: str | None = None
-
     def __init__(
         self,
-        model: AskedModel,
+        model: Any,
         file: SceneFile,
         run: Path,
         lock: AbstractContextManager,

@@ -58,19 +58,14 @@ class Scene(ViewedScene):
     photo shows) is kept. Any number of threads may use one scene.
 
     Args:
-        splats: the Gaussians, in the model's frame.
+        splats, looks, background, cache, backend, watch: see `ViewedScene`.
         file: photos, cameras, and the CLIP that the features come from.
         decoder: turns codes into features; None for a scene of colors alone.
         codes: semantic values of the Gaussians, a row each; NaN for those visible in no photo.
-        looks: lighting of the photos; None where all share one.
-        background: color behind the scene, 0…1; None for black.
         config: defaults of queries.
         encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text that
             is not among `vectors`.
         vectors: unit vectors of common words, which need no CLIP.
-        cache: file to keep which Gaussians the photos show; None: they are measured in every process.
-        backend: the rasterizer, see `rasterize`.
-        watch: called with a short description of slow work; None: a progress bar.
         words: words taught by example, see `teach`.
     """
 

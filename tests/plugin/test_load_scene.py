@@ -13,12 +13,11 @@ import torch
 from conftest import make_trainer
 from PIL import Image
 from plyfile import PlyData
-from scenes import write_scene
+from scenes import view_of, write_scene
 
 import lang3dxl_ns
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.language import open_scorer
-from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words

@@ -231,8 +231,6 @@ def _place_camera(client: viser.ClientHandle, camera: Camera, target: tuple[floa
 class _Answers:
     """The panel's answers to renderings."""
 
-    look = None
-
     def __init__(self, panel: AskPanel) -> None:
         self._panel = panel
 

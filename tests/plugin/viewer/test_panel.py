@@ -13,9 +13,8 @@ from conftest import make_trainer
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
-from scenes import write_scene
+from scenes import view_of, write_scene
 
-from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 from lang3dxl_ns.plugin.viewer.frame_size import least_size
 from lang3dxl_ns.plugin.viewer.panel import INVITATION
