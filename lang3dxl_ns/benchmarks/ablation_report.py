@@ -177,7 +177,7 @@ def _scene_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> 
 
 
 def _family_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> str | None:
-    """Means over the scenes of one family (cathedral-700, cathedral-701 …), with the deviation between them."""
+    """Means over the scenes of one family (cathedral-700, -701 …), and the deviation between them."""
     families: dict[str, list[str]] = {}
     for scene in data["scenes"]:
         families.setdefault(scene.rpartition("-")[0], []).append(scene)
