@@ -251,6 +251,8 @@ class Export:
             own = read_names(self.vocabulary, "words") if self.vocabulary else ()
             page = Page(scene, prompts, own, self._clip_words(scene.file.clip), self._told(), self.look)
             size = write_page(page, self.web)
+            for left_out in page.left_out:
+                say(f"{left_out}.")
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
             text = prompts[0] if prompts else None

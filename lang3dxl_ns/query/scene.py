@@ -24,6 +24,7 @@ from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.match import Found, Match, Viewpoint
+from lang3dxl_ns.query.negatives import CLEAR, NOTHING
 from lang3dxl_ns.query.places import strongest_match
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.question import Question
@@ -314,7 +315,10 @@ class Scene(ViewedScene):
         most: int = 5,
         size: int | None = None,
     ) -> list[tuple[str, float]]:
-        """The words that fit a pixel best, with their relevancy, best first; none where nothing is rendered.
+        """The words that fit a pixel best, with their relevancy, best first.
+
+        There are none where the scene's Gaussians hardly cover the pixel or have no meaning, and none at the
+        sky: where the sky or a phrase that fits anything fits best, and no word clearly better.
 
         Args:
             place, size: the view, see `camera`.
@@ -333,11 +337,16 @@ class Scene(ViewedScene):
         pixel[int(y), int(x)] = 1.0
         share = self._fill(camera, pixel)
         rows = share.nonzero().squeeze(1)
-        if not len(rows):
+        features = self.engine.features(rows)
+        if float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
             return []
-        feature = share[rows] @ self.engine.features(rows)
         queries = self.text.plain_queries(words).to(self.device)
-        scores = queries.relevancy_of_cosines(queries.cosines(feature))
+        cosines = queries.cosines(share[rows] @ features)
+        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature)
+        negatives = self.text.config.negatives
+        clear = any(score > CLEAR for word, score in zip(words, scores, strict=True) if word != "sky")
+        if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
+            return []
         best = scores.topk(min(most, len(words)))
         return [(words[int(i)], float(score)) for score, i in zip(best.values, best.indices, strict=True)]
 

@@ -169,6 +169,27 @@ def test_a_pixel_is_named(scene):
         scene.what_is("0003", 5000, 3)
 
 
+def test_words_of_a_pixel_have_the_relevancies_of_its_gaussians():
+    scene = painted_scene(config=QueryConfig(temperature=1.0))
+    dome = scene.ask("dome").gaussians[0].nonzero()[0, 0]
+    expected = scene.engine.of_gaussians(scene.text.plain_queries(["dome"]))[0, dome]
+    column, row = scene.query("dome", "right/0002.jpg").peak
+    ((_, score),) = scene.what_is("right/0002.jpg", column, row, words=["dome"])
+    assert scene.engine.temperature != 1 and 0.55 < expected < 0.9
+    assert score == pytest.approx(float(expected), abs=1e-3)
+
+
+def test_nothing_is_named_at_the_sky_and_where_nothing_has_a_meaning(scene):
+    place = ("right/0002.jpg", *scene.query("dome", "right/0002.jpg").peak)
+    dome, codes = scene.ask("dome").gaussians[0], scene.codes
+    sky = F.normalize(encode_texts(["sky"]), dim=1)
+    for changed in (sky, torch.full_like(sky, torch.nan)):
+        other = painted_scene(codes=torch.where(dome[:, None], changed, codes))
+        assert other.what_is(*place) == []
+        column, row = other.query("windows", "left/0001.jpg").peak
+        assert other.what_is("left/0001.jpg", column, row)[0][0] in ("window", "windows")
+
+
 def test_features_are_unit_vectors_and_unseen_gaussians_have_none(scene):
     lengths = np.linalg.norm(scene.features.astype(np.float32), axis=1)
     np.testing.assert_allclose(lengths[:-1], 1, atol=1e-2)
