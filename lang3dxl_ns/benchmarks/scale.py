@@ -138,7 +138,7 @@ def _reading(out: Path, count: int) -> list[Stage]:
     """Decoding once, reading the copies, and waiting for them in steps, with a tenth in memory."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from lang3dxl_ns.plugin.photo_cache import PhotoCache
+    from lang3dxl_ns.preparation.photo_cache import PhotoCache
     from lang3dxl_ns.preparation.store import FeatureStore
     from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 

@@ -12,8 +12,8 @@ from torch.nn import Parameter
 
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.preparation.handover import Batch
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 
 LONGER_SIDE = 1_600

@@ -41,7 +41,6 @@ class RenderedAnswers:
 
     question: Question
     shows_bottleneck: bool = True
-    look: str | None = None
 
     def channels(self) -> Tensor:
         """See `Answers`."""

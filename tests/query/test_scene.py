@@ -1,5 +1,6 @@
 """Queries on a scene with known answers."""
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -22,6 +23,8 @@ from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.scene import QueryConfig, Scene
+from lang3dxl_ns.rendering.rasterize import rasterize
+from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.scene.camera import camera_to_world
 
 
@@ -90,6 +93,24 @@ def test_several_prompts_share_one_rendering(scene):
     matches = scene.query(["dome", "window; wall"], "all/0003.jpg")
     assert len(matches) == 3
     assert matches[0].view is matches[2].view
+
+
+@pytest.mark.parametrize(("size", "passes"), [(48, 1), (96, 1), (192, 2)])
+def test_a_view_of_at_most_the_training_size_takes_one_pass(scene, monkeypatch, size, passes):
+    drawn = []
+
+    def counted(gaussians, camera, *args, **settings):
+        drawn.append(camera.width)
+        return rasterize(gaussians, camera, *args, **settings)
+
+    question = scene.ask("dome; window")
+    monkeypatch.setattr(sys.modules["lang3dxl_ns.rendering.render"], "rasterize", counted)
+    match, _ = scene.matches(question, "all/0003.jpg", size)
+    assert drawn == [size, 96][:passes]
+    if passes == 1:
+        apart = composite(scene.splats, match.view.camera, question.channels)
+        expected = question.maps(replace(match.view.rendering, channels=apart))[0]
+        np.testing.assert_allclose(match.relevancy, expected, atol=1e-6)
 
 
 def test_a_negative_takes_its_pixels_away(scene):

@@ -24,13 +24,14 @@ from painted_scene import (
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.doubt import LEAST_PEAK, peaks
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.scene_file import Provenance
 from lang3dxl_ns.query.teach import TaughtWord
-from lang3dxl_ns.query.vocabulary import read_vocabulary, shipped_vocabulary, whole_words
+from lang3dxl_ns.query.vocabulary import shipped_vocabulary, whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -552,9 +553,9 @@ def test_the_words_of_a_tokenizer_are_whole_and_plain(tmp_path):
 
 def test_a_vocabulary_of_ones_own_is_offered_and_named(tmp_path):
     (tmp_path / "words.txt").write_text("belfry\n\n  zebra crossing \nbelfry\n")
-    assert read_vocabulary(tmp_path / "words.txt") == ("belfry", "zebra crossing")
-    with pytest.raises(UserError, match="one per line"):
-        read_vocabulary(tmp_path / "missing.txt")
+    assert read_names(tmp_path / "words.txt", "words") == ("belfry", "zebra crossing")
+    with pytest.raises(UserError, match="list of words"):
+        read_names(tmp_path / "missing.txt", "words")
     described = json.loads(
         Page(painted_scene(), words=["lych gate"], more=["porch", "zoo"]).files()["vocabulary.json"]
     )
