@@ -149,17 +149,19 @@ def _reading(out: Path, count: int) -> list[Stage]:
     from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 
     photos = _photos(_scene(out, count))
-    working = WorkingPhotos(FeatureStore(out / f"working-{time.time_ns()}"))
+    store = FeatureStore(out / f"working-{time.time_ns()}")
+    working = WorkingPhotos(store)
     amount, repeated = f"{count} photos", photos * 5
     decoded = _measured(
         "decode, shrink, keep", amount, lambda: list(map(working.read, photos)), partial(_each, count)
     )
+    megabytes = mean(path.stat().st_size for path in store.folder.rglob("*.jpg")) / 1e6
     with ThreadPoolExecutor(2) as pool:
         read = _measured(
             "read the copies, 2 threads",
             f"{len(repeated)} photos",
             lambda: [image.shape for image in pool.map(working.read, repeated)],
-            lambda cpu: f"{len(repeated) / cpu:.0f} a second of one core",
+            lambda cpu: f"{len(repeated) / cpu:.0f} a second of one core; {megabytes:.2f} MB",
         )
     size = sum(working.read(photo).nbytes for photo in photos)
     cache = PhotoCache(
