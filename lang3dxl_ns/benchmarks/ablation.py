@@ -15,10 +15,12 @@ from lang3dxl_ns.benchmarks.landmarks import Landmarks, landmark_scenes
 from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import command_line, progress_bar
+from lang3dxl_ns.common.settings_help import showing
 
 Found = TypeVar("Found")
 
 
+@showing("out", "landmarks", "scene", "rows", "seeds", "steps")
 @dataclass
 class Ablation:
     """Train and score the method, the baselines, and the method without each of its parts, all else equal;
@@ -33,7 +35,7 @@ class Ablation:
     scene: tuple[Path, ...] = ()
     """Folders with images/, sparse/0/ and ground_truth/ (default: the landmarks)."""
     landmarks: Landmarks = "validation"
-    """Landmarks to use: six for decisions, or the three of the published figures."""
+    """Landmarks to use: six for decisions, or the nine of the published figures."""
     photos: int = 48
     """Photos of each landmark."""
     test_views: int = 24
@@ -43,7 +45,8 @@ class Ablation:
     steps: tuple[int, ...] = (1_200,)
     """Training iterations; several lengths show quality against time."""
     seeds: int = 1
-    """Runs of each row on each scene, with different random numbers and photo orders."""
+    """Runs of each row on each scene, with different random numbers and photo orders. Every run of a seed is
+    made before any of the next."""
     clip: str = "builtin"
     """CLIP: "builtin", a Hugging Face name or a folder."""
     dense: str = "builtin"
@@ -82,18 +85,30 @@ class Ablation:
             self.langsam,
             self.sam3,
         )
-        runs = [
+        figures, failed = make_all(
+            self.runs(scenes, rows),
+            ScoredRuns(self.out, settings),
+            lambda *found: self._write(rows, *found),
+            self.workers,
+        )
+        print(f"Wrote {self.out / 'ablation.md'} ({len(figures)} runs, {len(failed)} not run)")
+
+    def runs(self, scenes: Mapping[str, Path], rows: Sequence[Row]) -> list[Run]:
+        """Runs in the order in which they are made. The seed is the outer loop: an interrupted comparison
+        has one run of every row on every scene before any has two.
+
+        Args:
+            scenes: Folder of each scene, by label.
+            rows: Rows to run; bounds have no runs of their own.
+        """
+        return [
             Run(row, path, label, seed, steps)
-            for seed in range(self.seeds)  # so that every row has one run before any has two
+            for seed in range(self.seeds)
             for steps in sorted(self.steps)
             for label, path in scenes.items()
             for row in rows
             if row.trains or (row.name in SEGMENTERS and seed == 0 and steps == min(self.steps))
         ]
-        figures, failed = make_all(
-            runs, ScoredRuns(self.out, settings), lambda *found: self._write(rows, *found), self.workers
-        )
-        print(f"Wrote {self.out / 'ablation.md'} ({len(figures)} runs, {len(failed)} not run)")
 
     def _write(self, rows: list[Row], figures: dict[Run, dict], failed: dict[Run, str]) -> None:
         command = command_line("lang3dxl benchmark ablation", self)

@@ -18,6 +18,7 @@ from lang3dxl_ns.common.reports import (
     markdown_table,
     write_report,
 )
+from lang3dxl_ns.common.settings_help import showing
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -67,6 +68,7 @@ class Stage:
     """Peak memory beyond that of the process with everything imported."""
 
 
+@showing("out", "parts")
 @dataclass
 class ScaleBenchmark:
     """Reading, preparation and training of photos of some 11 megapixels, and compression, stage by stage."""
@@ -155,7 +157,7 @@ def _reading(out: Path, count: int) -> list[Stage]:
     decoded = _measured(
         "decode, shrink, keep", amount, lambda: list(map(working.read, photos)), partial(_each, count)
     )
-    megabytes = mean(path.stat().st_size for path in store.folder.rglob("*.jpg")) / 1e6
+    megabytes = mean(path.stat().st_size for path in store.root.rglob("*.jpg")) / 1e6
     with ThreadPoolExecutor(2) as pool:
         read = _measured(
             "read the copies, 2 threads",

@@ -13,7 +13,7 @@ EVEN = 0.5
 """Relevancy where prompt and negatives fit equally well."""
 SHARE = 0.35
 """Of the way from a prompt's relevancy for what is surely something else to its peak, where matches begin;
-chosen on landmarks for decisions (docs/queries.md)."""
+chosen on landmarks for decisions (docs/lab/words.md)."""
 _ELSE = 0.25
 """Quantile of the Gaussians that is surely something else; above it, large things begin."""
 

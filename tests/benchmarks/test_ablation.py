@@ -112,6 +112,17 @@ def test_no_runs_at_a_time_is_an_error(tmp_path):
         make_all(runs_of(FULL), Counting(tmp_path, []), lambda *_: None, workers=0)
 
 
+def test_a_stopped_comparison_has_every_row_on_every_scene_once_before_any_twice(tmp_path):
+    scenes = {name: tmp_path / name for name in ("a", "b")}
+    rows = [BY_NAME[name] for name in (FULL, "fmgs", CLIPSEG, TEACHER)]
+    runs = Ablation(tmp_path, seeds=2, steps=(6, 4)).runs(scenes, rows)
+    assert [run.seed for run in runs] == [0] * 10 + [1] * 8  # segmenters once, bounds never
+    made: list[str] = []
+    make_all(runs[:3], Counting(tmp_path, made), lambda *_: None)
+    make_all(runs, Counting(tmp_path, made), lambda *_: None)
+    assert sorted(made) == sorted(run.name for run in runs)
+
+
 def test_clipsegs_folder_decides_about_its_own_row_alone(tmp_path):
     made: list[str] = []
     runs = runs_of(FULL, CLIPSEG, LANGSAM)
