@@ -295,12 +295,13 @@ class Scene:
         foreground = None if view.name is None else self.file.photo(view.name).foreground()
         small = resized(view.rendering.camera, self.trained_side)
         carried = composite(self.splats, small, channels, self.backend)
-        maps = question.maps(replace(view.rendering, channels=carried), foreground).cpu().float().numpy()
+        maps, masks = question.maps(replace(view.rendering, channels=carried), foreground)
+        found = maps.cpu().float().numpy(), masks.cpu().numpy()
         seconds += time.perf_counter() - start
-        rows = zip(question.prompts, question.doubts, question.thresholds, maps, strict=True)
+        rows = zip(question.prompts, question.doubts, *found, question.thresholds, strict=True)
         return [
-            Match(prompt, self.synonyms(prompt), doubt, view, relevancy, level, seconds)
-            for prompt, doubt, level, relevancy in rows
+            Match(prompt, self.synonyms(prompt), doubt, view, relevancy, mask, level, seconds)
+            for prompt, doubt, relevancy, mask, level in rows
         ]
 
     @torch.no_grad()

@@ -1,6 +1,6 @@
 // Answers: cosines to relevancy, the threshold from which a place matches, and doubt, as in Python's query/.
 
-const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.35, ELSE = 0.25, BEST = 0.005, LEAST_PEAK = 0.1;
+const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.4, BEST = 0.005, LEAST_PEAK = 0.1;
 const TIE = 0.999; // numbers of 16 bits: what is equal in Python may differ by less than this
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
@@ -40,7 +40,7 @@ export class Answers {
     const { unrelated } = this.words;
     const asWell = unrelated.filter((other) => other >= fit * TIE).length;
     const doubt = fit < LEAST_PEAK ? 1 : (1 + asWell) / (1 + unrelated.length);
-    const low = sorted[Math.floor(ELSE * (count - 1))];
+    const low = sorted[(count - 1) >> 1]; // the median, as torch takes it
     const own = doubt > DOUBTFUL || named ? EVEN : Math.min(low + SHARE * (fit - low), EVEN);
     const level = threshold ?? this.words.threshold ?? own;
     let matching = 0;
