@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
@@ -461,7 +461,12 @@ class Scene:
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 
-    def teach(self, word: str, examples: Example | Sequence[Example]) -> Scene:
+    def teach(
+        self,
+        word: str,
+        examples: Example | Sequence[Example],
+        selection: Bool[Tensor, " n"] | None = None,
+    ) -> Scene:
         """A scene that knows a word from examples, as `scene.words[word]`; this one doesn't change.
 
         `query`, `find`, `relevancy` and `export` of the new scene use what it learned wherever the word is
@@ -470,6 +475,7 @@ class Scene:
         Args:
             word: the word, of any case.
             examples: marks in photos of the scene.
+            selection: the Gaussians that are the word, if known; default: those that the marks show.
 
         Raises:
             UserError: the marks show nothing or everything, or lie outside their photos.
@@ -482,6 +488,8 @@ class Scene:
             return queries.relevancy_of_cosines(queries.cosines(features), 1.0)[0].logit()
 
         weights = [self._marked(example) for example in listed]
+        if selection is not None:
+            weights = [Weights(w.seen * selection, torch.zeros_like(w.seen), w.seen) for w in weights]
         engine = self.engine
         learned = learn(
             prompt.text, listed, weights, engine.features, margin, engine.head, engine.temperature
