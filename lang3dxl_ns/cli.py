@@ -22,20 +22,15 @@ import tyro
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.settings_help import asked_for_all
 
 BENCHMARKS = {
-    "rasterizer": ("benchmarks.rasterizer:RasterizerBenchmark", "The CPU rasterizer: time, memory, error."),
     "training": ("benchmarks.training:TrainingBenchmark", "A training step by its parts."),
     "gpu": ("benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time and memory, in one file to send."),
     "scale": ("benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
-    "real-photos": ("benchmarks.real_photos:RealPhotos", "Scenes of real photos, trained and scored."),
     "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
-    "typed-words": (
-        "benchmarks.typed_words:TypedWords",
-        "Fifty prompts as people type them, judged by labels.",
-    ),
     "teaching": (
         "benchmarks.teaching:TeachingBenchmark",
         "Words taught by example, beside the text alone.",
@@ -82,7 +77,7 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `lang3dxl` command."""
-    words = sys.argv[1:] if arguments is None else arguments
+    words = asked_for_all(sys.argv[1:] if arguments is None else arguments)
     silence_libraries()
     accept_any_console()
     if words[:1] == ["--version"]:

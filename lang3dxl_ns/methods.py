@@ -13,6 +13,7 @@ from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerC
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from lang3dxl_ns.common.settings_help import asked_for_all
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.saved_config import check_command_line
@@ -106,7 +107,7 @@ def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
 
 
 def _paper_config() -> Lang3DXLTrainerConfig:
-    """Lang3D-XL as printed and, where the paper is silent, as released: docs/deviations.md has every line.
+    """Lang3D-XL as printed and, where the paper is silent, as released: docs/deviations.md says where.
 
     A run of any length shrinks or stretches the schedule of 70,000 iterations. Runs of under 30,000 learn at
     the rates for short runs.
@@ -144,6 +145,8 @@ lang3dxl_paper = MethodSpecification(
     description="Lang3D-XL as in its paper: codes trained with the scene, composited, then decoded.",
 )
 METHODS = {"lang3dxl": lang3dxl, "lang3dxl-paper": lang3dxl_paper}
+if sys.argv[1:2] and sys.argv[1] in METHODS:
+    sys.argv[2:] = asked_for_all(sys.argv[2:])
 
 
 def run_config(

@@ -14,4 +14,4 @@ def test_decision_published_and_training_landmarks_are_disjoint():
         assert seed in SPLITS["test"]
     assert (
         min(seed for seed, _ in LANDMARKS.values()) >= 250
-    )  # those below are reported in docs/small_clip.md
+    )  # those below are reported in docs/lab/small_clip.md

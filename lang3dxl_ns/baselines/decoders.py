@@ -14,6 +14,7 @@ from lang3dxl_ns.baselines.fmgs import PlaceField
 from lang3dxl_ns.baselines.langsplat import LangSplat
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.components.compression import CompressedField, CompressionConfig
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
@@ -23,6 +24,7 @@ DecoderName = Literal["gathered", "paper", "feature3dgs", "fmgs", "langsplat", "
 NAMES: tuple[str, ...] = get_args(DecoderName)
 
 
+@showing("name")
 @dataclass
 class DecoderConfig:
     """The model's feature decoder. Targets, losses and schedules are the same for all, so that a comparison

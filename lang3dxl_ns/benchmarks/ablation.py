@@ -15,10 +15,12 @@ from lang3dxl_ns.benchmarks.landmarks import Landmarks, landmark_scenes
 from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import command_line, progress_bar
+from lang3dxl_ns.common.settings_help import showing
 
 Found = TypeVar("Found")
 
 
+@showing("out", "landmarks", "scene", "rows", "seeds", "steps")
 @dataclass
 class Ablation:
     """Train and score the method, the baselines, and the method without each of its parts, all else equal;

@@ -17,6 +17,7 @@ from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset, scene_presets, train_flags
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import pool
 from lang3dxl_ns.evaluation.holyscenes import is_holyscenes
 from lang3dxl_ns.evaluation.lerf_ovs import is_lerf_ovs
@@ -36,6 +37,7 @@ class BenchmarkScene:
     truth: Path
 
 
+@showing("data", "out", "scenes", "iterations")
 @dataclass(kw_only=True)
 class _Benchmark:
     data: Path

@@ -18,6 +18,7 @@ from lang3dxl_ns.common.reports import (
     markdown_table,
     write_report,
 )
+from lang3dxl_ns.common.settings_help import showing
 
 if TYPE_CHECKING:
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
@@ -61,6 +62,7 @@ class Stage:
     """Peak memory beyond that of the process with everything imported."""
 
 
+@showing("out", "parts")
 @dataclass
 class ScaleBenchmark:
     """Reading, preparation and training of photos of some 11 megapixels, stage by stage."""

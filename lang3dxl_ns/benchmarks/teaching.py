@@ -24,6 +24,7 @@ from lang3dxl_ns.common.reports import (
     progress_bar,
     write_report,
 )
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.average_precision import average_precision
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import overlap
@@ -38,6 +39,7 @@ Masks = Mapping[str, Bool[Array, "h w"]]
 """Of a word, by the scene's names of the photos."""
 
 
+@showing("scene", "out", "mark", "ground_truth")
 @dataclass(kw_only=True)
 class TeachingBenchmark:
     """Teach every labeled word by clicks, boxes and outlines drawn from its labels, and score its maps in the

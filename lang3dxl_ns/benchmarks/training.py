@@ -11,15 +11,16 @@ from statistics import median
 from typing import Any
 
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+from lang3dxl_ns.common.settings_help import showing
 
 PARTS = ("data", "render", "appearance", "decode", "downsample", "losses", "backward", "optimizer")
 """Parts of a step; appearance is within the rendering."""
 
 
+@showing("data", "out", "clip", "iterations", "threads")
 @dataclass
 class TrainingBenchmark:
-    """Train with and without semantics, evaluate on held-out photos, and time every part of a step, beside
-    the least time that this machine's arithmetic and memory allow."""
+    """Train with and without semantics, evaluate on held-out photos, and time every part of a step."""
 
     data: Path
     """Folder with images/ and sparse/0/."""
@@ -84,7 +85,6 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
         "metrics": metrics,
         "seconds_per_step": step,
         "split_seconds": split,
-        "floor_seconds": _floor(trainer) if name == "rgb" else None,
         "training_seconds": total,
         "peak_memory_mb": torch.cuda.max_memory_allocated() / 2**20
         if cuda
@@ -92,20 +92,6 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
         "gaussians": trainer.pipeline.model.num_points,
         "machine": describe_machine(trainer.device),
     }
-
-
-def _floor(trainer: Any) -> dict[str, float]:
-    """Least seconds of the parts of a step with the Gaussians of the end, for the next photo."""
-    from lang3dxl_ns.benchmarks.floor import measure_speed, step_work
-    from lang3dxl_ns.plugin.cameras import to_rasterizer
-
-    model = trainer.pipeline.model
-    camera, _ = trainer.pipeline.datamanager.next_train(trainer.config.max_num_iterations)
-    parameters = sum(parameter.numel() for parameter in model.gauss_params.values())
-    view = to_rasterizer(camera, camera.camera_to_worlds[0])
-    work = step_work(model.activated(model.gauss_params), view, 3, parameters)
-    speed = measure_speed()
-    return {part: least.seconds(speed) for part, least in work.items()}
 
 
 def _time_parts(trainer: Any) -> None:
@@ -139,31 +125,22 @@ def _time_parts(trainer: Any) -> None:
 def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:
     """The report of both runs, in markdown."""
     joint, rgb = results["joint"], results["rgb only"]
-    floor = rgb["floor_seconds"]
     names = [name for name in joint["metrics"] if name not in ("num_rays_per_sec", "fps")]
     quality = markdown_table(
         ["held-out photos", "joint", "rgb only"],
         [[name, *(_figure(r["metrics"].get(name)) for r in (joint, rgb))] for name in names],
     )
     cost = markdown_table(
-        ["", "joint", "rgb only", "floor"],
+        ["", "joint", "rgb only"],
         [
-            [
-                f"{p} (ms)",
-                *(_figure(_milliseconds(r["split_seconds"].get(p))) for r in (joint, rgb)),
-                _figure(_milliseconds(floor.get(p))),
-            ]
+            [f"{p} (ms)", *(_figure(_milliseconds(r["split_seconds"].get(p))) for r in (joint, rgb))]
             for p in PARTS
         ]
         + [
-            [
-                "median step (ms)",
-                *(_figure(_milliseconds(r["seconds_per_step"])) for r in (joint, rgb)),
-                _figure(_milliseconds(sum(floor.values()))),
-            ],
-            ["whole training (s)", *(_figure(r["training_seconds"]) for r in (joint, rgb)), None],
-            ["peak memory (MB)", *(_figure(r["peak_memory_mb"]) for r in (joint, rgb)), None],
-            ["Gaussians at the end", *(r["gaussians"] for r in (joint, rgb)), None],
+            ["median step (ms)", *(_figure(_milliseconds(r["seconds_per_step"])) for r in (joint, rgb))],
+            ["whole training (s)", *(_figure(r["training_seconds"]) for r in (joint, rgb))],
+            ["peak memory (MB)", *(_figure(r["peak_memory_mb"]) for r in (joint, rgb))],
+            ["Gaussians at the end", *(r["gaussians"] for r in (joint, rgb))],
         ],
     )
     return f"""# Training on `{settings.data.name}`: with and without semantics
@@ -180,9 +157,7 @@ def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:
 
 ## Cost of a step
 
-Mean milliseconds by part, with appearance inside `render`; and the median step. Floor: colors alone, with
-the Gaussians of the end, for one photo: the larger of operations ÷ the machine's rate in a matrix product
-and bytes ÷ its bandwidth in a copy. Looks and what decodes semantics are not in it.
+Mean milliseconds by part, with appearance inside `render`; and the median step.
 
 {cost}
 {_by_threads(results)}"""

@@ -10,9 +10,14 @@ import tyro
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.preparation.settings import PreparationConfig
 
 
+@showing(
+    *("splat", "data", "out", "text", "clip", "dense", "quality", "views", "up", "foreground", "segment"),
+    *("workers", "cache_dir"),
+)
 @dataclass(kw_only=True)
 class Attach(PreparationConfig):
     """Give words to a finished splat: writes a scene that answers any text, without training colors again.

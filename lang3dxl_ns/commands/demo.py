@@ -22,6 +22,7 @@ from lang3dxl_ns.common.reports import (
     markdown_table,
     write_report,
 )
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
 from lang3dxl_ns.demo.landmark.labels import CATEGORIES
@@ -38,6 +39,7 @@ RUN = Path("run", "lang3dxl", "demo")
 _STAGES = "stages.json"
 
 
+@showing("out", "quick", "photos", "steps", "seed", "family")
 @dataclass
 class Demo:
     """See the full workflow in minutes, without any data: generate a landmark that the built-in CLIP has

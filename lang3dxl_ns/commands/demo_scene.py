@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
 
 
+@showing("out", "photos", "seed", "family", "wild")
 @dataclass
 class GenerateScene(DemoScene):
     """Generate a demo scene: photos of a procedural landmark."""

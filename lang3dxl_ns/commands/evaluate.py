@@ -11,6 +11,7 @@ import tyro
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, write_report
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import average, pool
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
 from lang3dxl_ns.evaluation.report import pooled_table, read_results, scene_table
@@ -19,6 +20,7 @@ REPORT = "scores"
 """Report file name, without suffix."""
 
 
+@showing("maps", "ground_truth", "layout", "photos", "masks", "out")
 @dataclass(kw_only=True)
 class EvaluateMaps:
     """Score relevancy maps made by any system.
@@ -144,12 +146,7 @@ class EvaluatePool:
         if not any("map" in results for results in scenes.values()):
             raise UserError(f"no prompt was scored in {', '.join(scenes)}: there is nothing to combine")
         pooled = pool({name: list(results["photos"].values()) for name, results in scenes.items()})
-        notes = [
-            f"- {name}: {p.get('evaluated_photos')} photos, {p.get('seen_in_training', 'unknown')} of them "
-            f"seen in training; foreground: {p.get('foreground')}"
-            for name, p in protocols.items()
-        ]
-        table = "\n".join([pooled_table(pooled), "", *notes])
+        table = "\n".join([pooled_table(pooled), "", *(_told(*scene) for scene in protocols.items())])
         write_report(self.out, REPORT, table, pooled | {"protocols": protocols})
         print(f"{table}\n\nWrote {self.out / REPORT}.md")
 
@@ -182,6 +179,13 @@ Evaluate = (
     | Annotated[EvaluatePool, tyro.conf.subcommand("pool")]
     | Annotated[EvaluateSplit, tyro.conf.subcommand("split")]
 )
+
+
+def _told(name: str, protocol: dict[str, Any]) -> str:
+    """What a report says of how its scene was scored."""
+    keys = ("evaluated_photos", "seen_in_training", "foreground")
+    known = [f"{key.replace('_', ' ')}: {protocol[key]}" for key in keys if protocol.get(key) is not None]
+    return f"- {name}: {', '.join(known) or 'its report does not tell how it was scored'}"
 
 
 def _scene_name(folder: Path) -> str:

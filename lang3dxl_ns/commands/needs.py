@@ -8,9 +8,11 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.preparation.settings import PreparationConfig
 
 
+@showing("data", "json", "clip")
 @dataclass(kw_only=True)
 class Needs(PreparationConfig):
     """Measure a scene's needs without training: which optional components will be built, and why.

@@ -6,12 +6,17 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.preparation.settings import PreparationConfig
 
 if TYPE_CHECKING:
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 
 
+@showing(
+    *("data", "clip", "dense", "quality", "longer_side", "foreground", "regions", "workers"),
+    *("engine", "cache_dir"),
+)
 @dataclass(kw_only=True)
 class Prepare(PreparationConfig):
     """Make the targets that training learns from: CLIP features of crops in physical scale, dense features.

@@ -19,6 +19,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.common.reports import progress_bar
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.coco import CocoLabels
 from lang3dxl_ns.query.doubt import doubtful
@@ -36,6 +37,10 @@ from lang3dxl_ns.scene.camera import Camera
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
+@showing(
+    *("scene", "text", "not_", "out", "image", "all", "camera_path", "coco", "without_taught", "clip"),
+    "settings",
+)
 @dataclass(kw_only=True)
 class Query:
     """Search a trained scene for texts: writes heat maps, masks and relevancy maps.
@@ -132,8 +137,8 @@ class Query:
 
 
 def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:
-    """Prompts of --text, each with the negatives of --not."""
-    prompts = [prompt for text in texts for prompt in parse_prompts(text)]
+    """Prompts of --text, each once and with the negatives of --not."""
+    prompts = dict.fromkeys(prompt for text in texts for prompt in parse_prompts(text))
     return [replace(prompt, negatives=(*prompt.negatives, *apart_from)) for prompt in prompts]
 
 
@@ -182,6 +187,10 @@ def _view_report(name: str, matches: list[Match]) -> dict:
     return {"view": name, **seconds, "matches": found}
 
 
+@showing(
+    *("scene", "text", "not_", "out", "web", "scene_file", "vocabulary", "title", "credit", "license", "all"),
+    *("index", "look", "clip", "settings"),
+)
 @dataclass(kw_only=True)
 class Export:
     """Write a scene in another form: a splat file of the Gaussians that match a text, in the model's frame,

@@ -84,9 +84,15 @@ def read_array(path: Path) -> Any:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write to a temporary file beside `path`, then rename it, so that readers never see a partial file.
 
-    If the process is killed, the old content remains, beside a leftover .tmp file.
+    If the process is killed, the old content remains, beside a leftover .tmp file. A link stays a link; a
+    device (/dev/stdout) or a pipe is written to, and never replaced by a file.
     """
     make_folder(path.parent)
+    if path.exists() and not path.is_file():
+        with path.open("wb") as stream:
+            stream.write(content.encode() if isinstance(content, str) else content)
+        return
+    path = path.resolve()
     temporary = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.components.hash_grid import HashGrid
 from lang3dxl_ns.components.linear import linear
 from lang3dxl_ns.rendering.gaussians import Gaussians
@@ -50,6 +51,7 @@ GRIDS: dict[str, dict[str, int]] = {
 }
 
 
+@showing("use", "preset")
 @dataclass
 class AppearanceConfig:
     """Settings of the appearance field."""

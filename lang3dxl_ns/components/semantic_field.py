@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, MOST_DIMENSIONS, HashGrid
 from lang3dxl_ns.components.linear import linear
@@ -68,6 +69,7 @@ PRESETS: dict[Preset, FieldSettings] = {
 }  # fmt: skip
 
 
+@showing("preset", "code_dim")
 @dataclass
 class SemanticFieldConfig:
     """Settings of a semantic field: a preset, and values that override it."""

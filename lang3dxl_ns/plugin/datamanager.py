@@ -29,12 +29,13 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.plugin.data_folder import parser_for
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.handover import Batch, SceneFacts
-from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES, without
+from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
@@ -57,6 +58,12 @@ from lang3dxl_ns.scene.photo import Photo
 
 
 @without(*OF_IMAGE_CACHES)
+@showing(
+    *("dataparser", "clip", "clip_features", "dense", "quality", "longer_side", "camera_res_scale_factor"),
+    *("scale_range", "scale_preset", "scale_mode", "workers", "engine", "address", "foreground"),
+    *("foreground_prompts", "foreground_model", "skip_damaged_masks", "regions", "region_prompts", "sam"),
+    *("cache_dir", "cache_gb"),
+)
 @dataclass
 class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     """Photos and their targets. `--pipeline.datamanager.clip none` trains colors only."""

@@ -17,7 +17,8 @@ from rich.markup import escape
 from lang3dxl_ns.common.console import silence_libraries, some
 from lang3dxl_ns.common.errors import UserError, printable
 from lang3dxl_ns.common.files import expanded, read_names
-from lang3dxl_ns.plugin.inert_settings import OF_COLMAP, without
+from lang3dxl_ns.common.settings_help import without
+from lang3dxl_ns.plugin.inert_settings import OF_COLMAP
 from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.preparation.photo_collection import MODEL_FOLDERS, OWN_MODEL, images_path, usable_photos
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction

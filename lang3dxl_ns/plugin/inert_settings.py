@@ -1,16 +1,12 @@
-"""Settings without effect: hidden if they are nerfstudio's and never read, an error if they are set."""
+"""Settings without effect, nerfstudio's and, in some runs, our own: it is an error to set one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import MISSING, fields
-from typing import Any, TypeVar, get_type_hints
-
-import tyro
+from typing import Any
 
 from lang3dxl_ns.common.errors import UserError
-
-Class = TypeVar("Class", bound=type)
 
 OF_SPLATFACTO = (
     *("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt"),
@@ -35,18 +31,6 @@ _OF_RENDERINGS = (
     *("dense_compare", "mask_dense", "feature_gradient_to_geometry", "downsampler"),
 )
 """Settings of semantics that are trained with the scene."""
-
-
-def without(*names: str) -> Callable[[Class], Class]:
-    """A dataclass decorator that takes inherited settings off the command line."""
-
-    def hide(kind: Class) -> Class:
-        hints = get_type_hints(kind, include_extras=True)
-        for name in names:
-            kind.__annotations__[name] = tyro.conf.Fixed[hints[name]]  # type: ignore[valid-type, misc]
-        return kind
-
-    return hide
 
 
 def check_inert(model: Any, data: Any) -> None:

@@ -68,7 +68,7 @@ class Lang3DXLModel(RenderingModel):
         means, colors = seed_positions(self.config, self.seed_points)
         self.extent = center_and_radius(means)
         looks = self._wants("appearance", self.config.appearance.use)
-        # Where photos differ in light a smooth sky costs words (docs/training.md).
+        # Where photos differ in light a smooth sky costs words (docs/lab/short_and_long_runs.md).
         smooth = self.config.sky_gaussians if not looks else 0
         first = initial_gaussians(self.config, means, colors, OPACITY if smooth else FIRST_OPACITY)
         self.gauss_params = nn.ParameterDict(first)

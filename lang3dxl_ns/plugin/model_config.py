@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from lang3dxl_ns.baselines.decoders import DecoderConfig
+from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.plugin.densification import Densification
-from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO, without
+from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO
 from lang3dxl_ns.plugin.optimizers import run_length_weight
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
 
@@ -20,6 +21,11 @@ SHORT_FIELD_RUN = 5_000
 
 
 @without(*OF_SPLATFACTO)
+@showing(
+    *("decoder", "semantic_field", "appearance", "view_dependence", "camera_optimization", "sky_gaussians"),
+    *("rasterizer", "max_gaussians", "sh_degree", "densify_from", "densify_until", "densify_every"),
+    *("densify_grad_thresh", "ssim_lambda", "background_color", "clip_weight", "dense_weight"),
+)
 @dataclass
 class ModelSettings(SplatfactoModelConfig):
     """Splatfacto's settings, with the method's schedule and the semantic components."""

@@ -18,6 +18,7 @@ from lang3dxl_ns.common.device import unused_gpu, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import synchronize
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.plugin.data_folder import check_data
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
@@ -38,6 +39,11 @@ LONG_RUN_S = 3_600.0
 """Seconds of training that are not begun on a warning."""
 
 
+@showing(
+    *("data", "max_num_iterations", "output_dir", "experiment_name", "load_dir", "load_checkpoint", "vis"),
+    *("steps_per_save", "steps_per_eval_image", "save_only_latest_checkpoint", "max_skipped_steps"),
+    *("machine", "viewer", "pipeline"),
+)
 @dataclass
 class Lang3DXLTrainerConfig(TrainerConfig):
     """Training configuration; `--max-num-iterations` alone rescales every schedule."""

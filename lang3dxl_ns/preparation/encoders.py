@@ -28,6 +28,7 @@ from lang3dxl_ns.preparation.model_files import (
     model_type,
     read_config,
     spoken,
+    whole,
 )
 
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -192,15 +193,16 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
     model = load_weights(AutoModel, files, device)
     processor = _image_processor(files)
     normalizes = getattr(processor, "do_normalize", True)
-    return ImageTextEncoder(
-        model,
-        _tokenizer(files),
-        processor.image_mean if normalizes else (0.0, 0.0, 0.0),
-        processor.image_std if normalizes else (1.0, 1.0, 1.0),
-        files.identity,
-        getattr(processor, "brightness", None),  # a key of our own, in the built-in CLIP's folder
-        "bilinear" if int(processor.resample) == 2 else "bicubic",
-    )
+    with whole(f"the files in {files.folder} don't fit each other", "download the model again"):
+        return ImageTextEncoder(
+            model,
+            _tokenizer(files),
+            processor.image_mean if normalizes else (0.0, 0.0, 0.0),
+            processor.image_std if normalizes else (1.0, 1.0, 1.0),
+            files.identity,
+            getattr(processor, "brightness", None),  # a key of our own, in the built-in CLIP's folder
+            "bilinear" if int(processor.resample) == 2 else "bicubic",
+        )
 
 
 def _tokenizer(files: ModelFiles) -> Any:
@@ -213,13 +215,9 @@ def _tokenizer(files: ModelFiles) -> Any:
             f"{files.folder} has no tokenizer ({', '.join(' and '.join(names) for names in _VOCABULARIES)}): "
             "copy these files from the model that this one was fine-tuned from"
         )
-    try:
+    remedy = "SigLIP and TIPSv2 need `pip install sentencepiece protobuf`; otherwise download the model again"
+    with whole(f"the tokenizer in {files.folder} can't be read", remedy):
         return AutoTokenizer.from_pretrained(files.folder, local_files_only=True, trust_remote_code=False)
-    except (OSError, ValueError, TypeError, KeyError, ImportError, AttributeError) as error:
-        raise UserError(
-            f"the tokenizer in {files.folder} can't be read ({error}): those of SigLIP and TIPSv2 need "
-            "`pip install sentencepiece protobuf`; otherwise download the model again"
-        ) from error
 
 
 def _image_processor(files: ModelFiles) -> Any:
@@ -233,7 +231,11 @@ def _image_processor(files: ModelFiles) -> Any:
             f"{files.folder} has no preprocessor_config.json: copy it from the model that this one was "
             "fine-tuned from"
         )
-    return AutoImageProcessor.from_pretrained(files.folder, local_files_only=True, trust_remote_code=False)
+    path = files.folder / "preprocessor_config.json"
+    with whole(f"{path} can't be read", "download the model again"):
+        return AutoImageProcessor.from_pretrained(
+            files.folder, local_files_only=True, trust_remote_code=False
+        )
 
 
 def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, tokens: int = 64) -> DenseEncoder:

@@ -6,6 +6,8 @@ Code that comes with a model is never run, and weights are read as plain tensors
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,7 +17,7 @@ from typing import Any
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.files import check_regular, expanded
 
 CLIP_OPTION = "--pipeline.datamanager.clip"
 DENSE_OPTION = "--pipeline.datamanager.dense"
@@ -30,6 +32,8 @@ _BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
 _WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
 _FILES = ("*.json", "*.txt", "*.model")
 """Configuration, vocabularies, and SentencePiece models."""
+_MOST_LAYERS = 1000
+"""Layers of a network; a damaged number would keep transformers building for hours."""
 
 
 @dataclass(frozen=True)
@@ -95,11 +99,13 @@ def spoken(option: str) -> str:
 
 def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
     """The model, frozen and in float32. Missing weights are an error, not random numbers."""
-    from safetensors import SafetensorError
     from transformers.utils import logging
 
     logging.disable_progress_bar()  # a second's work, and it would draw over ours
-    try:
+    logging.set_verbosity_error()  # tables of tensors; what is missing is said below
+    read_config(files)
+    remedy = f"download it again, or give {spoken(files.option)} another folder"
+    with whole(f"{files.name}: the model in {files.folder} can't be loaded", remedy):
         model, report = model_class.from_pretrained(
             files.folder,
             local_files_only=True,
@@ -107,11 +113,6 @@ def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str
             dtype=torch.float32,
             output_loading_info=True,
         )
-    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
-        raise UserError(
-            f"{files.name}: the model in {files.folder} can't be loaded ({error}): download it again, or "
-            f"give {spoken(files.option)} another folder"
-        ) from error
     missing = sorted(name for name in report["missing_keys"] if "pooler" not in name)  # poolers are not used
     if missing:
         raise UserError(
@@ -123,13 +124,9 @@ def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str
 
 def load_processor(processor_class: Any, files: ModelFiles) -> Any:
     """Preprocessor of a network's images and texts. Raises UserError if its files are missing."""
-    try:
+    remedy = "copy its preprocessor_config.json and tokenizer files there, or download the model again"
+    with whole(f"{files.folder} lacks files that preprocess the input of {files.name}", remedy):
         return processor_class.from_pretrained(files.folder, local_files_only=True)
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise UserError(
-            f"{files.folder} lacks files that preprocess the input of {files.name} ({error}): copy its "
-            "preprocessor_config.json and tokenizer files there, or download the model again"
-        ) from error
 
 
 def model_type(files: ModelFiles) -> str:
@@ -141,10 +138,26 @@ def read_config(files: ModelFiles) -> Any:
     """A model's configuration. Raises UserError if its file isn't one."""
     from transformers import AutoConfig
 
+    with whole(f"{files.folder / 'config.json'} is not a model's configuration", "download the model again"):
+        config = AutoConfig.from_pretrained(files.folder, trust_remote_code=False)
+        for part in (config, getattr(config, "vision_config", None), getattr(config, "text_config", None)):
+            layers = getattr(part, "num_hidden_layers", 1)
+            if isinstance(layers, int) and not 0 < layers <= _MOST_LAYERS:
+                raise ValueError(f"it has {layers} layers")
+    return config
+
+
+@contextmanager
+def whole(problem: str, remedy: str) -> Iterator[None]:
+    """Turns any failure of transformers into a UserError: it trusts a model's files, so that damaged ones
+    make it fail in any way."""
     try:
-        return AutoConfig.from_pretrained(files.folder, trust_remote_code=False)
-    except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"{files.folder / 'config.json'} is not a model's configuration: {error}") from error
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+        raise UserError(f"{problem} ({reason}): {remedy}") from error
 
 
 def _download(name: str, option: str) -> Path:
@@ -185,6 +198,11 @@ def _fingerprint(folder: Path, option: str) -> str:
             f"{folder} is not a model in Hugging Face format: it needs config.json and "
             f"{' or '.join(_WEIGHTS)}; give {spoken(option)} the folder that holds them"
         )
+    for path in (path for pattern in (*_FILES, *_WEIGHTS) for path in folder.glob(pattern)):
+        try:
+            check_regular(path)
+        except OSError as error:
+            raise UserError(f"{path} can't be read ({error.strerror}): download the model again") from error
     preprocessing = sorted(folder.glob("p*processor_config.json"))
     digests = []
     for path in [config, *preprocessing, *weights]:

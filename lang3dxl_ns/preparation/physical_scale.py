@@ -22,7 +22,7 @@ from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 SMALLEST_CROP = 32
 """Pixels: smaller crops show an image encoder nothing."""
 FINE_SHARE = 0.7
-"""Side of the finest crops relative to the pyramid's smallest; chosen by measurement (docs/queries.md)."""
+"""Side of the finest crops relative to the pyramid's smallest; chosen by measurement (docs/lab/words.md)."""
 EDGE_MARGIN = 0.1
 """Share of a side: observations nearer to the photo's edge are ignored by the "mean-inner" distance."""
 

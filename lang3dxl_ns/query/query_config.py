@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.text import TextConfig
 
 
+@showing("threshold", "size", "foreground")
 @dataclass
 class QueryConfig:
     """Settings of queries."""

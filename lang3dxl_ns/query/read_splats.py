@@ -210,6 +210,10 @@ def _ply_header(file: BinaryIO) -> tuple[str, dict[str, _Element]]:
         match line.split():
             case ["format", name, *_]:
                 form = name
+            case ["element", name, _] if name in elements:
+                raise ValueError(f"it lists {name} twice")
+            case ["property", _, name] if name in columns:
+                raise ValueError(f"its points have {name} twice")
             case ["element", name, count]:
                 columns = {}
                 elements[name] = _Element(int(count), columns)

@@ -13,7 +13,7 @@ EVEN = 0.5
 """Relevancy where prompt and negatives fit equally well."""
 SHARE = 0.4
 """Of the way from the median Gaussian's relevancy to a prompt's peak, where matches begin; chosen on
-landmarks for decisions (docs/queries.md)."""
+landmarks for decisions (docs/lab/words.md)."""
 COVERED = 0.3
 """Share of a pixel that matching Gaussians must cover: most matches are small, and edges blend."""
 

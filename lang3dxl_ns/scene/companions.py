@@ -45,12 +45,14 @@ def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bo
     """The file in `folder` for a photo: `name` with a suffix appended (COLMAP's photo.jpg.png, which
     distinguishes photo.jpg from photo.png) or replaced. None if there is none.
 
-    Raises UserError for a name that leads out of the folder.
+    Raises UserError for a name that leads out of the folder, and for a pipe or a device of that name.
     """
     path = inside(folder, name, follow_links=True)  # the photo's name; the file found is checked below
     candidates = [path.with_name(path.name + suffix) for suffix in suffixes]
     candidates += [path.with_suffix(suffix) for suffix in suffixes]
-    found = next((candidate for candidate in candidates if candidate.is_file()), None)
+    found = next((path for path in candidates if path.exists() and not path.is_dir()), None)
+    if found is not None and not found.is_file():
+        raise UserError(f"{found} is not a regular file: replace or remove it")
     return None if found is None else inside(folder, str(found.relative_to(folder)), follow_links)
 
 

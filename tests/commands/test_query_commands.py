@@ -47,6 +47,13 @@ def test_query_writes_pictures_map_and_report(run, tmp_path, capsys):
     assert "dome" in capsys.readouterr().out
 
 
+def test_a_text_that_is_given_twice_is_asked_once(run, tmp_path):
+    run(
+        "query", "c", *("--text", "dome;dome", "--text", "dome"), "--image", "all/0003.jpg", "--out", tmp_path
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dome", "query.json"]
+
+
 def test_without_a_view_the_best_one_is_taken(run, tmp_path):
     run("query", "c", "--text", "dome", "--out", tmp_path)
     assert (tmp_path / "dome" / "right_0002.npy").exists()

@@ -20,3 +20,19 @@ def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path, monkeypat
         write_atomically(target, b"new")
     assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]
     assert target.read_bytes() == b"old"
+
+
+def test_a_device_or_a_pipe_is_written_to_and_a_link_stays_a_link(tmp_path):
+    pipe, link = tmp_path / "pipe", tmp_path / "link"
+    os.mkfifo(pipe)
+    link.symlink_to(tmp_path / "target")
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_atomically(pipe, "words")
+    assert pipe.is_fifo()
+    assert os.read(reader, 100) == b"words"
+    os.close(reader)
+    write_atomically(link, "words")
+    assert link.is_symlink()
+    assert (tmp_path / "target").read_text() == "words"
+    with pytest.raises(IsADirectoryError):
+        write_atomically(tmp_path, "words")

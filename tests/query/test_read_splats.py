@@ -248,3 +248,12 @@ def test_a_missing_file_and_a_folder_without_a_splat_are_named(tmp_path):
     for place in (tmp_path / "nothing.ply", tmp_path):
         with pytest.raises(UserError, match=place.name):
             read_splats(place)
+
+
+@pytest.mark.parametrize("line", [b"property float x\n", b"element vertex 5\n"])
+def test_what_a_ply_lists_twice_is_refused(line, tmp_path):
+    write_splats(tmp_path / "a.ply", some_splats())
+    header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    (tmp_path / "a.ply").write_bytes(header + line + b"end_header\n" + body)
+    with pytest.raises(UserError, match="twice"):
+        read_splats(tmp_path / "a.ply")

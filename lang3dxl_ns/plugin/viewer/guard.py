@@ -1,7 +1,8 @@
 """Access control of nerfstudio's viewers: who may open them, and which files and messages they accept.
 
 viser 0.2.7 serves any file of the machine, answers pages of any origin, and has no hook for either, so
-`guard_viewers` puts a guard before every server that this process starts. docs/faults.md says what it allows.
+`guard_viewers` puts a guard before every server that this process starts. What it allows:
+docs/troubleshooting.md.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from lang3dxl_ns.benchmarks.dense_rasterizer import count_pairs
+from lab.benchmarks.dense_rasterizer import count_pairs
 from lang3dxl_ns.common.reports import interleaved_times
 from lang3dxl_ns.rendering import Camera, Gaussians
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from lang3dxl_ns.benchmarks import rasterizer as benchmark
-from lang3dxl_ns.benchmarks.dense_rasterizer import count_pairs, render_dense
-from lang3dxl_ns.benchmarks.rasterizer import (
+from lab.benchmarks import rasterizer as benchmark
+from lab.benchmarks.dense_rasterizer import count_pairs, render_dense
+from lab.benchmarks.rasterizer import (
     DENSE,
     OURS,
     TORCH,
@@ -19,7 +19,7 @@ from lang3dxl_ns.benchmarks.rasterizer import (
     forward_backward,
     pass_costs,
 )
-from lang3dxl_ns.benchmarks.rasterizer_scenes import Case, make_problem, synthetic_cloud
+from lab.benchmarks.rasterizer_scenes import Case, make_problem, synthetic_cloud
 from lang3dxl_ns.common.errors import UserError
 
 SMALL = [Case("A", 400, 50, 37), Case("B", 400, 50, 37)]
@@ -61,7 +61,7 @@ def test_the_baseline_does_not_depend_on_its_tile_size(float64_problem, monkeypa
     image, _ = render_dense(float64_problem)
     scene = float64_problem.gaussians, float64_problem.camera
     kept, evaluated = count_pairs(*scene)
-    monkeypatch.setattr("lang3dxl_ns.benchmarks.dense_rasterizer.DENSE_TILE", 50)
+    monkeypatch.setattr("lab.benchmarks.dense_rasterizer.DENSE_TILE", 50)
     torch.testing.assert_close(render_dense(float64_problem)[0], image)
     assert count_pairs(*scene)[0] == kept
     assert kept < evaluated < count_pairs(*scene)[1]
@@ -130,7 +130,7 @@ def test_the_quick_benchmark_reports_times_ratios_errors_and_memory(tmp_path):
         (tmp_path / "rasterizer.md").read_text(),
         json.loads((tmp_path / "rasterizer.json").read_text()),
     )
-    assert f"`lang3dxl benchmark rasterizer --out {tmp_path} --device cpu --quick`" in report
+    assert f"`python -m lab.benchmarks.rasterizer --out {tmp_path} --device cpu --quick`" in report
     assert (tmp_path / "rasterizer.png").read_bytes().startswith(b"\x89PNG")
     for case in data["cases"]:
         ratio = case["forward_backward_ms"][DENSE] / case["forward_backward_ms"][OURS]

@@ -1,10 +1,12 @@
-"""`lang3dxl benchmark real-photos`: train on scenes of real photos, and score what there is truth for."""
+"""`python -m lab.benchmarks.real_photos`: train on scenes of real photos and score them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import tyro
 
 from lang3dxl_ns.baselines.rows import CHANCE, FULL, LIMIT, TEACHER, choose_rows
 from lang3dxl_ns.benchmarks.ablation import make_all
@@ -68,7 +70,7 @@ class RealPhotos:
     def _write(self, figures: Mapping[Run, Mapping[str, float]], failed: Mapping[Run, str]) -> None:
         text = [
             "# Real photos",
-            f"    {command_line('lang3dxl benchmark real-photos', self)}",
+            f"    {command_line('python -m lab.benchmarks.real_photos', self)}",
             describe_machine(),
             *tables(figures),
             *(f"Not run: {run.name}: {reason}" for run, reason in failed.items()),
@@ -129,3 +131,7 @@ def _labels(scenes: Sequence[Path]) -> dict[str, Path]:
     if not found:
         raise UserError("give --scene one or more folders of photos")
     return found
+
+
+if __name__ == "__main__":
+    tyro.cli(RealPhotos).main()

@@ -5,8 +5,8 @@ import pytest
 from painted_scene import painted_scene
 from PIL import Image
 
-from lang3dxl_ns.benchmarks import typed_words
-from lang3dxl_ns.benchmarks.typed_words import PROMPTS, judged
+from lab.benchmarks import typed_words
+from lab.benchmarks.typed_words import PROMPTS, judged
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
 PROMPTS_HERE = {"windows": ("windows", "window", "the left window"), "spires": ("spires",), "": ("nothing",)}

@@ -1,6 +1,6 @@
 """A soak: browsers come to a viewer and go, and its memory is watched. Run by hand:
 
-PYTHONPATH=tests python tests/attacks/soak.py --clients 200 --minutes 10
+PYTHONPATH=tests python -m lab.benchmarks.soak --clients 200 --minutes 10
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.benchmarks.rasterizer_scenes import CHANNELS, Problem
+from lab.benchmarks.rasterizer_scenes import CHANNELS, Problem
 from lang3dxl_ns.rendering import Camera, Gaussians
 
 DENSE_TILE = 16

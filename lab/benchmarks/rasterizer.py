@@ -1,4 +1,4 @@
-"""`lang3dxl benchmark rasterizer`: time, memory and error beside a plain dense rasterizer in one process.
+"""`python -m lab.benchmarks.rasterizer`: time, memory and error beside a plain dense rasterizer.
 
 Absolute times don't carry over to another machine; ratios between candidates that ran in turn do, so
 quote those.
@@ -15,16 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import tyro
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.benchmarks.dense_rasterizer import (
+from lab.benchmarks.dense_rasterizer import (
     DENSE_BYTES_PER_PAIR,
     DENSE_TILE,
     count_pairs,
     render_dense,
 )
-from lang3dxl_ns.benchmarks.rasterizer_scenes import (
+from lab.benchmarks.rasterizer_scenes import (
     CHANNELS,
     COLORS,
     Case,
@@ -189,7 +190,7 @@ class RasterizerBenchmark:
         torch.set_num_threads(self.threads)
         try:
             results = {
-                "command": command_line("lang3dxl benchmark rasterizer", self),
+                "command": command_line("python -m lab.benchmarks.rasterizer", self),
                 "machine": describe_machine(device),
                 "points": self.scene.name if self.scene else "synthetic scene",
                 "baseline_gigabytes": self.baseline_gigabytes,
@@ -386,3 +387,7 @@ def _plot(results: dict[str, Any]) -> bytes:
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=150)
     return file.getvalue()
+
+
+if __name__ == "__main__":
+    tyro.cli(RasterizerBenchmark).main()

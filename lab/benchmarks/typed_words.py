@@ -1,4 +1,4 @@
-"""`lang3dxl benchmark typed-words`: fifty prompts as people type them, each judged by labels."""
+"""`python -m lab.benchmarks.typed_words`: fifty prompts as people type them, each judged by labels."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+import tyro
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import command_line, markdown_table, write_report
@@ -67,7 +68,7 @@ class TypedWords:
         prompts = [text for texts in PROMPTS.values() for text in texts]
         rows = [[p, *(" ".join(filter(None, found[p])) for found in verdicts.values())] for p in prompts]
         each = markdown_table(["prompt", *(Path(name).name for name in verdicts)], rows)
-        command = command_line("lang3dxl benchmark typed-words", self)
+        command = command_line("python -m lab.benchmarks.typed_words", self)
         text = f"# Typed words\n\n    {command}\n\n{shares}\n\n{each}\n"
         write_report(self.out, "typed_words", text, {"shares": dict(counts), "scenes": verdicts})
         print(text)
@@ -104,3 +105,7 @@ def mask_ious(
             matches = scene.matches(question, photo.name, max(camera.width, camera.height))
             ious.append([overlap(match.mask, label.mask)["iou"] for match in matches])
     return [float(v) for v in np.mean(ious, axis=0)] if ious else [0.0] * len(texts)
+
+
+if __name__ == "__main__":
+    tyro.cli(TypedWords).main()

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from lab.benchmarks.real_photos import RealPhotos, tables
 from lang3dxl_ns.baselines.rows import FULL, ROWS
-from lang3dxl_ns.benchmarks.real_photos import RealPhotos, tables
 from lang3dxl_ns.benchmarks.scored_runs import Run, ScoredRuns
 from lang3dxl_ns.common.errors import UserError
 
@@ -49,7 +49,7 @@ def test_every_scene_is_trained_and_those_with_truth_score_words(tmp_path, made)
     RealPhotos(scene=scenes(tmp_path), out=tmp_path / "out").main()
     assert sorted(made) == ["castle/full/1000-0", "square/full/1000-0"]
     report = (tmp_path / "out" / "real_photos.md").read_text()
-    assert "lang3dxl benchmark real-photos" in report
+    assert "python -m lab.benchmarks.real_photos" in report
     assert "20.50" in report
     assert report.count("## Words in photos that training saw of castle") == 1
     assert report.count("## Words in held-out photos of castle") == 1

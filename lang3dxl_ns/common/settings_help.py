@@ -1,0 +1,44 @@
+"""What the help of a command shows of its settings."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from typing import TypeVar, get_type_hints
+
+import tyro
+
+Class = TypeVar("Class", bound=type)
+
+
+def without(*names: str) -> Callable[[Class], Class]:
+    """A dataclass decorator that takes inherited settings off the command line."""
+
+    def hide(kind: Class) -> Class:
+        hints = get_type_hints(kind, include_extras=True)
+        for name in names:
+            kind.__annotations__[name] = tyro.conf.Fixed[hints[name]]  # type: ignore[valid-type, misc]
+        return kind
+
+    return hide
+
+
+def showing(*names: str) -> Callable[[Class], Class]:
+    """A dataclass decorator that keeps all but these settings out of what `--help` prints. Commands accept
+    the others, and `--help-all` prints them too."""
+
+    def hide(kind: Class) -> Class:
+        if not {"-h", "--help"} & set(sys.argv[1:]):  # tyro would not accept what it does not print
+            return kind
+        hints = get_type_hints(kind, include_extras=True)
+        for name in (item.name for item in fields(kind) if item.name not in names):
+            kind.__annotations__[name] = tyro.conf.Suppress[hints[name]]  # type: ignore[valid-type, misc]
+        return kind
+
+    return hide
+
+
+def asked_for_all(arguments: list[str]) -> list[str]:
+    """The arguments of a command, with `--help-all` as tyro spells it."""
+    return ["--help" if argument == "--help-all" else argument for argument in arguments]

@@ -1,0 +1,73 @@
+"""A help shows what people need, and tells how to see the rest."""
+
+import contextlib
+import io
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from typing import get_args
+
+import pytest
+import tyro
+
+from lang3dxl_ns.common.settings_help import asked_for_all, showing
+
+
+def options(kind, default=None) -> set[str]:
+    said = io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
+        tyro.cli(kind, default=default, args=["--help"], config=(tyro.conf.OmitArgPrefixes,))
+    return set(re.findall(r"^[│ ]*(--[a-z][\w.-]*)", said.getvalue(), re.MULTILINE)) - {"--help"}
+
+
+def settings():
+    @showing("often")
+    @dataclass
+    class Settings:
+        often: int = 1
+        rarely: int = 2
+
+    return Settings
+
+
+def test_what_few_need_is_left_out_of_the_help_alone(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lang3dxl", "demo", "--help"])
+    assert options(settings()) == {"--often"}
+    for arguments in (["--help-all"], ["--rarely", "3"]):
+        monkeypatch.setattr(sys, "argv", ["lang3dxl", "demo", *arguments])
+        assert options(settings()) == {"--often", "--rarely"}
+    assert tyro.cli(settings(), args=["--rarely", "3"]).rarely == 3
+    assert asked_for_all(["demo", "--help-all"]) == ["demo", "--help"]
+
+
+def count() -> None:
+    """Prints how many settings the help of ns-train shows, and how many flags that of all our commands."""
+    from importlib import import_module
+
+    from lang3dxl_ns.cli import COMMANDS
+    from lang3dxl_ns.methods import lang3dxl
+
+    def flags(target) -> int:
+        if isinstance(target, dict):
+            return sum(flags(found) for found, _ in target.values())
+        module, _, name = target.partition(":")
+        command = getattr(import_module(f"lang3dxl_ns.{module}"), name)
+        kinds = [command] if isinstance(command, type) else [get_args(kind)[0] for kind in get_args(command)]
+        return sum(len(options(kind)) for kind in kinds)
+
+    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        tyro.cli(tyro.conf.SuppressFixed[type(lang3dxl.config)], default=lang3dxl.config, args=["--help"])
+    training = set(re.findall(r"^[│ ]*(--[a-z][\w.-]*)", said.getvalue(), re.MULTILINE))
+    print(len(training), sum(flags(target) for target, _ in COMMANDS.values()))
+
+
+@pytest.mark.slow
+def test_ns_train_shows_at_most_80_settings_and_our_commands_140_flags():
+    code = "import sys; sys.argv = ['lang3dxl', '--help']; from commands.test_help import count; count()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd="tests", check=True
+    )
+    training, commands = map(int, done.stdout.split())
+    assert 60 < training <= 80
+    assert 90 < commands <= 140
