@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,7 @@ from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.viewer.panel import AskPanel
 from lang3dxl_ns.query.answer import pictures
+from lang3dxl_ns.query.match import Match
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.text import Prompt
@@ -125,14 +126,15 @@ class Lang3DXLPipeline(VanillaPipeline):
         if self.test_mode != "val" and self.query:
             self.model.answers = self._answers()
 
-    def match_thresholds(self) -> dict[str, float]:
-        """Relevancy above which places match each scored prompt, by the scene."""
+    def scored_matches(self, photos: Sequence[str]) -> dict[str, dict[str, Match]]:
+        """What a user finds of every scored prompt in the views of some photos, by photo and prompt; nothing
+        without words or ground truth."""
         scorer = self.evaluation.scorer
         if scorer is None or self.model.carried is None:
-            return {}
+            return {photo: {} for photo in photos}
         scene, prompts = self.model.scene(self.scene_file), scorer.truth.categories
         question = scene.ask([Prompt(text) for text in prompts])
-        return dict(zip(prompts, question.thresholds, strict=True))
+        return {photo: dict(zip(prompts, scene.matches(question, photo), strict=True)) for photo in photos}
 
     def _answers(self) -> RenderedAnswers:
         cache = self.datamanager.config.run
