@@ -121,7 +121,7 @@ def test_a_view_of_at_most_the_training_size_takes_one_pass(scene, monkeypatch, 
     assert drawn == [size, 96][:passes]
     if passes == 1:
         apart = composite(scene.splats, match.view.camera, question.channels)
-        expected = question.maps(replace(match.view.rendering, channels=apart))[0]
+        expected = question.maps(replace(match.view.rendering, channels=apart))[0][0]
         np.testing.assert_allclose(match.relevancy, expected, atol=1e-6)
 
 
