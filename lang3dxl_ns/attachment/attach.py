@@ -12,6 +12,7 @@ import torch
 from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame, side_by_side
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.attachment.learn import learn, prepare_photos, scene_file, settled
+from lang3dxl_ns.attachment.segment import segmented
 from lang3dxl_ns.attachment.views import Up, rendered_views
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import best_device
@@ -19,6 +20,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
+from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.match import save_picture
@@ -42,6 +44,8 @@ class AttachConfig:
     """Without photos: the splat's axis that points up (auto: by where its ground is)."""
     cache_dir: Path | None = None
     """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
+    segment: tuple[str, ...] = ()
+    """Words that a segmenter, `preparation.foreground_model`, finds in the photos and teaches the scene."""
     preparation: PreparationConfig = field(default_factory=PreparationConfig)
     """Encoders, crops and foreground."""
 
@@ -79,7 +83,11 @@ def attach(
     preparation = settled(config.preparation)
     option_prefix.set("--")
     check_encoders(preparation.clip, preparation.dense)
-    stages, where = Stages(_SHARES), torch.device(device or best_device())
+    found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
+    stages, where = (
+        Stages(_SHARES if found is None else _SHARES | {"segment": 0.3}),
+        torch.device(device or best_device()),
+    )
     with stages.stage("splat"):
         path = find_splats(splat)
         splats = read_splats(path).to(where)
@@ -105,6 +113,11 @@ def attach(
     file = scene_file(collection, cameras, similarity, preparation)
     visible = None if place is None else place.with_name(f".{place.stem}.visible")
     scene = Scene(splats, file, decoder, codes, cache=visible)
+    if found is not None:
+        with stages.stage("segment"):
+            segmenter = load_text_segmenter(found, where)
+            for word in config.segment:
+                scene = segmented(scene, word, segmenter, collection.photos, cameras)
     if place is not None:
         scene = with_words_of(scene, place)
         written = write_scene(place, scene, _provenance(path, len(collection.photos), what))

@@ -35,7 +35,7 @@ LENS = Lens(480, 360, 384.0, 384.0, 240.0, 180.0)
 """Of the views: 64 degrees wide, as a phone's."""
 BACKGROUND = (0.75, 0.8, 0.85)
 """Behind the splat: a pale sky."""
-_RULE = 2
+_RULE = 3
 """Increased when views are chosen or rendered in another way."""
 _OPAQUE = 0.3
 _NEAR = 0.03
@@ -52,6 +52,9 @@ _PROBES, _ROOFED = 64, 0.7
 """Places tried, and the share of them with matter above from which a scene is indoors."""
 _TILT = 0.4
 """Angle in radians between up and the nearest axis, at most."""
+_RING = (1.6, 5.0)
+"""Distances in radii of the views around a scene. From closer by, its parts fill a view, and their crops
+lack the surroundings by which CLIP tells them apart."""
 _CANDIDATES = 5
 """Candidates for every view wanted."""
 _SIDE = 96
@@ -309,10 +312,10 @@ def candidates(extent: Extent, free: _FreeSpace, count: int) -> Iterator[Camera]
 
 
 def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """From 0.8 to 5 radii away, up to 40 degrees above the ground; at something in the inner half."""
+    """As far as `_RING` says, up to 40 degrees above the ground; at something in the inner half."""
     angle, height, distance, *aim = torch.rand(6, generator=draw).tolist()
     elevation = math.radians(40) * height**2
-    away = extent.radius * 0.8 * 6.0**distance
+    away = extent.radius * _RING[0] * (_RING[1] / _RING[0]) ** distance
     side, front = _level(extent.up)
     direction = math.cos(2 * math.pi * angle) * side + math.sin(2 * math.pi * angle) * front
     floor = extent.center + (extent.ground + 0.08 * extent.radius) * extent.up

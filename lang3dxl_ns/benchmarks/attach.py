@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from lang3dxl_ns.attachment.attach import AttachConfig, attach
 from lang3dxl_ns.attachment.frames import camera_in
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError
@@ -16,6 +17,8 @@ from lang3dxl_ns.common.reports import markdown_table
 from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
+from lang3dxl_ns.open_scene import find_scene_file
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import read_scene
 from lang3dxl_ns.scene.camera import Camera
@@ -24,20 +27,28 @@ from lang3dxl_ns.scene.novel_views import read_novel_views
 
 @dataclass
 class AttachBenchmark:
-    """Score words in scenes of one splat, in the test views or labeled photos of its data."""
+    """Score words in scenes of one splat, in the test views or labeled photos of its data.
+
+    Of a single scene, the Gaussians are written as a PLY and attached again, with the photos of --data and
+    without: one table tells what each costs.
+    """
 
     scenes: tyro.conf.Positional[list[Path]]
-    """Scene files, all in one frame. The first knows where the photos were taken."""
+    """Scene files or runs, all in one frame. The first knows where the photos were taken."""
     data: Path
     """Folder with test_views/, or with ground_truth/ of photos."""
+    out: Path = Path("attach-benchmark")
+    """Folder for what is attached; finished scenes in it are kept."""
     most: int | None = None
     """Views to score, evenly spread (default: all)."""
 
     def main(self) -> None:
-        scenes = {path: read_scene(path) for path in self.scenes}
-        first = next(iter(scenes.values()))
+        files = [find_scene_file(path) or path for path in self.scenes]
+        first = read_scene(files[0])
         if first.file.clip is None:
             raise UserError(f"{self.scenes[0]} has colors alone: name a scene with words")
+        files += attached(first, self.data, self.out) if len(files) == 1 else []
+        scenes = {path: read_scene(path) for path in files}
         truth, views = _labeled(self.data, first)
         chosen = views if self.most is None else views[:: -(-len(views) // self.most)]
         scorer = open_scorer(truth, first.file.clip, first.device)
@@ -49,6 +60,28 @@ class AttachBenchmark:
             rows.append([path.name, f"{means['map']:.3f}", f"{seen:.0%}", *found])
         say(f"{len(chosen)} views of {self.data}")
         say(markdown_table(["scene", "mAP", "Gaussians seen", *truth.categories], rows))
+
+
+def attached(scene: Scene, data: Path, out: Path) -> list[Path]:
+    """Scene files of a scene's own Gaussians as a PLY, attached with its photos and without.
+
+    Args:
+        scene: the scene, with words.
+        data: folder of its photos.
+        out: folder for the files; those in it are kept.
+
+    Raises:
+        UserError: see `attach`.
+    """
+    assert scene.file.clip is not None
+    splat, config = out / "splat.ply", AttachConfig(preparation=PreparationConfig(clip=scene.file.clip))
+    found = {out / "with-photos.scene": data, out / "without-photos.scene": None}
+    if not splat.is_file():
+        scene.export(splat)
+    for file, photos in found.items():
+        if not file.is_file():
+            attach(splat, photos, file, config)
+    return list(found)
 
 
 Labeled = tuple[str, Camera, tuple[int, int]]

@@ -40,6 +40,8 @@ class Attach(PreparationConfig):
     """Without --data: number of views to render."""
     up: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
     """Without --data: the splat's axis that points up (auto: by where its ground is)."""
+    segment: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """A word that --foreground-model finds in the photos and teaches the scene; repeat the flag."""
     cache_dir: Path | None = None
     """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
 
@@ -50,7 +52,7 @@ class Attach(PreparationConfig):
         if not 4 <= self.views <= 10_000:
             raise UserError(f"--views is {self.views}: give a number from 4 to 10000")
         settings = PreparationConfig(**{f.name: getattr(self, f.name) for f in fields(PreparationConfig)})
-        config = AttachConfig(self.views, self.up, self.cache_dir, settings)
+        config = AttachConfig(self.views, self.up, self.cache_dir, tuple(self.segment), settings)
         scene = attach(self.splat, self.data, self.out, config)
         if self.text:
             _show(scene, self.text, self.out)

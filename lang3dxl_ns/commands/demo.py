@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.evaluation.evaluated_photo import EvaluatedPhoto
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+    from lang3dxl_ns.query.match import Match
 
 RUN = Path("run", "lang3dxl", "demo")
 """The run's folder inside the demo's folder."""
@@ -104,8 +105,9 @@ class Demo:
         report |= stages.figures()
         folder = config.get_base_dir()
         write_report(folder, "report", self.markdown(report), report)
-        thresholds = trainer.pipeline.match_thresholds()
-        if rows := [row for row in (_picture_row(p, trainer, thresholds) for p in photos) if row.truth]:
+        matches = trainer.pipeline.scored_matches([photo.name for photo in photos])
+        drawn = (_picture_row(photo, trainer, matches[photo.name]) for photo in photos)
+        if rows := [row for row in drawn if row.truth]:
             from lang3dxl_ns.demo.picture import draw_picture, most_telling
 
             draw_picture(most_telling(rows, 3), folder / "report.png")
@@ -276,7 +278,7 @@ SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluat
 """The demo's stages, and their usual shares of its time on a CPU."""
 
 
-def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, thresholds: dict[str, float]) -> PictureRow:
+def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, matches: dict[str, Match]) -> PictureRow:
     from lang3dxl_ns.demo.picture import PictureRow
 
     real, rendered = photo.images["img"].cpu().chunk(2, dim=1)
@@ -290,7 +292,6 @@ def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, thresholds: di
         photo=real.numpy(),
         rendering=rendered.numpy(),
         codes=codes.cpu().numpy(),
-        relevancy={prompt: m.cpu().numpy() for prompt, m in photo.maps.items()},
-        truth={prompt: mask for prompt, mask in truth.items() if mask.any()},
-        thresholds=thresholds,
+        matches=matches,
+        truth={prompt: mask for prompt, mask in truth.items() if mask.any() and prompt in matches},
     )

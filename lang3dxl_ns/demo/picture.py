@@ -13,9 +13,12 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.evaluation.scores import resize_map
 from lang3dxl_ns.query.heat_maps import overlay
+from lang3dxl_ns.query.match import Match
 
 COLUMNS = 4
 """Prompts shown per photo."""
+FOUND = (1.0, 0.0, 1.0)
+"""Color of the outline of what is found: magenta, which no heat has."""
 
 
 @dataclass
@@ -26,12 +29,10 @@ class PictureRow:
     photo: Float[Array, "h w 3"]
     rendering: Float[Array, "h w 3"]
     codes: Float[Array, "h w 3"]
-    relevancy: Mapping[str, Float[Array, "mh mw"]]
-    """By prompt, 0…1."""
+    matches: Mapping[str, Match]
+    """By prompt, in the view of the photo."""
     truth: Mapping[str, Bool[Array, "mh mw"]]
     """By prompt; prompts without truth are not shown."""
-    thresholds: Mapping[str, float]
-    """Relevancy above which pixels match, by prompt."""
 
 
 def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
@@ -47,8 +48,8 @@ def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
 
 
 def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
-    """Write a PNG with a row per photo: photo, rendering, codes as color, and a heat map per prompt with
-    the ground truth outlined in white."""
+    """Write a PNG with a row per photo: photo, rendering, codes as color, and what is found of each prompt:
+    its heat, outlined in magenta, with the ground truth outlined in white."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -72,18 +73,16 @@ def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
 
 
 def _draw_prompt(axis, prompt: str, row: PictureRow) -> None:
-    height, width = row.truth[prompt].shape
-    gray = torch.from_numpy(row.rendering).mean(dim=2).expand(3, -1, -1)
-    picture = resize_map(gray, (height, width)).permute(1, 2, 0).clamp(0, 1)
-    found = overlay(picture, torch.from_numpy(row.relevancy[prompt]).float(), row.thresholds[prompt])
-    axis.imshow(found.numpy(), extent=(0, width, height, 0))
-    axis.contour(
-        row.truth[prompt].astype(float),
-        levels=[0.5],
-        colors="white",
-        linewidths=1,
-        extent=(0, width, 0, height),
-    )
+    match, truth = row.matches[prompt], row.truth[prompt]
+    height, width = truth.shape
+    relevancy, mask = torch.from_numpy(match.relevancy), torch.from_numpy(match.mask)
+    gray = torch.from_numpy(row.rendering).float().mean(dim=2).expand(3, -1, -1)
+    picture = resize_map(gray, (mask.shape[0], mask.shape[1])).permute(1, 2, 0).clamp(0, 1)
+    axis.imshow(overlay(picture, relevancy, mask, match.threshold).numpy(), extent=(0, width, height, 0))
+    for region, color in ((truth, "white"), (match.mask, FOUND)):
+        place = {"extent": (0, width, 0, height), "levels": [0.5], "linewidths": 1}
+        if region.any() and not region.all():  # matplotlib warns of a contour without a line
+            axis.contour(region.astype(float), colors=[color], **place)
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
     axis.set_title(f"“{prompt}”", fontsize=10)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,11 +21,12 @@ from lang3dxl_ns.evaluation.ground_truth import Layout
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.describe_scene import describe_scene
 from lang3dxl_ns.plugin.evaluation import Evaluation, Split
-from lang3dxl_ns.plugin.lift_features import learn_from_photos, start_codes
+from lang3dxl_ns.plugin.lift_features import learn_from_photos
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.viewer.panel import AskPanel
 from lang3dxl_ns.query.answer import pictures
+from lang3dxl_ns.query.match import Match
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.text import Prompt
@@ -103,11 +103,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         return results
 
     def get_train_loss_dict(self, step: int):
-        """Outputs, losses and metrics of the next photo; before it, where semantics begin, their start."""
-        config = self.config.model
-        begins = step == math.ceil(config.warm_up * config.total_steps)
-        if begins and config.decoder.start == "gathered" and self.model.learns_from_renderings:
-            start_codes(self.model, self.datamanager.train_photos())
+        """Outputs, losses and metrics of the next photo."""
         outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
         return outputs, self.last_losses, metrics
 
@@ -130,14 +126,15 @@ class Lang3DXLPipeline(VanillaPipeline):
         if self.test_mode != "val" and self.query:
             self.model.answers = self._answers()
 
-    def match_thresholds(self) -> dict[str, float]:
-        """Relevancy above which places match each scored prompt, by the scene."""
+    def scored_matches(self, photos: Sequence[str]) -> dict[str, dict[str, Match]]:
+        """What a user finds of every scored prompt in the views of some photos, by photo and prompt; nothing
+        without words or ground truth."""
         scorer = self.evaluation.scorer
         if scorer is None or self.model.carried is None:
-            return {}
+            return {photo: {} for photo in photos}
         scene, prompts = self.model.scene(self.scene_file), scorer.truth.categories
         question = scene.ask([Prompt(text) for text in prompts])
-        return dict(zip(prompts, question.thresholds, strict=True))
+        return {photo: dict(zip(prompts, scene.matches(question, photo), strict=True)) for photo in photos}
 
     def _answers(self) -> RenderedAnswers:
         cache = self.datamanager.config.run

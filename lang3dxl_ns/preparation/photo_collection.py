@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, read_json
@@ -146,9 +148,8 @@ def read_transforms(path: Path) -> _Read:
         for frame in frames:
             name = _photo_name(path.parent, str(frame["file_path"]))
             try:
-                photo = _transforms_photo(path.parent, name, {**content, **frame})
+                photo, tracked[name] = _transforms_photo(path.parent, name, {**content, **frame})
                 photos[photo.path] = photo
-                tracked[name] = _transforms_pose(photo, frame["transform_matrix"])
             except UserError as reason:
                 left_out[name] = reason
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
@@ -170,15 +171,15 @@ def _photo_name(folder: Path, name: str) -> str:
     )
 
 
-def _transforms_photo(folder: Path, name: str, frame: Mapping[str, Any]) -> Photo:
+def _transforms_photo(folder: Path, name: str, frame: Mapping[str, Any]) -> tuple[Photo, TrackedPhoto]:
     path = inside(folder, name, follow_links=True)
     if not path.is_file():
         raise UserError(f"there is no {path}")
-    mask = frame.get("mask_path")
-    lens = _transforms_lens(frame, path, name)
-    nowhere = np.zeros((0, 3)), np.zeros((0, 2))
-    unposed = TrackedPhoto(name, lens, np.eye(4)[:3], *nowhere)
-    return Photo.from_model(unposed, path, None if mask is None else inside(folder, str(mask), True))
+    mask, pose = frame.get("mask_path"), _camera_from_world(frame["transform_matrix"])
+    nothing = np.zeros((0, 3)), np.zeros((0, 2))
+    # Programs that write this file read the pixels as stored, whatever EXIF says.
+    tracked = upright_in_model(TrackedPhoto(name, _transforms_lens(frame, path, name), pose, *nothing), path)
+    return Photo.from_model(tracked, path, None if mask is None else inside(folder, str(mask), True)), tracked
 
 
 def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
@@ -210,9 +211,8 @@ def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
     return lens
 
 
-def _transforms_pose(photo: Photo, matrix: Any) -> TrackedPhoto:
+def _camera_from_world(matrix: Any) -> Float[Array, "3 4"]:
     check_pose(matrix)
     pose = np.array(matrix, dtype=np.float64)
     rotation = (pose[:3, :3] * [1, -1, -1]).T  # OpenGL's camera axes to OpenCV's, inverted
-    camera_from_world = np.hstack([rotation, -rotation @ pose[:3, 3:]])
-    return TrackedPhoto(photo.name, photo.lens, camera_from_world, np.zeros((0, 3)), np.zeros((0, 2)))
+    return np.hstack([rotation, -rotation @ pose[:3, 3:]])

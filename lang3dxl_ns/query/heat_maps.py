@@ -7,21 +7,17 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from numpy import ndarray as Array
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.threshold import matching
 
 
-def heat(
-    relevancy: Float[Tensor, "h w"], threshold: float = 0.5, highest: float | None = None
-) -> Float[Tensor, "h w"]:
-    """Relevancy above the threshold stretched to 0…1; `highest` maps to 1 (None: the map's maximum)."""
-    top = float(relevancy.max()) if highest is None else highest
-    return ((relevancy - threshold) / max(top - threshold, 1e-6)).clamp(0, 1)
+def heat(relevancy: Float[Tensor, "h w"], threshold: float = 0.5) -> Float[Tensor, "h w"]:
+    """Relevancy above the threshold stretched to 0…1, which the map's highest is."""
+    return ((relevancy - threshold) / max(float(relevancy.max()) - threshold, 1e-6)).clamp(0, 1)
 
 
 def color(values: Float[Tensor, "*shape"], color_map: str = "turbo") -> Float[Tensor, "*shape 3"]:
@@ -33,14 +29,26 @@ def color(values: Float[Tensor, "*shape"], color_map: str = "turbo") -> Float[Te
 def overlay(
     image: Float[Tensor, "h w 3"],
     relevancy: Float[Tensor, "h w"],
+    mask: Bool[Tensor, "h w"],
     threshold: float = 0.5,
     opacity: float = 0.7,
     color_map: str = "turbo",
-    highest: float | None = None,
 ) -> Float[Tensor, "h w 3"]:
-    """The heat map over matching pixels, the image elsewhere."""
-    strength = opacity * (relevancy > threshold).to(image)[..., None]
-    return torch.lerp(image, color(heat(relevancy, threshold, highest), color_map), strength)
+    """The heat map over matching pixels, the image elsewhere.
+
+    Args:
+        image: colors, 0…1.
+        relevancy: 0…1.
+        mask: pixels that match.
+        threshold: relevancy of the color map's first color; the highest gets its last.
+        opacity: of the heat map, 0…1.
+        color_map: name of a matplotlib color map.
+
+    Raises:
+        UserError: there is no such color map.
+    """
+    hot = color(heat(relevancy * mask, threshold), color_map)
+    return torch.lerp(image, hot, opacity * mask.to(image)[..., None])
 
 
 @lru_cache
@@ -55,12 +63,12 @@ def _colors(name: str) -> Float[Tensor, "256 3"]:
 
 
 def strongest(
-    maps: Float[Tensor, "q ..."], thresholds: Sequence[float]
-) -> tuple[Float[Tensor, "..."], Int64[Tensor, "..."], float]:
-    """The highest relevancy of the prompts that match a place, 0 where none does; which prompt that is; and
-    the lowest threshold, from which the result can be displayed."""
-    best, which = torch.where(matching(maps, thresholds), maps, 0.0).max(0)
-    return best, which, min(thresholds)
+    maps: Float[Tensor, "q ..."], masks: Bool[Tensor, "q ..."]
+) -> tuple[Float[Tensor, "..."], Int64[Tensor, "..."]]:
+    """The highest relevancy of the prompts that match a place, 0 where none does; and which prompt that
+    is."""
+    best, which = torch.where(masks, maps, -1.0).max(0)
+    return best.clamp_min(0), which
 
 
 PROMPT_COLORS = (
@@ -75,14 +83,15 @@ _FONT_SHARE = 32
 def tinted(
     image: Float[Tensor, "h w 3"],
     maps: Float[Tensor, "q h w"],
-    thresholds: Sequence[float],
+    masks: Bool[Tensor, "q h w"],
+    threshold: float,
     opacity: float = 0.7,
 ) -> Float[Tensor, "h w 3"]:
     """The image with each prompt's matches in its own color: that of the most relevant where several match,
-    stronger with relevancy."""
-    best, which, lowest = strongest(maps, thresholds)
+    stronger with relevancy above the threshold."""
+    best, which = strongest(maps, masks)
     colors = torch.tensor([PROMPT_COLORS[i % len(PROMPT_COLORS)] for i in range(len(maps))]).to(image) / 255
-    strength = opacity * (best > 0) * (0.5 + 0.5 * heat(best, lowest))
+    strength = opacity * masks.any(0) * (0.5 + 0.5 * heat(best, threshold))
     return torch.lerp(image, colors[which], strength[..., None].to(image))
 
 

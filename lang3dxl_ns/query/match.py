@@ -76,8 +76,10 @@ class Match:
     view: View
     relevancy: Float[Array, "h w"]
     """0…1; above 0.5 where the prompt beats all its competitors, 0 where nothing is rendered."""
+    mask: Bool[Array, "h w"]
+    """Pixels that matching Gaussians cover."""
     threshold: float
-    """Relevancy above which a pixel matches."""
+    """Relevancy above which Gaussians match."""
     seconds: float
     """For all prompts of the call, without rendering."""
 
@@ -86,11 +88,6 @@ class Match:
             f"Match({self.prompt.text!r} in {_where(self.view)}: {self.score:.2f} at {self.peak}, "
             f"{self.area:.1%} of the view)"
         )
-
-    @cached_property
-    def mask(self) -> Bool[Array, "h w"]:
-        """Pixels above the threshold."""
-        return self.relevancy > self.threshold
 
     @cached_property
     def peak(self) -> tuple[int, int]:
@@ -110,8 +107,9 @@ class Match:
 
     def overlay(self, opacity: float = 0.7, color_map: str = "turbo") -> UInt8[Array, "h w 3"]:
         """The heat map over the rendering. Raises UserError for an unknown matplotlib color map."""
-        image = self.view.rendering.rgb.cpu()
-        return as_bytes(overlay(image, torch.from_numpy(self.relevancy), self.threshold, opacity, color_map))
+        image, mask = self.view.rendering.rgb.cpu(), torch.from_numpy(self.mask)
+        relevancy = torch.from_numpy(self.relevancy)
+        return as_bytes(overlay(image, relevancy, mask, self.threshold, opacity, color_map))
 
     def save(self, path: str | Path) -> Path:
         """Write the overlay as a picture or, if the name ends in .npy, the relevancy (float32)."""
@@ -130,8 +128,9 @@ def together(matches: Sequence[Match], opacity: float = 0.7) -> UInt8[Array, "h+
     if not matches or any(match.view.pixels.shape != matches[0].view.pixels.shape for match in matches):
         raise UserError("one picture shows the prompts of one view: pass the matches of a single query")
     maps = torch.stack([torch.from_numpy(match.relevancy) for match in matches])
-    thresholds = [match.threshold for match in matches]
-    picture = as_bytes(tinted(matches[0].view.rendering.rgb.cpu(), maps, thresholds, opacity))
+    masks = torch.stack([torch.from_numpy(match.mask) for match in matches])
+    lowest = min(match.threshold for match in matches)
+    picture = as_bytes(tinted(matches[0].view.rendering.rgb.cpu(), maps, masks, lowest, opacity))
     return with_legend(picture, [match.prompt.text for match in matches], PROMPT_COLORS)
 
 

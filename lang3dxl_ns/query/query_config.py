@@ -21,7 +21,7 @@ class QueryConfig:
     """Softmax temperature of the relevancy, for an encoder whose cosines spread like the built-in CLIP's;
     those of others are scaled. Changes neither the ranking of Gaussians nor what matches."""
     threshold: float | None = None
-    """Relevancy above which a pixel matches (default: what stands out in the scene, at most 0.5)."""
+    """Relevancy above which Gaussians match (default: what stands out in the scene, at most 0.5)."""
     min_alpha: float = 0.3
     """Coverage below which a pixel can't match."""
     foreground: str = ""

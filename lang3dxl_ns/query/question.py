@@ -17,7 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.query.threshold import matching
+from lang3dxl_ns.query.threshold import COVERED, matching
 from lang3dxl_ns.rendering.render import Rendering
 
 
@@ -32,7 +32,7 @@ class Question:
     doubts: tuple[float, ...] = ()
     """Per prompt, the share of unrelated words that fit the scene as well."""
     thresholds: tuple[float, ...] = ()
-    """Relevancy above which places match, one per prompt."""
+    """Relevancy above which Gaussians match, one per prompt."""
     foreground_thresholds: tuple[float, ...] = ()
     """The same for the foreground prompts."""
     min_alpha: float = 0.3
@@ -43,8 +43,10 @@ class Question:
 
     @cached_property
     def channels(self) -> Float[Tensor, "n d"]:
-        """Values that Gaussians carry in a rendering that answers the question."""
-        return self.engine.channels(self.queries)
+        """Values that Gaussians carry in a rendering that answers the question: the engine's, then a 1 for
+        each prompt that they match."""
+        own = self.engine.channels(self.queries)
+        return torch.cat([own, self.gaussians.T.to(own)], dim=1)
 
     @cached_property
     def relevancy(self) -> Float[Tensor, "q n"]:
@@ -53,30 +55,33 @@ class Question:
 
     @cached_property
     def gaussians(self) -> Bool[Tensor, "q n"]:
-        """Which Gaussians match each prompt: the selection that masks show in 2D."""
+        """Which Gaussians match each prompt."""
         return matching(self.relevancy, self.thresholds)
 
     @torch.no_grad()
     def maps(
         self, rendering: Rendering, foreground: Bool[Tensor, "h w"] | None = None
-    ) -> Float[Tensor, "q h w"]:
-        """Relevancy of every pixel to every prompt, 0…1.
+    ) -> tuple[Float[Tensor, "q h w"], Bool[Tensor, "q h w"]]:
+        """Relevancy of every pixel to every prompt, 0…1, and the pixels that match: those that matching
+        Gaussians cover, so that a view shows the scene's selection.
 
         Args:
             rendering: a view with `channels`, composited at its size or at another.
             foreground: pixels that may match, at any size; None for all.
 
-        Pixels outside the foreground, and those that the scene hardly covers, are 0.
+        Pixels outside the foreground, and those that the scene hardly covers, are 0 and match nothing.
         """
         assert rendering.channels is not None
         keep, size = rendering.alpha >= self.min_alpha, (rendering.camera.height, rendering.camera.width)
         if foreground is not None:
             there = F.interpolate(foreground[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
             keep = keep & there.to(keep.device)
-        maps = self._confined(self.engine.maps(rendering.channels, self.queries))
+        count = len(self.prompts)
+        carried, covered = rendering.channels.tensor_split([-count], dim=2)
+        maps = torch.cat([self._confined(self.engine.maps(carried, self.queries)), covered.permute(2, 0, 1)])
         if maps.shape[1:] != size:
             maps = F.interpolate(maps[None].float(), size, mode="bilinear", align_corners=False)[0]
-        return maps * keep
+        return maps[:count] * keep, (maps[count:] >= COVERED) & keep
 
     def _confined(self, relevancy: Float[Tensor, "all ..."]) -> Float[Tensor, "q ..."]:
         """Relevancy to the prompts, 0 where no foreground prompt matches."""

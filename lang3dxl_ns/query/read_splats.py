@@ -327,9 +327,26 @@ def _splat(path: Path) -> Splats:
     return Splats(means, _tensor(quats), scales, colors[:, 3], harmonics_of(colors[:, :3]))
 
 
+class _NumPyScalar:
+    """Stands in for what pickles make NumPy's scalars of, such as a trainer's learning rates, which are never
+    needed: it takes every argument and does nothing."""
+
+    def __init__(self, *_: Any) -> None: ...
+
+    def __setstate__(self, _: Any) -> None: ...
+
+
+_SCALARS = (
+    *("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar", "numpy.dtype"),
+    "_codecs.encode",  # their bytes, in the pickles that torch.save writes
+)
+"""Names in pickles for which `_NumPyScalar` stands in."""
+
+
 def _checkpoint(path: Path) -> Splats:
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        with torch.serialization.safe_globals([(_NumPyScalar, name) for name in _SCALARS]):
+            state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         raise ValueError("it holds more than tensors, or is no checkpoint; nothing in it was run") from error
     if isinstance(state, dict) and isinstance(state.get("pipeline"), dict):

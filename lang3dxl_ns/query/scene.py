@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
@@ -197,12 +197,13 @@ class Scene(ViewedScene):
         if enlarged:
             rendering = replace(rendering, channels=composite(self.splats, small, channels, self.backend))
         foreground = None if name is None else self.file.photo(name).foreground()
-        maps = question.maps(rendering, foreground).cpu().float().numpy()
+        maps, masks = question.maps(rendering, foreground)
+        found = maps.cpu().float().numpy(), masks.cpu().numpy()
         seconds += time.perf_counter() - start
-        rows = zip(question.prompts, question.doubts, question.thresholds, maps, strict=True)
+        rows = zip(question.prompts, question.doubts, *found, question.thresholds, strict=True)
         return [
-            Match(prompt, self.synonyms(prompt), doubt, view, relevancy, level, seconds)
-            for prompt, doubt, level, relevancy in rows
+            Match(prompt, self.synonyms(prompt), doubt, view, relevancy, mask, level, seconds)
+            for prompt, doubt, relevancy, mask, level in rows
         ]
 
     @torch.no_grad()
@@ -352,7 +353,12 @@ class Scene(ViewedScene):
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 
-    def teach(self, word: str, examples: Example | Sequence[Example]) -> Scene:
+    def teach(
+        self,
+        word: str,
+        examples: Example | Sequence[Example],
+        selection: Bool[Tensor, " n"] | None = None,
+    ) -> Scene:
         """A scene that knows a word from examples, as `scene.words[word]`; this one doesn't change.
 
         `query`, `find`, `relevancy` and `export` of the new scene use what it learned wherever the word is
@@ -361,6 +367,7 @@ class Scene(ViewedScene):
         Args:
             word: the word, of any case.
             examples: marks in photos of the scene.
+            selection: the Gaussians that are the word, if known; default: those that the marks show.
 
         Raises:
             UserError: the marks show nothing or everything, or lie outside their photos.
@@ -373,6 +380,8 @@ class Scene(ViewedScene):
             return queries.relevancy_of_cosines(queries.cosines(features), 1.0)[0].logit()
 
         weights = [self._marked(example) for example in listed]
+        if selection is not None:
+            weights = [Weights(w.seen * selection, torch.zeros_like(w.seen), w.seen) for w in weights]
         engine = self.engine
         learned = learn(
             prompt.text, listed, weights, engine.features, margin, engine.head, engine.temperature

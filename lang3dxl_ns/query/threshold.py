@@ -11,21 +11,21 @@ from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 
 EVEN = 0.5
 """Relevancy where prompt and negatives fit equally well."""
-SHARE = 0.35
-"""Of the way from a prompt's relevancy for what is surely something else to its peak, where matches begin;
-chosen on landmarks for decisions (docs/lab/words.md)."""
-_ELSE = 0.25
-"""Quantile of the Gaussians that is surely something else; above it, large things begin."""
+SHARE = 0.4
+"""Of the way from the median Gaussian's relevancy to a prompt's peak, where matches begin; chosen on
+landmarks for decisions (docs/lab/words.md)."""
+COVERED = 0.3
+"""Share of a pixel that matching Gaussians must cover: most matches are small, and edges blend."""
 
 
 def match_thresholds(
     relevancy: Float[Tensor, "q n"], doubts: Sequence[float], named: Sequence[bool]
 ) -> tuple[float, ...]:
-    """For each prompt the relevancy above which pixels and Gaussians match.
+    """For each prompt the relevancy above which Gaussians match.
 
-    Small and thin things blur with their surroundings, in the crops that CLIP sees as in the pixels of a
-    view, and seldom beat every negative there. So what stands out in the scene matches: at most `EVEN` is
-    asked for, and that of doubtful prompts, whose peaks mean nothing.
+    Small and thin things blur with their surroundings in the crops that CLIP sees, and seldom beat every
+    negative there. So what stands out in the scene matches: at most `EVEN` is asked for, and that of doubtful
+    prompts, whose peaks mean nothing.
 
     Args:
         relevancy: of all Gaussians to the prompts.
@@ -34,7 +34,7 @@ def match_thresholds(
     """
     if relevancy.shape[1] == 0:
         return (EVEN,) * len(relevancy)
-    low = relevancy.kthvalue(1 + int(_ELSE * (relevancy.shape[1] - 1)), dim=1).values
+    low = relevancy.median(dim=1).values
     levels = (low + SHARE * (peaks(relevancy) - low)).clamp_max(EVEN).tolist()
     strict = [doubt > DOUBTFUL or names for doubt, names in zip(doubts, named, strict=True)]
     return tuple(EVEN if one else level for one, level in zip(strict, levels, strict=True))

@@ -1,5 +1,7 @@
 """Words for a finished splat, with its photos and without; and back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -83,6 +85,31 @@ def test_without_photos_the_splat_is_its_own(place):
     assert len(scene.photos) == 6
     assert (place / ".alone.views" / "images" / "0000.png").is_file()
     assert float(scene.codes.isfinite().all(1).float().mean()) > 0.5
+
+
+class Upper:
+    """A segmenter that finds the upper half of every picture."""
+
+    def segment(self, image, prompts):
+        return torch.arange(len(image))[:, None].expand(image.shape[:2]) < len(image) // 2
+
+
+@pytest.mark.slow
+def test_a_segmented_word_is_kept_in_the_scene(place, monkeypatch):
+    monkeypatch.setattr("lang3dxl_ns.attachment.attach.find_text_segmenter", lambda *names: names)
+    monkeypatch.setattr("lang3dxl_ns.attachment.attach.load_text_segmenter", lambda *_: Upper())
+    config = replace(SETTINGS, segment=("upper part",))
+    attach(place / "box.ply", place / "photos", place / "segmented.scene", config)
+    scene = read_scene(place / "segmented.scene")
+    assert list(scene.words) == ["upper part"] and scene.words["upper part"].examples
+
+
+def test_a_segmenter_that_is_not_there_is_told_before_any_work(place, tmp_path):
+    model = replace(SETTINGS.preparation, foreground_model=str(tmp_path / "none"))
+    config = replace(SETTINGS, segment=("windows",), preparation=model)
+    with pytest.raises(UserError, match="--foreground-model"):
+        attach(place / "box.ply", place / "photos", tmp_path / "a.scene", config)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

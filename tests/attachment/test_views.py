@@ -64,6 +64,17 @@ def test_no_camera_stands_in_matter():
     assert torch.tensor([2.0, -2.0, 0.5]) in free
 
 
+def test_views_around_a_scene_leave_its_parts_their_surroundings():
+    """They start at 1.6 radii and end at 5, looking at its inner half from above the ground."""
+    extent, draw = Extent.of(SPLATS, "z"), torch.Generator().manual_seed(0)
+    floor = extent.center + (extent.ground + 0.08 * extent.radius) * extent.up
+    for _ in range(100):
+        place, target = views._around(extent, draw)
+        assert 1.6 - 1e-4 <= float((place - floor).norm()) / extent.radius <= 5 + 1e-4
+        assert float((target - extent.center).abs().max()) <= 0.5 * extent.radius + 1e-5
+        assert float((place - floor) @ extent.up) >= -1e-5
+
+
 def test_a_room_is_seen_from_within():
     """The box without anything around it, from which most places have its top above them."""
     room = Extent(torch.from_numpy(CENTER).float(), 0.6, torch.tensor([0.0, 0, 1]), -0.5)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.heat_maps import color, heat, overlay
+from lang3dxl_ns.query.heat_maps import color, heat, overlay, strongest, tinted
 
 RELEVANCY = torch.tensor([[0.0, 0.4, 0.5], [0.55, 0.6, 0.7]])
 IMAGE = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(0))
@@ -12,7 +12,6 @@ IMAGE = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(0))
 
 def test_heat_starts_at_the_threshold_and_ends_at_the_highest():
     torch.testing.assert_close(heat(RELEVANCY), torch.tensor([[0.0, 0.0, 0.0], [0.25, 0.5, 1.0]]))
-    torch.testing.assert_close(heat(RELEVANCY, highest=0.9)[1], torch.tensor([0.125, 0.25, 0.5]))
 
 
 def test_a_map_below_the_threshold_is_cold():
@@ -20,11 +19,27 @@ def test_a_map_below_the_threshold_is_cold():
 
 
 def test_only_what_matches_is_painted():
-    picture = overlay(IMAGE, RELEVANCY)
+    mask = torch.tensor([[False] * 3, [True] * 3])
+    picture = overlay(IMAGE, RELEVANCY, mask)
     assert torch.equal(picture[0], IMAGE[0])
     assert (picture[1] != IMAGE[1]).any(1).all()
     assert picture.min() >= 0 and picture.max() <= 1
-    assert torch.equal(overlay(IMAGE, RELEVANCY, opacity=0.0), IMAGE)
+    assert torch.equal(overlay(IMAGE, RELEVANCY, mask, opacity=0.0), IMAGE)
+
+
+def test_a_peak_outside_of_what_matches_does_not_cool_it():
+    peak = torch.where(torch.tensor([[True, False, False], [False] * 3]), 1.0, RELEVANCY)
+    mask = RELEVANCY > 0.5
+    assert torch.equal(overlay(IMAGE, peak, mask), overlay(IMAGE, RELEVANCY, mask))
+
+
+def test_the_most_relevant_prompt_that_matches_a_place_colors_it():
+    maps = torch.tensor([[[0.9, 0.6, 0.3]], [[0.5, 0.7, 0.8]]])
+    masks = torch.tensor([[[False, True, False]], [[True, True, False]]])
+    best, which = strongest(maps, masks)
+    assert best.tolist() == [[0.5, pytest.approx(0.7), 0.0]] and which.tolist()[0][:2] == [1, 1]
+    picture = tinted(IMAGE[:1], maps, masks, 0.4)
+    assert torch.equal(picture[0, 2], IMAGE[0, 2]) and (picture[0, :2] != IMAGE[0, :2]).any(1).all()
 
 
 def test_colors_are_matplotlibs():

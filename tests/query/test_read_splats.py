@@ -1,6 +1,7 @@
 """Splats of other programs: one scene, however it is written; and files that are none."""
 
 import gzip
+import pickle
 import struct
 
 import numpy as np
@@ -143,6 +144,18 @@ def test_checkpoints_of_gsplat_and_splatfacto_are_read(tmp_path):
     found = read_splats(tmp_path)
     assert_alike(found, splats)
     assert found.antialiased
+
+
+def test_a_checkpoint_that_holds_numpy_scalars_is_read(tmp_path):
+    """As learning rates of schedulers are."""
+    splats = some_splats()
+    rates = {"lr": np.float64(0.1), "steps": [np.int32(3), np.float32(2)], "big": np.dtype(">f8").type(1)}
+    torch.save(splatfacto_state(splats) | {"optimizers": rates}, tmp_path / "step-1.ckpt")
+    assert_alike(read_splats(tmp_path / "step-1.ckpt"), splats)
+    torch.save(gsplat_state(splats) | {"rate": rates["lr"]}, tmp_path / "a.pt")
+    assert_alike(read_splats(tmp_path / "a.pt"), splats)
+    with pytest.raises(pickle.UnpicklingError):  # elsewhere they stay refused
+        torch.load(tmp_path / "a.pt", weights_only=True)
 
 
 def test_a_splatfacto_of_one_color_per_gaussian_stores_logits_of_it(tmp_path):

@@ -47,6 +47,18 @@ def wider(mask: torch.Tensor) -> np.ndarray:
     return F.max_pool2d(mask[None].float(), 3, 1, 1)[0].bool().numpy()
 
 
+def test_a_view_matches_where_matching_gaussians_cover_it(scene):
+    """Not by its own relevancies, in which a strong Gaussian outweighs many that don't match."""
+    question = scene.ask("dome; window")
+    view = scene.draw(scene.camera("all/0003.jpg"), question.channels)
+    covered = composite(scene.splats, view.camera, question.gaussians.T.float()).permute(2, 0, 1)
+    relevancy, masks = question.maps(view)
+    assert masks.any() and torch.equal(masks, (covered >= 0.3) & (view.alpha >= 0.3))
+    stricter = replace(question, thresholds=(1.0, 1.0))
+    assert not stricter.maps(scene.draw(view.camera, stricter.channels))[1].any()
+    torch.testing.assert_close(stricter.maps(scene.draw(view.camera, stricter.channels))[0], relevancy)
+
+
 def test_words_are_found_where_they_are_painted(scene):
     matches = scene.query(["dome; window"], "all/0003.jpg")
     for match, word in zip(matches, (1, 2), strict=True):
@@ -109,7 +121,7 @@ def test_a_view_of_at_most_the_training_size_takes_one_pass(scene, monkeypatch, 
     assert drawn == [size, 96][:passes]
     if passes == 1:
         apart = composite(scene.splats, match.view.camera, question.channels)
-        expected = question.maps(replace(match.view.rendering, channels=apart))[0]
+        expected = question.maps(replace(match.view.rendering, channels=apart))[0][0]
         np.testing.assert_allclose(match.relevancy, expected, atol=1e-6)
 
 

@@ -43,6 +43,13 @@ def test_negatives_of_ones_own_have_to_be_beaten():
     assert plain < 0.49 < named == EVEN
 
 
+def test_a_large_thing_is_told_apart_from_the_median_not_from_what_it_is_least_like():
+    """In a scene whose larger half has 0.3, matches begin above that."""
+    relevancy = torch.cat([torch.zeros(400), torch.full((550,), 0.3), torch.full((50,), 0.5)])[None]
+    (threshold,) = match_thresholds(relevancy, [0.0], [False])
+    assert threshold == pytest.approx(0.3 + SHARE * 0.2)
+
+
 def test_the_order_of_gaussians_does_not_matter():
     relevancy = torch.rand(3, 999, generator=torch.Generator().manual_seed(0))
     shuffled = relevancy[:, torch.randperm(999)]

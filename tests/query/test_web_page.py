@@ -341,7 +341,7 @@ def test_a_typed_word_lights_up_where_it_is(page, scene):
     changed = cells(np.abs(picture(page) - before).max(2) > 40)
     question = scene.ask("dome")  # a page composites at its own size
     drawn = scene.draw(scene.camera(camera, SIDE), question.channels)
-    there = cells((question.maps(drawn)[0] > question.thresholds[0]).numpy())
+    there = cells(question.maps(drawn)[1][0].numpy())
     assert there.sum() >= 20 and (changed & there).sum() > 0.9 * (changed | there).sum()
     page.get_by_role("button", name="Remove dome").click()
     assert np.abs(picture(page) - before).max() <= 2

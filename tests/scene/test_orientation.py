@@ -1,5 +1,6 @@
 """Laws of orientation: a photo turned as a whole shows the same, wherever its pixels were stored."""
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
+from lang3dxl_ns.preparation.photo_collection import read_transforms
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 from lang3dxl_ns.scene.orientation import turned_lens, upright
@@ -65,6 +67,25 @@ def test_a_photo_stored_lying_is_read_as_the_same_photo_stored_upright(tmp_path,
     assert (lying.read_uint8() == straight.read_uint8()).all()
     assert (lying.read_file(30) == straight.read_file(30)).all()
     assert (lying.read_mask() == straight.read_mask()).all()
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_lying_photo_of_a_transforms_json_is_upright_with_its_camera(tmp_path, quarters):
+    """The file's poses and lenses are of the pixels as stored."""
+    stored, seen = tracked(), upright(tracked(), (60, 40), quarters)
+    pixels = np.random.default_rng(0).integers(0, 256, (seen.height, seen.width, 3), dtype=np.uint8)
+    store(tmp_path / "a.png", pixels, quarters)
+    pose = np.linalg.inv(np.vstack([stored.camera_from_world, [0, 0, 0, 1]]))
+    pose[:3, 1:3] *= -1  # OpenGL's axes
+    frame = {"file_path": "a.png", "transform_matrix": pose.tolist()}
+    lens = {"w": 60, "h": 40, "fl_x": LENS.fx, "fl_y": LENS.fy, "cx": LENS.cx, "cy": LENS.cy}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+    photos, left_out, found = read_transforms(tmp_path / "transforms.json")
+    (photo,) = photos.values()
+    assert not left_out and (photo.read_uint8().numpy() == pixels).all()
+    plain = turned_lens(replace(LENS, distortion=()), quarters)
+    assert photo.lens == plain and found.photos["a.png"].lens == plain
+    np.testing.assert_allclose(found.photos["a.png"].camera_from_world, seen.camera_from_world, atol=1e-9)
 
 
 @pytest.mark.parametrize("quarters", [1, 3])

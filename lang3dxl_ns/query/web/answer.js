@@ -1,7 +1,7 @@
 // Answers: cosines to relevancy, the threshold from which a place matches, and doubt, as in Python's query/.
 
 const CLEAR = 0.55; // relevancy from which a word names a place that is else sky, or nothing in particular
-const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.35, ELSE = 0.25, BEST = 0.005, LEAST_PEAK = 0.1;
+const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.4, BEST = 0.005, LEAST_PEAK = 0.1;
 const TIE = 0.999; // numbers of 16 bits: what is equal in Python may differ by less than this
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
@@ -45,7 +45,7 @@ export class Answers {
     const { unrelated } = this.words;
     const asWell = unrelated.filter((other) => other >= fit * TIE).length;
     doubt ??= fit < LEAST_PEAK ? 1 : (1 + asWell) / (1 + unrelated.length);
-    const low = sorted[Math.floor(ELSE * (count - 1))];
+    const low = sorted[(count - 1) >> 1]; // the median, as torch takes it
     const own = doubt > DOUBTFUL || strict ? EVEN : Math.min(low + SHARE * (fit - low), EVEN);
     const level = threshold ?? own, { foreground } = this;
     const confined = foreground ? relevancy.map((value, i) => value * foreground[i]) : relevancy;

@@ -1,0 +1,81 @@
+"""Words taught by a segmenter: its masks of the photos, lifted to the Gaussians by votes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lang3dxl_ns.common.console import progress, say
+from lang3dxl_ns.preparation.segmentation import TextSegmenter
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.teach import MARK_SIDE, Example
+from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
+from lang3dxl_ns.rendering.render import composite
+from lang3dxl_ns.scene.camera import Camera, resized
+from lang3dxl_ns.scene.photo import Photo
+
+_SIDE = 800
+"""Longer side in pixels of the photos that are segmented."""
+_EXAMPLES = 12
+"""Photos that teach the word, at most: those that show most of it."""
+_LEAST, _MOST = 1e-3, 0.9
+"""Share of the scene's pixels in a photo that the word fills, where the photo teaches it."""
+
+
+def segmented(
+    scene: Scene,
+    word: str,
+    segmenter: TextSegmenter,
+    photos: Sequence[Photo],
+    cameras: Mapping[str, Camera],
+) -> Scene:
+    """A scene that was taught a word by a segmenter; the same scene, with a message, if that finds nothing.
+
+    Each photo votes about the Gaussians that it shows, so an error in one photo is outvoted by the others.
+    The word is then learned from the Gaussians with a majority, as from marks of a person.
+
+    Args:
+        scene: the scene.
+        word: what to look for.
+        segmenter: finds it in photos.
+        photos: those of the scene.
+        cameras: of each photo, at the file's resolution, in the scene's frame.
+    """
+    masks: dict[str, Bool[Tensor, "h w"]] = {}
+
+    def views() -> Iterator[tuple[Composite, Pixels]]:
+        with progress(f"looking for {word}", len(photos)) as advance:
+            for photo in photos:
+                masks[photo.name] = segmenter.segment(photo.read_file(_SIDE), [word])
+                marked = photo.undistort_labels(masks[photo.name].int()) == 1
+                camera, values = resized(cameras[photo.name], _SIDE), marked[..., None].to(like)
+                foreground = photo.read_mask(camera.width / photo.width)
+                drawn = partial(composite, scene.splats, camera, backend=scene.backend)
+                yield drawn, Pixels.of([values], (camera.height, camera.width), foreground)
+                advance()
+
+    like = scene.splats.means
+    chosen = gather(len(scene.splats), views(), 1, like)[0][:, 0].to(like) > 0.5
+    found = [photo for photo in photos if masks[photo.name].any()]
+    shares = {photo.name: _share(scene, photo, cameras[photo.name], chosen) for photo in found}
+    teaching = [name for name, share in shares.items() if _LEAST <= share <= _MOST]
+    if not teaching:
+        say(f"the segmenter finds no {word} that the photos agree on: the scene isn't taught this word")
+        return scene
+    best = sorted(teaching, key=lambda name: -shares[name])[:_EXAMPLES]
+    say(f"{word}: {int(chosen.sum()):,} Gaussians by the votes of {len(photos)} photos")
+    return scene.teach(word, [Example(name, masks[name].numpy()) for name in best], selection=chosen)
+
+
+def _share(scene: Scene, photo: Photo, camera: Camera, chosen: Bool[Tensor, " n"]) -> float:
+    """Share of the scene's pixels in a photo's foreground that some Gaussians fill."""
+    small = resized(camera, MARK_SIDE)
+    both = torch.stack([chosen, torch.ones_like(chosen)], dim=1).to(scene.splats.means)
+    drawn = composite(scene.splats, small, both, scene.backend)
+    foreground = photo.read_mask(small.width / photo.width)
+    filled = (drawn if foreground is None else drawn[foreground.to(drawn.device)]).flatten(0, -2).sum(0)
+    return float(filled[0] / filled[1].clamp_min(1e-6))
