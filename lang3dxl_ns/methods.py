@@ -16,8 +16,8 @@ from nerfstudio.plugins.types import MethodSpecification
 from lang3dxl_ns.common.settings_help import asked_for_all
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
-from lang3dxl_ns.plugin.saved_config import check_command_line
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+from lang3dxl_ns.query.run_settings import check_command_line
 
 check_command_line(sys.argv[1:])
 
@@ -115,13 +115,13 @@ def _paper_config() -> Lang3DXLTrainerConfig:
     config = _config("lang3dxl-paper", 70_000)
     x = 1 / 70_000
     model, data, groups = config.pipeline.model, config.pipeline.datamanager, config.optimizers
-    model.decoder.name, model.semantic_field.preset = "paper", "paper"
+    model.decoder.name = "paper"
     model.decode_size, model.dense_weight = (80, 120), 0.5
     model.dense_compare, model.mask_dense = "target", False
     model.feature_gradient_to_geometry, model.semantic_ramp = True, 15_000 * x
     model.densify_from, model.densify_until, model.densify_every = 2_000 * x, 15_000 * x, 2_000 * x
     model.densify_size_thresh = 0.2 * EXTENT
-    model.view_dependence, model.camera_optimization, model.sky_gaussians = "on", "off", 0
+    model.view_dependence, model.camera_optimization = "on", "off"
     model.appearance.use, model.appearance.preset, model.appearance.opacity_shift = "on", "paper", True
     data.scale_mode, data.pixel_distance, data.camera_res_scale_factor = "physical", "mean-inner", 0.5
     data.regions, data.sam = "sam", "facebook/sam-vit-huge"

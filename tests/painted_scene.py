@@ -11,7 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.rendering.splats import Splats, harmonics_of
@@ -129,3 +131,16 @@ def painted_scene(cache: Path | None = None, config: QueryConfig | None = None, 
     }
     parts |= {"encode_texts": encode_texts, "cache": cache, "config": config}
     return Scene(**{**parts, **changes})
+
+
+def painted_looks(seed: int = 0) -> Looks:
+    """A look of its own for every training photo."""
+    generator = torch.Generator().manual_seed(seed)
+    names = [photo.name for photo in painted_file().photos if photo.split == "train"]
+    field = AppearanceField(AppearanceConfig(), names, torch.zeros(3), 5.0, generator=generator)
+    with torch.no_grad():
+        field.output.weight.normal_(0, 0.2, generator=generator)
+        for photo in painted_file().photos[:3]:
+            pose = photo.camera.view_matrix
+            field.remember(photo.name, -pose[:3, :3].T @ pose[:3, 3], pose[2, :3])
+    return Looks(field.eval().requires_grad_(False))

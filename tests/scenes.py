@@ -166,3 +166,13 @@ def speckled(points: np.ndarray) -> np.ndarray:
         draws = np.sin(cells @ [[127.1, 269.5, 113.5], [311.7, 183.3, 271.9], [74.7, 246.1, 124.6]]) * 43758.5
         colors = colors + 0.5 * (draws % 1)
     return colors
+
+
+def view_of(camera):
+    """One of our cameras as a nerfstudio camera."""
+    from lang3dxl_ns.plugin.cameras import to_nerfstudio
+    from lang3dxl_ns.scene.camera import Lens, camera_to_world
+
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    lens = Lens(camera.width, camera.height, fx, fy, cx, cy)
+    return to_nerfstudio([lens], camera_to_world(camera.view_matrix.cpu())[None])

@@ -9,8 +9,6 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
 USER_PAGES = sorted(path for path in DOCS.glob("*.md") if path.name != "changelog.md")
-UNDIVIDED = DOCS / "scale.md"
-"""Still holds its measurements: an exception until they are in docs/lab."""
 LAB_PAGES = sorted((DOCS / "lab").rglob("*.md"))
 PAGES = [README, ROOT / "lab" / "README.md", DOCS / "changelog.md", *USER_PAGES, *LAB_PAGES]
 
@@ -55,14 +53,14 @@ def test_the_readme_has_at_most_800_words():
 
 @pytest.mark.parametrize("page", USER_PAGES, ids=name)
 def test_a_user_page_has_at_most_900_words(page):
-    assert words(page.read_text()) <= (1_050 if page == UNDIVIDED else 900)
+    assert words(page.read_text()) <= 900
 
 
 def test_user_pages_together_have_at_most_13_000_words():
     assert sum(words(page.read_text()) for page in USER_PAGES) <= 13_000
 
 
-@pytest.mark.parametrize("page", [page for page in USER_PAGES if page != UNDIVIDED], ids=name)
+@pytest.mark.parametrize("page", USER_PAGES, ids=name)
 def test_a_user_page_is_not_a_notebook(page):
     assert not NOTEBOOK.findall(page.read_text())
 

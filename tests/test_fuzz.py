@@ -24,12 +24,12 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.methods import lang3dxl
-from lang3dxl_ns.plugin.load_scene import check_checkpoint, read_checkpoint
-from lang3dxl_ns.plugin.saved_config import read_config
-from lang3dxl_ns.plugin.viewer.guard import Guard, is_camera
+from lang3dxl_ns.plugin.trainer_config import read_config
 from lang3dxl_ns.preparation.regions import FolderRegions
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.query.run_checkpoint import check_checkpoint, read_checkpoint
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
+from lang3dxl_ns.query.web.viewer_guard import Guard, is_camera
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.companions import companion, inside

@@ -204,7 +204,7 @@ def test_out_of_memory_ends_in_three_settings_that_help(trained, monkeypatch):
 def test_a_resumed_run_goes_on(trained):
     first = trained(4, semantics=False, mixed_precision=True)
     again = trained(6, semantics=False, mixed_precision=True, load_dir=first.checkpoint_dir)
-    assert again.first_iteration == 4
+    assert again._start_step == 4
     before, after = (t.pipeline.model.gauss_params["features_dc"].detach().cpu() for t in (first, again))
     assert not torch.equal(before, after[: len(before)])
 
@@ -338,8 +338,9 @@ def test_export(default, tmp_path, gpu):
 def test_a_conversation_in_the_viewer(default, gpu):
     from contextlib import nullcontext
 
-    from lang3dxl_ns.plugin.cameras import view_of
-    from lang3dxl_ns.plugin.viewer.session import Conversation
+    from scenes import view_of
+
+    from lang3dxl_ns.query.conversation import Conversation
 
     pipeline = default.pipeline
     model = pipeline.model.eval()

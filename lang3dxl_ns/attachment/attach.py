@@ -22,6 +22,7 @@ from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
@@ -118,6 +119,7 @@ def attach(
             for word in config.segment:
                 scene = segmented(scene, word, segmenter, collection.photos, cameras)
     if place is not None:
+        scene = with_words_of(scene, place)
         written = write_scene(place, scene, _provenance(path, len(collection.photos), what))
         say(f"Wrote {written / 1e6:.1f} MB to {place}")
     return scene

@@ -38,10 +38,6 @@ class DecoderConfig:
     langsplat: a per-scene autoencoder's three numbers. direct: the whole feature on every Gaussian. lifting:
     targets averaged onto the Gaussians, rendered uncompressed."""
 
-    start: Literal["noise", "gathered"] = "noise"
-    """paper: initial codes. noise: nearly equal, as published. gathered: when the warm-up ends, the principal
-    components of the CLIP targets, gathered onto the Gaussians; rare things then have codes of their own."""
-
     compression: CompressionConfig = field(default_factory=CompressionConfig)
     """gathered: compression of gathered features to codes."""
 

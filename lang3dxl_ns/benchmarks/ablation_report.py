@@ -110,8 +110,13 @@ def markdown(data: Mapping[str, Any]) -> str:
     """The report in markdown."""
     parts = []
     for steps, rows in data["lengths"].items():
-        tables = (_table(rows), _scene_table(rows, data), _category_table(rows, data))
-        parts += [f"## {steps} iterations", *tables]
+        tables = (
+            _table(rows),
+            _scene_table(rows, data),
+            _family_table(rows, data),
+            _category_table(rows, data),
+        )
+        parts += [f"## {steps} iterations", *filter(None, tables)]
     reasons = [(r["label"], why) for rows in data["lengths"].values() for r in rows for why in r["not_run"]]
     notes = "\n".join(f"- {label}: {why}" for label, why in dict.fromkeys(reasons))
     return f"""# Ablation
@@ -168,6 +173,27 @@ def _scene_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> 
     return markdown_table(
         ["mAP", *scenes],
         [[row["label"], *(_cell(row["scenes"][s].get(quality), ".3f") for s in scenes)] for row in rows],
+    )
+
+
+def _family_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> str | None:
+    """Means over the scenes of one family (cathedral-700, -701 …), and the deviation between them."""
+    families: dict[str, list[str]] = {}
+    for scene in data["scenes"]:
+        families.setdefault(scene.rpartition("-")[0], []).append(scene)
+    if max(map(len, families.values())) < 2:
+        return None
+    quality = data["quality"]
+    values = {
+        row["label"]: [
+            spread([row["scenes"][s][quality]["mean"] for s in scenes if quality in row["scenes"][s]])
+            for scenes in families.values()
+        ]
+        for row in rows
+    }
+    return markdown_table(
+        ["mAP by family", *(name or "other" for name in families)],
+        [[label, *(_cell(value, ".3f") for value in found)] for label, found in values.items()],
     )
 
 

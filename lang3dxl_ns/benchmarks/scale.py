@@ -21,6 +21,8 @@ from lang3dxl_ns.common.reports import (
 from lang3dxl_ns.common.settings_help import showing
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
     from lang3dxl_ns.scene.photo import Photo
 
@@ -30,6 +32,10 @@ _STEP_S = 0.015
 """A training step on a GPU, which reading ahead must keep up with."""
 _STARTED = 2_000
 """Photos of the start that is timed."""
+_LANDMARK_STEPS = 200
+"""Training of the landmark whose features are compressed."""
+_NOISE = 0.15
+"""Noise of its repeated features, in their deviations."""
 _VISION: dict[str, dict[str, int]] = {
     "B/32": {"patch_size": 32},
     "B/16": {"patch_size": 16},
@@ -42,7 +48,7 @@ _VISION: dict[str, dict[str, int]] = {
     },
 }
 """CLIP's image towers, as far as they differ from transformers' default."""
-Part = Literal["photos", "start", "crops", "run"]
+Part = Literal["photos", "start", "crops", "compression", "run"]
 _alone = partial(in_own_process, preload=("lang3dxl_ns.methods", "pycolmap", "transformers"))
 
 
@@ -65,16 +71,17 @@ class Stage:
 @showing("out", "parts")
 @dataclass
 class ScaleBenchmark:
-    """Reading, preparation and training of photos of some 11 megapixels, stage by stage."""
+    """Reading, preparation and training of photos of some 11 megapixels, and compression, stage by stage."""
 
     out: Path
     """Folder for scale.md, scale.json and the scenes (kept, and used again)."""
-    parts: tuple[Part, ...] = ("photos", "start", "crops", "run")
-    """What is measured: reading; a start with everything prepared; encoding of crops; whole runs."""
+    parts: tuple[Part, ...] = ("photos", "start", "crops", "compression", "run")
+    """What is measured: reading; a start with everything prepared; encoding of crops; compression of a
+    landmark's features, repeated with noise; whole runs."""
     photos: int = 24
     """Photos made."""
     gaussians: tuple[int, ...] = (20_000, 300_000, 1_000_000)
-    """Numbers of Gaussians, of a run each."""
+    """Numbers of Gaussians, compressed and of a run each."""
     clips: tuple[str, ...] = ("builtin", "B/32", "B/16", "L/14")
     """CLIPs whose crops are timed: the built-in one, and CLIP's sizes with random weights."""
     steps: int = 5
@@ -87,6 +94,7 @@ class ScaleBenchmark:
             "photos": [partial(_alone, _reading, self.out, self.photos)],
             "start": [partial(_alone, _start, self.out)],
             "crops": [partial(_alone, _crops, clip) for clip in self.clips],
+            "compression": [partial(_alone, _compression, self.out, n) for n in self.gaussians],
             "run": [partial(_alone, _run, self.out, self.photos, n, self.steps) for n in self.gaussians],
         }
         for part in self.parts:
@@ -138,22 +146,24 @@ def _reading(out: Path, count: int) -> list[Stage]:
     """Decoding once, reading the copies, and waiting for them in steps, with a tenth in memory."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from lang3dxl_ns.plugin.photo_cache import PhotoCache
+    from lang3dxl_ns.preparation.photo_cache import PhotoCache
     from lang3dxl_ns.preparation.store import FeatureStore
     from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 
     photos = _photos(_scene(out, count))
-    working = WorkingPhotos(FeatureStore(out / f"working-{time.time_ns()}"))
+    store = FeatureStore(out / f"working-{time.time_ns()}")
+    working = WorkingPhotos(store)
     amount, repeated = f"{count} photos", photos * 5
     decoded = _measured(
         "decode, shrink, keep", amount, lambda: list(map(working.read, photos)), partial(_each, count)
     )
+    megabytes = mean(path.stat().st_size for path in store.root.rglob("*.jpg")) / 1e6
     with ThreadPoolExecutor(2) as pool:
         read = _measured(
             "read the copies, 2 threads",
             f"{len(repeated)} photos",
             lambda: [image.shape for image in pool.map(working.read, repeated)],
-            lambda cpu: f"{len(repeated) / cpu:.0f} a second of one core",
+            lambda cpu: f"{len(repeated) / cpu:.0f} a second of one core; {megabytes:.2f} MB",
         )
     size = sum(working.read(photo).nbytes for photo in photos)
     cache = PhotoCache(
@@ -229,6 +239,69 @@ def _crops(clip: str) -> list[Stage]:
     return [_measured(f"encode with {clip}", f"{batch} crops", lambda: encode(crops), each)]
 
 
+def _landmark_features(path: Path) -> tuple[Tensor, Tensor]:
+    """CLIP features gathered onto a small landmark's Gaussians, and their mass; kept in a file."""
+    from safetensors.torch import load_file, save
+
+    from lang3dxl_ns.baselines.lifting import LiftedFeatures
+    from lang3dxl_ns.common.files import write_atomically
+    from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
+    from lang3dxl_ns.demo.landmark.scene_writer import write_scene
+    from lang3dxl_ns.methods import run_config
+    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
+
+    class Kept(LiftedFeatures):
+        def learn_gaussians(self, features, mass, *arguments, **others):
+            seen = mass > 0
+            write_atomically(path, save({"features": features[seen], "mass": mass[seen]}))
+            return super().learn_gaussians(features, mass, *arguments, **others)
+
+    if not path.exists():
+        data = path.parent / "landmark"
+        if not data.is_dir():
+            write_scene(DemoScene(data, seed=604, family="hall", photos=24, test_views=0))
+        config = run_config(data, path.parent / "runs", "landmark", _LANDMARK_STEPS, "builtin", "builtin")
+        settings = config.pipeline.datamanager
+        settings.camera_res_scale_factor, settings.foreground = 0.5, "none"
+        config.set_timestamp()
+        config.save_config()
+        trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        for step in range(_LANDMARK_STEPS):
+            trainer.pipeline.model.step_cb(trainer.optimizers, step)
+            trainer.train_iteration(step)
+        field = trainer.pipeline.model.semantic_field
+        assert field is not None
+        trainer.pipeline.model.semantic_field = Kept(field.clip_dim, 0)
+        trainer.pipeline.learn_words()
+    kept = load_file(path)
+    return kept["features"], kept["mass"]
+
+
+def _compression(out: Path, gaussians: int) -> list[Stage]:
+    """The landmark's features, repeated until they are enough, with noise of 0.15 of their deviation."""
+    import torch
+    import torch.nn.functional as F
+
+    from lang3dxl_ns.components.compression import CompressedField
+    from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+
+    features, mass = _landmark_features(out / "features.safetensors")
+    rows, draw = torch.arange(gaussians) % len(features), torch.Generator().manual_seed(1)
+    clean = features[rows]
+    noisy = clean + _NOISE * features.std(0) * torch.randn(clean.shape, generator=draw)
+    mean = noisy.mean(0)
+    limit = float(F.cosine_similarity(clean - mean, noisy - mean, dim=1).mean())
+    del clean
+    field = CompressedField(SemanticFieldConfig("short"), features.shape[1])
+
+    def said(_: float) -> str:
+        return f"{field.learned}; of features and noise: {limit:.3f}"
+
+    work = partial(field.learn_gaussians, noisy, mass[rows])
+    return [_measured("compress", f"{gaussians:,} Gaussians", work, said)]
+
+
 def _run(out: Path, photos: int, gaussians: int, steps: int) -> list[Stage]:
     """A run: preparation (none the second time), steps, words."""
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
@@ -242,6 +315,7 @@ def _run(out: Path, photos: int, gaussians: int, steps: int) -> list[Stage]:
 
     def train() -> None:
         for step in range(steps):
+            pipeline.model.step_cb(trainer.optimizers, step)
             trainer.train_iteration(step)
 
     trained = _measured(f"{steps} steps", amount, train, partial(_each, steps))

@@ -17,12 +17,13 @@ from PIL import Image
 from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
+from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomically
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.coco import CocoLabels
 from lang3dxl_ns.query.doubt import doubtful
+from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.match import Match, save_picture, together
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import read_camera_path
@@ -30,7 +31,7 @@ from lang3dxl_ns.query.scene import QueryConfig, Scene
 from lang3dxl_ns.query.scene_file import Provenance, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
 from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
-from lang3dxl_ns.query.vocabulary import read_vocabulary, whole_words
+from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
 
@@ -243,12 +244,15 @@ class Export:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         if self.scene_file is not None:
-            size = write_scene(self.scene_file, scene, self._told())
+            kept = with_words_of(scene, self.scene_file)
+            size = write_scene(self.scene_file, kept, self._told())
             say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: lang3dxl query {self.scene_file}")
         if self.web is not None:
-            own = read_vocabulary(self.vocabulary) if self.vocabulary else ()
+            own = read_names(self.vocabulary, "words") if self.vocabulary else ()
             page = Page(scene, prompts, own, self._clip_words(scene.file.clip), self._told(), self.look)
             size = write_page(page, self.web)
+            for left_out in page.left_out:
+                say(f"{left_out}.")
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
         if self.out is not None:
             text = prompts[0] if prompts else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,7 +88,7 @@ class Words:
             scene = forgotten(scene, name)
         if self.load is not None:
             for word in load_words(self.load):
-                scene = carried(scene, word)
+                scene = scene.carrying(word)
         words = list(scene.words.values())
         if self.forget or self.load is not None:
             keep_words(file, words)
@@ -100,20 +100,6 @@ class Words:
             say("This scene was taught no word: lang3dxl teach --word doors --photo NAME --at X,Y")
         for word in words:
             say(*described(word))
-
-
-def carried(scene: Scene, word: TaughtWord) -> Scene:
-    """The scene with a word that was taught elsewhere: learned anew where its photos are the same, otherwise
-    as it was learned there.
-
-    Raises:
-        UserError: it was learned with another CLIP.
-    """
-    if word.examples and word.scene == Path(scene.file.data).name:
-        return scene.teach(word.name, word.examples)
-    if word.clip != scene.file.clip_identity:
-        raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
-    return scene.with_words([*scene.words.values(), replace(word, examples=(), precision={})])
 
 
 def opened(path: Path | None) -> tuple[Scene, Path]:

@@ -10,6 +10,7 @@ import tyro
 
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.files import read_names
 
 
 @dataclass(kw_only=True)
@@ -35,12 +36,11 @@ class View:
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene, provenance_of
-        from lang3dxl_ns.query.vocabulary import read_vocabulary
         from lang3dxl_ns.query.web.serve import PageServer
         from lang3dxl_ns.query.web.write_page import Page
 
         check_address(self.host, self.port)  # fail now rather than after the work
-        words = read_vocabulary(self.vocabulary) if self.vocabulary else ()
+        words = read_names(self.vocabulary, "words") if self.vocabulary else ()
         scene = load_scene(self.scene, clip=self.clip)
         page = Page(scene, self.text, words, provenance=provenance_of(self.scene), live=True)
         server = PageServer(page, self.host, self.port)

@@ -150,16 +150,17 @@ def slugs(texts: Sequence[str]) -> list[str]:
     return found
 
 
-def read_names(path: Path) -> list[str]:
-    """Photo names from a text file, one per line; blank lines and comments (#) are skipped.
+def read_names(path: Path, what: str = "photos") -> tuple[str, ...]:
+    """Names of photos, or other texts (`what`, for messages), from a text file, one per line and each once;
+    blank lines and comments (#) are skipped.
 
     Raises UserError for a file that can't be read or is empty.
     """
     try:
         lines = read_text(expanded(path)).splitlines()
     except (OSError, ValueError) as error:
-        raise UserError(f"the list of photos {path} can't be read ({error})") from error
-    names = [name for line in lines if (name := line.partition("#")[0].strip())]
+        raise UserError(f"the list of {what} {path} can't be read ({error})") from error
+    names = tuple(dict.fromkeys(name for line in lines if (name := line.partition("#")[0].strip())))
     if not names:
-        raise UserError(f"the list of photos {path} is empty: write one name per line")
+        raise UserError(f"the list of {what} {path} is empty: write one per line")
     return names

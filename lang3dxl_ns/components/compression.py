@@ -9,8 +9,10 @@ its feature, so that the work beyond the sample is one search per Gaussian.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import count
 
 import torch
 import torch.nn.functional as F
@@ -35,6 +37,8 @@ _ROWS = 16_384
 """Gaussians at a time, to bound memory."""
 _SECONDS_PER_DRAW, _SECONDS_PER_GAUSSIAN = 1e-5, 1e-4
 """Of one core, to announce how long it will take."""
+_MOST_GROWTH = 3
+"""Beyond, time grows and the features hardly come nearer (docs/scale.md)."""
 _SEARCHES = (0.4, 0.6, 0.8)
 """Fractions of the steps after which the sample's codes are searched anew: descent alone leaves some of them
 in the wrong place for good."""
@@ -45,15 +49,25 @@ class CompressionConfig:
     """Settings of the regression."""
 
     steps: int = 1_000
-    """Number of steps."""
+    """Number of steps, up to three times as many for many Gaussians."""
     batch: int = 3_072
     """Gaussians per step."""
     sample: int = 16_384
-    """Gaussians that the field is trained on, if there are more."""
+    """Gaussians that the field is trained on, if there are more; up to three times as many."""
     code_rate: float = 2e-2
     """Adam's learning rate for the codes."""
     field_rate: float = 1e-2
     """Adam's learning rate for the field."""
+
+    def growth(self, count: int) -> int:
+        """Factor of steps and sample for so many Gaussians: the root of their number in samples, at most 3.
+        A field that has seen few of many fits those few, and the others less."""
+        return min(max(round(math.sqrt(count / self.sample)), 1), _MOST_GROWTH)
+
+    def grown(self, count: int) -> CompressionConfig:
+        """The settings for so many Gaussians."""
+        factor = self.growth(count)
+        return replace(self, steps=factor * self.steps, sample=factor * self.sample)
 
 
 @dataclass(frozen=True)
@@ -100,7 +114,7 @@ def compress(
         generator: source of the sample and the batches, on the CPU.
         advance: called after each step.
     """
-    config = config or CompressionConfig()
+    config = (config or CompressionConfig()).grown(len(features))
     sample = _seen(features, mass, basis).sample(config.sample, generator)
     codes = fit(sample, field, config, generator, advance)
     return assign(features, mass, field, codes, basis)
@@ -264,7 +278,7 @@ class CompressedField(SemanticField):
         return self.compression.steps
 
     def learning_seconds(self, count: int) -> float:
-        draws = self.compression.steps * self.compression.batch
+        draws = self.compression.grown(count).steps * self.compression.batch
         return draws * _SECONDS_PER_DRAW + count * _SECONDS_PER_GAUSSIAN
 
     def initial_codes(self, count: int, generator: torch.Generator | None = None) -> None:  # type: ignore[override]
@@ -285,7 +299,14 @@ class CompressedField(SemanticField):
     ) -> Float[Tensor, "n code"]:
         """Codes of three numbers; of more if those lose too much and the settings leave it open."""
         generator = torch.Generator().manual_seed(0)
-        sample = _seen(features, mass, basis).sample(self.compression.sample, generator)
+        config, steps = self.compression.grown(len(features)), count(1)
+        sample = _seen(features, mass, basis).sample(config.sample, generator)
+
+        def step() -> None:
+            """The bar has as many steps whatever the number of Gaussians."""
+            if next(steps) % self.compression.growth(len(features)) == 0:
+                advance()
+
         state = generator.get_state()
         dims = CODE_DIMS if self.config.code_dim is None else (self.config.code_dim,)
         lost = ""
@@ -293,7 +314,7 @@ class CompressedField(SemanticField):
             generator.set_state(state)
             fresh = SemanticField(replace(self.config, code_dim=dim), self.clip_dim, generator=generator)
             fresh = fresh.to(self.output_mean.device)
-            codes = fit(sample, fresh, self.compression, generator, advance if dim == dims[0] else _nothing)
+            codes = fit(sample, fresh, config, generator, step if dim == dims[0] else _nothing)
             found = assign(sample.features, sample.mass, fresh, codes, basis)
             cosine = centered_cosine(sample.features, fresh, found, basis)
             if cosine >= GOOD:

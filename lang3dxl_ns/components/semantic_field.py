@@ -75,8 +75,9 @@ class SemanticFieldConfig:
     """Settings of a semantic field: a preset, and values that override it."""
 
     preset: Preset | Literal["auto"] = "auto"
-    """`default`: long GPU run; `short`: 300 to 1,000 steps on a CPU; `paper`: as printed; `official`: as
-    released; `auto`: chosen by the length of the run (`default` if unknown)."""
+    """`default`: long GPU run; `short`: hundreds to a few thousand steps; `paper`: as printed; `official`: as
+    released; `auto`: `short` in runs of under 5,000 iterations, in longer ones `paper` with the paper's
+    method and else `default` (also where the length is unknown)."""
     code_dim: int | None = None
     """Channels of the rendered code, 2 to 6 (2 to 5 with `indexed`). Each doubles the cost of a lookup."""
     code_std: float | None = None

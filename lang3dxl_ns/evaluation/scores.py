@@ -178,7 +178,7 @@ def bounds(labels: Maps, truths: Mapping[str, Truth]) -> dict[str, float]:
     """Average precision by chance and at best, for every category in the photo.
 
     `chance_ap_{category}`: of a map without information, the share of positives.
-    `limit_ap_{category}`: of `labels`, the exact labels after lifting and rendering (plugin/label_limit.py).
+    `limit_ap_{category}`: of `labels`, the exact labels after lifting and rendering (`label_limit`).
     """
     found: dict[str, float] = {}
     for category, truth in truths.items():

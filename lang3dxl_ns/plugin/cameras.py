@@ -9,7 +9,7 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from lang3dxl_ns.scene.camera import Camera, Lens, camera_to_world, view_matrix
+from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 
 
 def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4"]) -> Cameras:
@@ -29,13 +29,6 @@ def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4
     )
 
 
-def view_of(camera: Camera) -> Cameras:
-    """One of our cameras as a nerfstudio camera."""
-    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
-    lens = Lens(camera.width, camera.height, fx, fy, cx, cy)
-    return to_nerfstudio([lens], camera_to_world(camera.view_matrix.cpu())[None])
-
-
 def lens_of(cameras: Cameras, index: int) -> Lens:
     """The lens of a nerfstudio perspective camera."""
     parameters = cameras.distortion_params
@@ -51,10 +44,10 @@ def lens_of(cameras: Cameras, index: int) -> Lens:
     )
 
 
-def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"]) -> Camera:
-    """The lens of a nerfstudio camera at a (possibly refined) pose, camera → world; where these are."""
+def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
+    """The lens of a nerfstudio camera at its pose, or another (refined) one, camera → world."""
     return Camera(
-        view_matrix=view_matrix(pose),
+        view_matrix=view_matrix(camera.camera_to_worlds[0] if pose is None else pose),
         intrinsics=camera.get_intrinsics_matrices()[0],
         width=int(camera.width.item()),
         height=int(camera.height.item()),

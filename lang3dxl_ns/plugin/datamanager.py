@@ -34,17 +34,17 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.plugin.data_folder import parser_for
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
-from lang3dxl_ns.plugin.handover import Batch, SceneFacts
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
-from lang3dxl_ns.plugin.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.plugin.run_dataparser import recorded_scene
 from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
+from lang3dxl_ns.preparation.handover import Batch, SceneFacts
 from lang3dxl_ns.preparation.model_files import BUILTIN
 from lang3dxl_ns.preparation.needs import Need, Sources, needs_table, scene_needs
+from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig

@@ -10,8 +10,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
+from lang3dxl_ns.preparation.handover import Batch
 from lang3dxl_ns.scene.photo import Photo
 
 

@@ -19,20 +19,22 @@ from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import host_peak, progress_bar, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
+from lang3dxl_ns.evaluation.evaluated_photo import EvaluatedPhoto
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
+from lang3dxl_ns.evaluation.half_image import PROTOCOL, HalfImage, HalfImageProtocol
+from lang3dxl_ns.evaluation.label_limit import label_limit
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
 from lang3dxl_ns.evaluation.score_scene import truths_of
 from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resized
+from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.eval_photos import EvalPhotos
-from lang3dxl_ns.plugin.evaluated_photo import EvaluatedPhoto
-from lang3dxl_ns.plugin.half_image import PROTOCOL, half_image
-from lang3dxl_ns.plugin.handover import Batch
-from lang3dxl_ns.plugin.label_limit import label_limit
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
 from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.preparation.handover import Batch
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.photo import Photo
 
 Split = Literal["held-out", "seen", "test"]
@@ -131,7 +133,7 @@ class Evaluation:
                 for name in hidden:
                     evaluated.metrics.pop(name, None)
                 if self._fits_looks(split):
-                    fitted = half_image(self._model, camera, batch)
+                    fitted = self._half_image(camera, batch)
                     evaluated.metrics = fitted.figures | evaluated.metrics
                     evaluated.images["fitted"] = fitted.rendering
                 yield evaluated
@@ -141,6 +143,16 @@ class Evaluation:
         """Whether the half-image protocol applies: photos may have looks, and those of the split are not
         known from training."""
         return self._model.appearance is not None and split != "seen"
+
+    def _half_image(self, camera: Cameras, batch: Batch) -> HalfImage:
+        model = self._model
+        assert model.appearance is not None
+        background, weight = model._get_background_color(), model.config.ssim_lambda
+        protocol = HalfImageProtocol(
+            model.splats(), model.appearance, model.image_metrics, background, weight, model.backend
+        )
+        mask = batch["mask"][..., 0] if "mask" in batch else None
+        return protocol.measure(to_rasterizer(camera), model.get_gt_img(batch["image"]), mask)
 
     def _photos_of(self, split: Split) -> EvalPhotos:
         if split == "held-out":
@@ -155,16 +167,16 @@ class Evaluation:
             raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
         return EvalPhotos(self._data, seen, labeled)
 
-    def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Cameras], Maps]:
+    def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Camera], Maps]:
         """Maps of the labels themselves, lifted from the photos to the Gaussians."""
         truth = scorer.truth
 
         def labels():
             for camera, photo in photos.cameras():
                 truths = truths_of(truth, photo, truth.scoring_size(photo.height, photo.width))
-                yield camera, {category: found.mask for category, found in truths.items()}
+                yield to_rasterizer(camera), {category: found.mask for category, found in truths.items()}
 
-        return label_limit(self._model, labels(), truth.categories)
+        return label_limit(self._model.splats(), labels(), truth.categories, self._model.backend)
 
     def _evaluate_photo(self, camera, batch: Batch, photo: Photo, score: Score | None) -> EvaluatedPhoto:
         start = perf_counter()
@@ -184,7 +196,7 @@ class Evaluation:
     def _score_words(
         self,
         scorer: LanguageScorer,
-        limit: Callable[[Cameras], Maps],
+        limit: Callable[[Camera], Maps],
         camera: Cameras,
         evaluated: EvaluatedPhoto,
         batch: Batch,
@@ -207,7 +219,7 @@ class Evaluation:
         evaluated.maps = inside(raw, keep)
         truths = truths_of(scorer.truth, photo, map_size(raw))
         evaluated.metrics |= scorer.scores_of(photo.name, variants | {"teacher_": teacher}, truths)
-        evaluated.metrics |= bounds(inside(resized(limit(camera), size), keep), truths)
+        evaluated.metrics |= bounds(inside(resized(limit(to_rasterizer(camera)), size), keep), truths)
 
     @torch.no_grad()
     def relevancy(self, camera: Cameras, queries: Queries, yardstick: Queries) -> Float[Tensor, "q h w"]:

@@ -46,11 +46,6 @@ def check_inert(model: Any, data: Any) -> None:
         raise UserError(
             f"{_option(changed[0])} has no effect here: no method of this package reads it; leave it off"
         )
-    if model.decoder.start != "noise" and model.decoder.name != "paper":
-        raise UserError(
-            f"--pipeline.model.decoder.start has no effect with --pipeline.model.decoder.name "
-            f"{model.decoder.name}: leave it off, or train with ns-train lang3dxl-paper"
-        )
     if model.decoder.learns_from_renderings:
         return
     changed = [f"--pipeline.model.{name}" for name in _changed(model, _OF_RENDERINGS)]

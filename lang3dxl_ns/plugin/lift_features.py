@@ -11,16 +11,12 @@ from nerfstudio.cameras.cameras import Cameras
 from torch.nn import Parameter
 
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
-from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.plugin.handover import Batch
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.rendering.gathering import Pixels, gather
+from lang3dxl_ns.preparation.handover import Batch
 
 LONGER_SIDE = 1_600
 """Pixels of the longer side at which larger photos are gathered: a CLIP crop covers hundreds of pixels, and
 time and memory grow with their number."""
-REACH = 3.0
-"""Codes that start from gathered features lie within this many standard deviations."""
 
 
 def learn_from_photos(
@@ -51,33 +47,6 @@ def _view(model: Lang3DXLModel, camera: Cameras, batch: Batch) -> TargetView:
         batch.get("dense_target"),
         batch["mask"][..., 0] if "mask" in batch else None,
     )
-
-
-@torch.no_grad()
-def start_codes(model: Lang3DXLModel, photos: Iterable[tuple[Cameras, Batch]]) -> None:
-    """Let the Gaussians' codes differ as the features of what they show: set them to the first principal
-    components of the photos' CLIP targets, gathered onto the present Gaussians, each divided by its
-    deviation. Gaussians visible in no photo keep their codes.
-
-    model: in training mode, one whose codes are learned from renderings. photos: cameras and batches, with
-    targets.
-    """
-    codes, targets = model.gauss_params["codes"], model.facts.clip_targets
-    assert targets is not None
-    basis = PrincipalBasis.of(targets(), codes.shape[1])
-
-    def views():
-        for camera, batch in photos:
-            camera, clip = working_camera(camera), batch["clip_target"]
-            size = int(camera.height.item()), int(camera.width.item())
-            mask = batch["mask"][..., 0] if "mask" in batch else None
-            yield partial(model.composite, camera), Pixels.of([basis.to(clip).coordinates(clip)], size, mask)
-
-    places, mass = gather(model.num_points, views(), codes.shape[1], model.means.detach())
-    seen = (mass > 0).to(codes.device)
-    places = places.to(codes)[seen]
-    if len(places) > 1:
-        codes[seen] = (places / places.std(0).clamp_min(1e-12)).clamp(-REACH, REACH)
 
 
 def working_camera(camera: Cameras) -> Cameras:

@@ -18,28 +18,18 @@ from pytorch_msssim import SSIM
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from lang3dxl_ns.baselines.decoders import make_decoder
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
-from lang3dxl_ns.components.appearance import AppearanceField
-from lang3dxl_ns.components.compression import CompressedField
-from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
-from lang3dxl_ns.components.sky import OPACITY, Sky
+from lang3dxl_ns.components.initialization import color_parameters, initial_gaussians, seed_positions
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
-from lang3dxl_ns.plugin.handover import Batch
-from lang3dxl_ns.plugin.initialization import (
-    FIRST_OPACITY,
-    color_parameters,
-    initial_gaussians,
-    seed_positions,
-)
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
+from lang3dxl_ns.plugin.optional_components import COMPONENTS
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
-from lang3dxl_ns.preparation.targets import FeatureStatistics
+from lang3dxl_ns.preparation.handover import Batch
 from lang3dxl_ns.scene.geometry import center_and_radius
 
 DECODE_SIZES = 5
@@ -56,32 +46,24 @@ class Lang3DXLModelConfig(ModelSettings):
 class Lang3DXLModel(RenderingModel):
     """Gaussians with colors and semantic codes; without targets (clip = none) it has no semantic parts."""
 
-    downsampler: AttenuatedDownsampler | None
-    clip_mean: Tensor
-    dense_mean: Tensor
-
     def populate_modules(self) -> None:
-        """Build Gaussians, components, metrics and strategy (on the CPU; the pipeline moves them)."""
-        self.config.fit_to_run(self.config.total_steps)
-        if not self._wants("view dependence", self.config.view_dependence):
-            self.config.sh_degree = 0
-        means, colors = seed_positions(self.config, self.seed_points)
+        """Build Gaussians, strategy, components and metrics (on the CPU; the pipeline moves them)."""
+        c = self.config
+        c.fit_to_run(c.total_steps)
+        if not self.facts.wants("view dependence", c.view_dependence):
+            c.sh_degree = 0
+        points = None if c.random_init else self.seed_points
+        means, colors = seed_positions(points, c.num_random, c.random_scale)
         self.extent = center_and_radius(means)
-        looks = self._wants("appearance", self.config.appearance.use)
-        # Where photos differ in light a smooth sky costs words (docs/lab/short_and_long_runs.md).
-        smooth = self.config.sky_gaussians if not looks else 0
-        first = initial_gaussians(self.config, means, colors, OPACITY if smooth else FIRST_OPACITY)
+        first = initial_gaussians(means, colors, c.sky_gaussians, c.sh_degree)
         self.gauss_params = nn.ParameterDict(first)
-        self.sky = Sky(first["means"].detach()[:smooth] - self.extent[0]) if smooth else None
-        self._make_camera_optimizer(self._wants("camera optimizer", self.config.camera_optimization, False))
-        self.semantic_field = self.downsampler = None
-        statistics = self.facts.statistics
-        if statistics is not None:
-            clip, dense = statistics.clip, statistics.dense
-            self._add_semantics(clip.mean, clip.mean[:0] if dense is None else dense.mean, statistics)
-        self.appearance = None
-        if looks:
-            self.appearance = self._make_appearance()
+        self.strategy = make_strategy(self.config)
+        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
+        for component in COMPONENTS:
+            if component.wanted(self.config, self.facts):
+                component.build(self)
+            else:
+                component.leave_out(self)
         self.step = 0
         self.step_is_sound = True
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
@@ -90,53 +72,6 @@ class Lang3DXLModel(RenderingModel):
         self.background_color = get_color(
             "black" if self.config.background_color == "random" else self.config.background_color
         )
-        self.strategy = make_strategy(self.config)
-        self.strategy.still = smooth
-        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
-
-    def _add_semantics(
-        self,
-        clip_mean: Float[Tensor, " c"],
-        dense_mean: Float[Tensor, " d"],
-        statistics: FeatureStatistics | None = None,
-    ) -> None:
-        """Build the feature decoder and the downsampler for this feature width; give every Gaussian a code.
-
-        `statistics` of the targets, if available: not for a loaded model.
-        """
-        self.register_buffer("clip_mean", clip_mean)
-        self.register_buffer("dense_mean", dense_mean)
-        c = self.config
-        self.semantic_field = make_decoder(
-            c.decoder, c.semantic_field, len(clip_mean), len(dense_mean), *self.extent
-        )
-        if statistics is not None:
-            clip, dense = statistics.clip.std, statistics.dense
-            std = clip if dense is None else torch.cat([clip, dense.std])
-            self.semantic_field.set_output_statistics(torch.cat([clip_mean, dense_mean]), std)
-            with part("learn targets"):
-                assert self.facts.clip_targets is not None
-                self.semantic_field.learn_targets(self.facts.clip_targets)
-        self.downsampler = AttenuatedDownsampler(c.downsampler, len(clip_mean))
-        codes = self.semantic_field.initial_codes(self.num_points)
-        if codes is not None:
-            self.gauss_params["codes"] = Parameter(codes)
-
-    def _wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
-        """Whether to build an optional component; `auto`: by the scene's measured needs."""
-        if choice == "auto":
-            return self.facts.needs.get(component, unmeasured)
-        return choice == "on"
-
-    def _make_camera_optimizer(self, wanted: bool) -> None:
-        settings = self.config.camera_optimizer
-        if wanted and settings.mode == "off":
-            settings.mode = "SO3xR3"
-        self.camera_optimizer = settings.setup(num_cameras=self.num_train_data, device="cpu")
-
-    def _make_appearance(self) -> AppearanceField:
-        generator = torch.Generator().manual_seed(0)
-        return AppearanceField(self.config.appearance, self.facts.names, *self.extent, generator=generator)
 
     # ── training ────────────────────────────────────────────────────────────────────────────────────
 
@@ -158,7 +93,7 @@ class Lang3DXLModel(RenderingModel):
                 CONSOLE.log(f"Step {step}: {before} → {self.num_points} Gaussians")
         if self.sky is not None:
             with torch.no_grad():
-                colors = color_parameters(self.config, self.sky.colors)
+                colors = color_parameters(self.sky.colors, self.config.sh_degree)
                 self.gauss_params["features_dc"][: len(self.sky)] = colors
 
     def forget_gathered_codes(self) -> None:
@@ -172,16 +107,9 @@ class Lang3DXLModel(RenderingModel):
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Optimizer groups: one per Gaussian property, and those of the components present."""
-        groups = super().get_param_groups()
-        if self.semantic_field is not None and self.downsampler is not None:
-            groups |= self.semantic_field.parameter_groups()
-            if self.learns_from_renderings:
-                groups["downsampler"] = list(self.downsampler.parameters())
-        if self.sky is not None:
-            groups["sky"] = [self.sky.harmonics]
-        if self.appearance is not None:
-            groups["appearance_vectors"] = [self.appearance.vectors]
-            groups["appearance"] = self.appearance.network_parameters()
+        groups = self.get_gaussian_param_groups()
+        for component in COMPONENTS:
+            groups |= component.parameters(self)
         return {name: parameters for name, parameters in groups.items() if parameters}
 
     # ── losses and metrics ──────────────────────────────────────────────────────────────────────────
@@ -333,13 +261,9 @@ class Lang3DXLModel(RenderingModel):
 
         Parameters are resized in place: the optimizers hold them, and new ones would never be trained.
         """
-        self._match_semantics(state)
-        self._match_appearance(state)
-        self._match_sky(state)
+        for component in COMPONENTS:
+            component.load(self, state)
         self.config.sh_degree = isqrt(state["gauss_params.features_rest"].shape[1] + 1) - 1
-        if "camera_optimizer.pose_adjustment" in state and self.config.camera_optimizer.mode == "off":
-            self._make_camera_optimizer(wanted=True)
-            self.to(self.device)
         self.step = self.config.total_steps
         for name, parameter in self.gauss_params.items():
             saved = state[f"gauss_params.{name}"]
@@ -352,45 +276,3 @@ class Lang3DXLModel(RenderingModel):
                 )
             parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super(SplatfactoModel, self).load_state_dict(state, **kwargs)
-
-    def _match_appearance(self, state: Mapping[str, Any]) -> None:
-        """`auto` follows the checkpoint; `on` and `off` must agree with it."""
-        saved = "appearance.vectors" in state
-        if saved == (self.appearance is not None):
-            return
-        if self.config.appearance.use != "auto":
-            raise UserError(
-                f"the checkpoint was trained {'with' if saved else 'without'} appearance: load it with "
-                f"--pipeline.model.appearance.use auto, or train anew"
-            )
-        self.appearance = self._make_appearance().to(self.device) if saved else None
-
-    def _match_sky(self, state: Mapping[str, Any]) -> None:
-        """The checkpoint's sky, or none if it was trained like all Gaussians."""
-        saved = state.get("sky.directions")
-        if saved is None or self.sky is None or len(saved) != len(self.sky):
-            self.sky = None if saved is None else Sky(torch.zeros_like(saved)).to(self.device)
-            self.strategy.still = 0 if saved is None else len(saved)
-
-    def _match_semantics(self, state: Mapping[str, Any]) -> None:
-        """Build the components that the checkpoint has, or raise an error about the difference."""
-        if "clip_mean" not in state:
-            return
-        saved = {"CLIP": state["clip_mean"], "dense": state["dense_mean"]}
-        if self.semantic_field is None:
-            self._add_semantics(*saved.values())
-        assert self.semantic_field is not None
-        if isinstance(self.semantic_field, CompressedField) and "gauss_params.codes" in state:
-            self.semantic_field.fit_codes(state["gauss_params.codes"])
-        if self.semantic_field.needs_lifting and "gauss_params.codes" in state:
-            self.gauss_params["codes"] = Parameter(state["gauss_params.codes"].clone(), requires_grad=False)
-        self.to(self.device)
-        for kind, mean, prepared in zip(
-            saved, saved.values(), (self.clip_mean, self.dense_mean), strict=True
-        ):
-            if len(mean) != len(prepared):
-                raise UserError(
-                    f"the checkpoint decodes to {kind} features of width {len(mean)}, but the prepared "
-                    f"targets have {len(prepared)}: pass the --pipeline.datamanager.{kind.lower()} that the "
-                    f"checkpoint was trained with, or train anew"
-                )

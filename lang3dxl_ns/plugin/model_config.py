@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from nerfstudio.utils.rich_utils import CONSOLE
+
 from lang3dxl_ns.baselines.decoders import DecoderConfig
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.components import schedules
@@ -17,7 +19,8 @@ from lang3dxl_ns.plugin.optimizers import run_length_weight
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
 
 SHORT_FIELD_RUN = 5_000
-"""Runs with fewer iterations use the field's `short` preset, if they train it with the scene."""
+"""Runs with fewer iterations use the field's `short` preset, if they train it with the scene: the grid as
+printed has learned no words after 300."""
 
 
 @without(*OF_SPLATFACTO)
@@ -101,9 +104,16 @@ class ModelSettings(SplatfactoModelConfig):
         x = run_length_weight(iterations)
         self.total_steps = iterations
         if self.semantic_field.preset == "auto":
-            # Compression is a direct regression of a thousand steps, whatever the run's length.
+            # Compression is a direct regression, whatever the run's length.
             compressed = self.decoder.name == "gathered"
-            self.semantic_field.preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "default"
+            long = "paper" if self.decoder.name == "paper" else "default"
+            preset = "short" if compressed or iterations < SHORT_FIELD_RUN else long
+            self.semantic_field.preset = preset  # type: ignore[assignment]
+            if self.decoder.name == "paper":
+                CONSOLE.log(
+                    f"Semantic field: preset {preset} (short in runs of under {SHORT_FIELD_RUN:,} "
+                    "iterations, paper, as printed, in longer ones)"
+                )
         self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
         if self.densify_grad_thresh is None:
             self.densify_grad_thresh = schedules.log_linear(x, 2e-3, 2e-4)

@@ -9,11 +9,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.load_scene import latest_checkpoint
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
-from lang3dxl_ns.plugin.saved_config import read_config
-from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig, read_config
 from lang3dxl_ns.query.find_run import find_config
+from lang3dxl_ns.query.run_checkpoint import latest_checkpoint
 
 
 def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPipeline, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,7 +21,7 @@ from lang3dxl_ns.evaluation.ground_truth import Layout
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.describe_scene import describe_scene
 from lang3dxl_ns.plugin.evaluation import Evaluation, Split
-from lang3dxl_ns.plugin.lift_features import learn_from_photos, start_codes
+from lang3dxl_ns.plugin.lift_features import learn_from_photos
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.viewer.panel import AskPanel
@@ -42,7 +41,6 @@ class RenderedAnswers:
 
     question: Question
     shows_bottleneck: bool = True
-    look: str | None = None
 
     def channels(self) -> Tensor:
         """See `Answers`."""
@@ -105,11 +103,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         return results
 
     def get_train_loss_dict(self, step: int):
-        """Outputs, losses and metrics of the next photo; before it, where semantics begin, their start."""
-        config = self.config.model
-        begins = step == math.ceil(config.warm_up * config.total_steps)
-        if begins and config.decoder.start == "gathered" and self.model.learns_from_renderings:
-            start_codes(self.model, self.datamanager.train_photos())
+        """Outputs, losses and metrics of the next photo."""
         outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
         return outputs, self.last_losses, metrics
 

@@ -18,13 +18,15 @@ from torch import Tensor
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField
+from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
-from lang3dxl_ns.plugin.handover import SceneFacts
+from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
+from lang3dxl_ns.preparation.handover import SceneFacts
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene
@@ -44,10 +46,6 @@ class Answers(Protocol):
     def shows_bottleneck(self) -> bool:
         """Whether anyone views the picture of the codes, which costs three more channels."""
 
-    @property
-    def look(self) -> str | None:
-        """Photo whose lighting is shown; None: by the appearance's rule."""
-
     def channels(self) -> Float[Tensor, "n d"] | None:
         """Values of the Gaussians to composite; None without prompts."""
 
@@ -63,7 +61,13 @@ class RenderingModel(SplatfactoModel):
     """
 
     config: ModelSettings
+    strategy: Densification
+    extent: tuple[Float[Tensor, "3"], float]
+    """The scene's center, and the distance from it that contains most of the scene."""
     semantic_field: Decoder | None
+    downsampler: AttenuatedDownsampler | None
+    clip_mean: Tensor
+    dense_mean: Tensor
     appearance: AppearanceField | None
     sky: Sky | None
     """The first Gaussians' colors; None: there is no sky, or it was trained like all Gaussians."""
@@ -157,8 +161,7 @@ class RenderingModel(SplatfactoModel):
             return self.get_outputs(camera)  # type: ignore[return-value]
         asked = answers.channels()
         colors = self._code_colors() if answers.shows_bottleneck else None
-        look = None if answers.look is None or self.looks is None else self.looks.of_photo(answers.look)
-        rendering, outputs = self._shown(camera, look, asked, colors)
+        rendering, outputs = self._shown(camera, asked, colors)
         found = answers.outputs(rendering, time.perf_counter() - start)
         return {"rgb": outputs["rgb"], **found, **outputs}
 
@@ -167,7 +170,7 @@ class RenderingModel(SplatfactoModel):
         decoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
         if self.training:
             return self._training_outputs(camera)
-        return self._shown(camera, None, None, self._code_colors())[1]
+        return self._shown(camera, None, self._code_colors())[1]
 
     def seen(
         self, camera: Cameras, look: Look | None = None, channels: Float[Tensor, "n d"] | None = None
@@ -189,13 +192,12 @@ class RenderingModel(SplatfactoModel):
     def _shown(
         self,
         camera: Cameras,
-        look: Look | None,
         asked: Float[Tensor, "n d"] | None,
         colors: Float[Tensor, "n 3"] | None,
     ) -> tuple[Rendering, dict[str, Tensor]]:
         """A rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
         parts = [part for part in (asked, colors) if part is not None]
-        rendering = self.seen(camera, look, torch.cat(parts, dim=1) if parts else None)
+        rendering = self.seen(camera, channels=torch.cat(parts, dim=1) if parts else None)
         background = self._get_background_color().expand_as(rendering.rgb)
         depth = rendering.depth
         outputs = {
@@ -260,7 +262,7 @@ class RenderingModel(SplatfactoModel):
         downscale = self._get_downscale_factor()
         if downscale != 1:
             camera.rescale_output_resolution(1 / downscale)
-        view = to_rasterizer(camera, camera.camera_to_worlds[0] if pose is None else pose)
+        view = to_rasterizer(camera, pose)
         if downscale != 1:
             camera.rescale_output_resolution(downscale)
         return view

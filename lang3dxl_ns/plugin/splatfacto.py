@@ -5,8 +5,8 @@ from nerfstudio.utils import misc
 _compile = misc.torch_compile
 misc.torch_compile = lambda *_, **__: lambda function: function
 try:
-    from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig, num_sh_bases
+    from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 finally:
     misc.torch_compile = _compile
 
-__all__ = ["RGB2SH", "SplatfactoModel", "SplatfactoModelConfig", "num_sh_bases"]
+__all__ = ["SplatfactoModel", "SplatfactoModelConfig"]

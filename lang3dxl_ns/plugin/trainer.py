@@ -31,19 +31,20 @@ from lang3dxl_ns.common.files import replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
+from lang3dxl_ns.components.step_guard import StepGuard
 from lang3dxl_ns.plugin.checkpoint import restore_run_state, run_state
 from lang3dxl_ns.plugin.datamanager import PhotosGoneError
 from lang3dxl_ns.plugin.describe_scene import describe_scene
-from lang3dxl_ns.plugin.load_scene import (
+from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
+from lang3dxl_ns.plugin.sizes import plan
+from lang3dxl_ns.preparation.needs import write_needs
+from lang3dxl_ns.query.kept_words import with_words_of
+from lang3dxl_ns.query.run_checkpoint import (
     NOT_A_CHECKPOINT,
     check_checkpoint,
     read_checkpoint,
 )
-from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
-from lang3dxl_ns.plugin.sizes import plan
-from lang3dxl_ns.plugin.step_guard import StepGuard
-from lang3dxl_ns.preparation.needs import write_needs
 from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
 
@@ -192,11 +193,6 @@ class Lang3DXLTrainer(Trainer):
         if path is not None and not path.is_file():
             raise UserError(f"there is no checkpoint {path}: pass the folder nerfstudio_models of a run")
         return path
-
-    @property
-    def first_iteration(self) -> int:
-        """First iteration: 0, or the one after the loaded checkpoint."""
-        return self._start_step
 
     def setup_optimizers(self) -> Optimizers:
         """The optimizers, with the guard before them."""
@@ -368,11 +364,14 @@ class Lang3DXLTrainer(Trainer):
         super()._after_train()  # saves first
 
     def write_scene(self) -> None:
-        """Write the trained scene as one file into the run's folder, to ask and to share."""
+        """Write the trained scene as one file into the run's folder, to ask and to share. It keeps the words
+        taught in an earlier file there, or in that of the run that this one resumed."""
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
         how = f"{self.config.method_name}, {config.decoder.name}, {self.config.max_num_iterations} iterations"
-        scene = self.pipeline.model.scene(self.pipeline.scene_file)
+        scene, checkpoint = self.pipeline.model.scene(self.pipeline.scene_file), self._checkpoint_to_load()
+        for folder in (self.base_dir, *([] if checkpoint is None else [checkpoint.parents[1]])):
+            scene = with_words_of(scene, folder / path.name)
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
         size = write_scene(path, scene, told)
         say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)", *self._next_steps())

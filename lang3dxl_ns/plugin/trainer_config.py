@@ -23,15 +23,15 @@ from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.plugin.data_folder import check_data
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.inert_settings import check_inert
-from lang3dxl_ns.plugin.load_scene import check_checkpoint
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
-from lang3dxl_ns.plugin.saved_config import load_configs, read_config
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
+from lang3dxl_ns.query.run_checkpoint import check_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE
+from lang3dxl_ns.query.run_settings import load_configs, no_config, read_settings
 from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
 from lang3dxl_ns.scene.camera import Camera
 
@@ -191,6 +191,17 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         settle(mine.appearance, earlier.appearance, "use", "appearance")
         settle(mine, earlier, "view_dependence", "view dependence")
         settle(mine, earlier, "camera_optimization", "camera optimizer")
+
+
+def read_config(path: Path) -> TrainerConfig:
+    """The configuration of a run, read as `read_settings` does.
+
+    Raises UserError for a missing or damaged file, one of another version, and one that asks for more.
+    """
+    (config,) = read_settings(path, [()])
+    if not isinstance(config, TrainerConfig):
+        raise no_config(path)
+    return config
 
 
 def _torch_rendering_seconds(count: int = 50_000, size: tuple[int, int] = (1000, 700)) -> float:

@@ -43,6 +43,10 @@ _NAMED = {
 }
 NEGATIVES = (*CANONICAL, *_NAMED)
 """The default."""
+NOTHING = ("sky", *CANONICAL)
+"""Phrases that fit best where there is nothing to name."""
+CLEAR = 0.55
+"""Relevancy from which a word names a place that one of them fits best."""
 
 
 def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:

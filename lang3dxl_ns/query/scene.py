@@ -1,11 +1,12 @@
-"""`Scene`: a finished scene that one can render and ask, as data."""
+"""`Scene`: a finished scene that one can look at and ask, as data."""
 
 from __future__ import annotations
 
 import copy
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, replace
+from contextlib import suppress
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,66 +18,55 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import watched
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.looks import Look, Looks, render_in_look
+from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
-from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
-from lang3dxl_ns.query.match import Found, Match, View, Viewpoint
-from lang3dxl_ns.query.overview import overview
+from lang3dxl_ns.query.match import Found, Match, Viewpoint
+from lang3dxl_ns.query.negatives import CLEAR, NOTHING
 from lang3dxl_ns.query.places import strongest_match
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.rank_views import rank_views
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
+from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import MARK_SIDE, Example, TaughtWord, Weights, known_word, learn, marks
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched
 from lang3dxl_ns.query.threshold import match_thresholds
-from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
+from lang3dxl_ns.query.viewed_scene import Place, ViewedScene
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
-from lang3dxl_ns.rendering.gathering import filled_parts, filled_pixels
+from lang3dxl_ns.rendering.gathering import filled_parts
 from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import Rendering, composite
+from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.rendering.splats import Splats
-from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
+from lang3dxl_ns.scene.camera import Camera, resized
 
 _LEAST_PIXELS = 1.0
 """Pixels of a small view that a match must fill."""
 _ROWS = 65_536
 """Gaussians decoded at a time."""
-LARGEST = 1920
-"""Longer side of pictures in pixels, where no size is requested."""
 NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
-Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
-"""A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
 Text: TypeAlias = str | Prompt | Float[Tensor, " c"] | Float[Array, " c"]
 """A text as `parse_prompts` reads it, or a vector in the space of the scene's CLIP."""
 
 
-class Scene:
+class Scene(ViewedScene):
     """A scene: Gaussians, what they mean, and the photos they were made from.
 
     It is data, and never changes; what is computed from it once (decoded features, the Gaussians that each
     photo shows) is kept. Any number of threads may use one scene.
 
     Args:
-        splats: the Gaussians, in the model's frame.
+        splats, looks, background, cache, backend, watch: see `ViewedScene`.
         file: photos, cameras, and the CLIP that the features come from.
         decoder: turns codes into features; None for a scene of colors alone.
         codes: semantic values of the Gaussians, a row each; NaN for those visible in no photo.
-        looks: lighting of the photos; None where all share one.
-        background: color behind the scene, 0…1; None for black.
         config: defaults of queries.
         encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text that
             is not among `vectors`.
         vectors: unit vectors of common words, which need no CLIP.
-        cache: file to keep which Gaussians the photos show; None: they are measured in every process.
-        backend: the rasterizer, see `rasterize`.
-        watch: called with a short description of slow work; None: a progress bar.
         words: words taught by example, see `teach`.
     """
 
@@ -97,13 +87,11 @@ class Scene:
         watch: Callable[[str], None] | None = None,
         words: Iterable[TaughtWord] = (),
     ) -> None:
+        super().__init__(splats, file, looks, background, config, cache, backend, watch)
         self.words: Mapping[str, TaughtWord] = {known_word(word.name): word for word in words}
         """Taught words, by their names in lower case."""
-        self.splats, self.file, self.decoder, self.codes = splats, file, decoder, codes
-        self.looks, self.background, self.backend = looks, background, backend
-        self.config = config or QueryConfig()
+        self.decoder, self.codes = decoder, codes
         self._encode_texts, self._vectors = encode_texts, vectors
-        self._cache, self._watch = cache, watch
         self._doubt_alone: dict[str, float] = {}
         """Doubt about texts without their synonyms."""
 
@@ -114,97 +102,6 @@ class Scene:
             f"Scene({len(self.splats):,} Gaussians, {len(self.photos)} photos ({held_out} held out) "
             f"of {self.file.data}, {words})"
         )
-
-    @property
-    def device(self) -> torch.device:
-        """Where the Gaussians are."""
-        return self.splats.means.device
-
-    @property
-    def photos(self) -> list[ScenePhoto]:
-        """Training photos, then held-out ones: names, cameras, poses."""
-        return self.file.photos
-
-    @cached_property
-    def overview(self) -> ScenePhoto:
-        """The photo that shows the scene as a whole."""
-        return overview(self.photos, tuple(self.splats.means.median(0).values.tolist()))
-
-    # ── looking ─────────────────────────────────────────────────────────────────────────────────────
-
-    def camera(self, place: Place, size: int | None = None, fov: float | None = None) -> Camera:
-        """A camera of the scene.
-
-        Args:
-            place: a camera; a photo by name; or a pose (camera → world in the model's frame, nerfstudio's
-                axes), which gets the first photo's lens.
-            size: longer side in pixels; by default a camera's own, and for photos that of the file, at most
-                1920.
-            fov: vertical field of view in degrees; by default that of the lens.
-
-        Raises:
-            UserError: no photo has this name, or the size or field of view is impossible.
-        """
-        size = self.config.size if size is None else size
-        if isinstance(place, Camera):
-            camera = place if size is None else with_longer_side(place, size)
-        else:
-            photo = self.file.photo(place) if isinstance(place, str) else self.photos[0]
-            camera = photo.full_camera
-            if not isinstance(place, str):
-                camera = posed(torch.as_tensor(place), camera)
-            camera = resized(camera, LARGEST) if size is None else with_longer_side(camera, size)
-        return camera if fov is None else with_field_of_view(camera, fov)
-
-    def render(
-        self, place: Place, size: int | None = None, fov: float | None = None, look: str | None = None
-    ) -> View:
-        """The scene from a photo's viewpoint, a camera or a pose.
-
-        Args:
-            place, size, fov: see `camera`.
-            look: training photo whose lighting is used; default: by the scene's rule for this view.
-
-        Raises:
-            UserError: see `camera`; or there is no look of this photo.
-        """
-        return self._view(self.camera(place, size, fov), self._name(place), look)
-
-    def draw(
-        self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
-    ) -> Rendering:
-        """Render a camera, as tensors on the scene's device.
-
-        Args:
-            camera: where to render from.
-            channels: further values of the Gaussians to composite.
-            look: the lighting; default: by the scene's rule for this view.
-        """
-        if look is None and self.looks is not None:
-            look = self.looks.of_view(camera)
-        return render_in_look(
-            self.splats, camera, look, channels, background=self.background, backend=self.backend
-        )
-
-    def _view(
-        self,
-        camera: Camera,
-        name: str | None,
-        look: str | None = None,
-    ) -> View:
-        start = time.perf_counter()
-        chosen = self._look(look)
-        return View(self.draw(camera, look=chosen), name, time.perf_counter() - start)
-
-    def _look(self, photo: str | None) -> Look | None:
-        if photo is None:
-            return None
-        if self.looks is None:
-            raise UserError("all photos of this scene share one lighting: there is no look to choose")
-        return self.looks.of_photo(photo)
-
-    def _name(self, place: Place) -> str | None:
-        return self.file.photo(place).name if isinstance(place, str) else None
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -229,28 +126,28 @@ class Scene:
         Raises:
             UserError: there is no prompt, the threshold is impossible, or the scene has colors alone.
         """
-        extra = tuple(negatives)
-        prompts = [replace(p, negatives=p.negatives + extra) for p in self.prompts(texts)]
-        within = self.config.foreground if foreground is None else foreground
-        everything = [*prompts, *(self.prompts(within) if within else ())]
-        queries = self.queries(everything)
-        relevancy = self.engine.of_gaussians(queries)
-        doubts = self.doubts.of(relevancy)
-        doubts = [p.taught.doubt if p.taught else d for p, d in zip(everything, doubts, strict=True)]
-        strict = [bool(prompt.negatives or prompt.taught) for prompt in everything]
-        own = match_thresholds(relevancy, doubts, strict)
-        count, requested = len(prompts), self.config.threshold if threshold is None else threshold
+        requested = self.config.threshold if threshold is None else threshold
         if requested is not None and not 0 <= requested <= 1:
             raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
+        prompts = [replace(p, negatives=(*p.negatives, *negatives)) for p in self.prompts(texts)]
+        within = self.config.foreground if foreground is None else foreground
+        everything, count = [*prompts, *(self.prompts(within) if within else ())], len(prompts)
+        queries = self.queries(everything)
+        doubts, levels = self._judged(everything, queries)
+        own = levels[:count] if requested is None else (requested,) * count
         return Question(
-            self.engine,
-            tuple(prompts),
-            queries,
-            tuple(doubts[:count]),
-            own[:count] if requested is None else (requested,) * count,
-            own[count:],
-            self.config.min_alpha,
+            self.engine, tuple(prompts), queries, doubts[:count], own, levels[count:], self.config.min_alpha
         )
+
+    def _judged(
+        self, prompts: Sequence[Prompt], queries: Queries
+    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Doubt about each prompt, and the relevancy from which places match it."""
+        relevancy = self.engine.of_gaussians(queries)
+        doubts = self.doubts.of(relevancy)
+        doubts = [p.taught.doubt if p.taught else d for p, d in zip(prompts, doubts, strict=True)]
+        strict = [bool(prompt.negatives or prompt.taught) for prompt in prompts]
+        return tuple(doubts), match_thresholds(relevancy, doubts, strict)
 
     def query(
         self,
@@ -284,18 +181,23 @@ class Scene:
     def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
         """Matches of a question's prompts in one view; see `query`.
 
-        Relevancies are composited with at most the pixels of the photos in training, then enlarged: between
-        these pixels nothing was learned, and needles too thin for them would stand out as lines.
+        Relevancies are composited with at most the pixels of the photos in training, in a pass of their own
+        if the view has more, then enlarged: between these pixels nothing was learned, and needles too thin
+        for them would stand out as lines.
         """
         start = time.perf_counter()
         channels = question.channels
         seconds = time.perf_counter() - start
-        view = self._view(self.camera(place, size), self._name(place))
+        camera, name = self.camera(place, size), self._name(place)
+        small = resized(camera, self.trained_side)
+        enlarged = small.width < camera.width
+        view = self._view(camera, name, channels=None if enlarged else channels)
         start = time.perf_counter()
-        foreground = None if view.name is None else self.file.photo(view.name).foreground()
-        small = resized(view.rendering.camera, self.trained_side)
-        carried = composite(self.splats, small, channels, self.backend)
-        maps, masks = question.maps(replace(view.rendering, channels=carried), foreground)
+        rendering = view.rendering
+        if enlarged:
+            rendering = replace(rendering, channels=composite(self.splats, small, channels, self.backend))
+        foreground = None if name is None else self.file.photo(name).foreground()
+        maps, masks = question.maps(rendering, foreground)
         found = maps.cpu().float().numpy(), masks.cpu().numpy()
         seconds += time.perf_counter() - start
         rows = zip(question.prompts, question.doubts, *found, question.thresholds, strict=True)
@@ -377,35 +279,17 @@ class Scene:
         Raises:
             UserError: nothing matches, or see `ask` and `write_splats`.
         """
-        splats, relevancy = self.baked(look), None
-        if text is not None:
-            question = self._one(text, threshold)
-            relevancy, keep = question.relevancy[0], question.gaussians[0]
-            if not everything and not keep.any():
-                best, level = float(relevancy.max()), question.thresholds[0]
-                raise UserError(
-                    f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
-                    f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
-                )
-            if index is not None:
-                write_index(Path(index), keep)
-            if not everything:
-                splats, relevancy = splats.select(keep), relevancy[keep]
+        splats = self.baked(look)
+        if text is None:
+            return write_splats(Path(path), splats)
+        question = self._one(text, threshold)
+        relevancy, keep = question.relevancy[0], question.gaussians[0]
+        if not everything:
+            _expect_match(question)
+            splats, relevancy = splats.select(keep), relevancy[keep]
+        if index is not None:
+            write_index(Path(index), keep)
         return write_splats(Path(path), splats, relevancy)
-
-    def baked(self, look: str | None = None) -> Splats:
-        """The Gaussians for viewers that know no looks: under that of a training photo.
-
-        Args:
-            look: the photo; default: the overview photo. Without looks the Gaussians are returned as they
-                are.
-        """
-        if self.looks is None:
-            if look is not None:
-                self._look(look)
-            return self.splats
-        camera = self.overview.camera
-        return (self._look(look) or self.looks.of_view(camera)).apply(self.splats, camera)
 
     # ── features ────────────────────────────────────────────────────────────────────────────────────
 
@@ -432,7 +316,10 @@ class Scene:
         most: int = 5,
         size: int | None = None,
     ) -> list[tuple[str, float]]:
-        """The words that fit a pixel best, with their relevancy, best first; none where nothing is rendered.
+        """The words that fit a pixel best, with their relevancy, best first.
+
+        There are none where the scene's Gaussians hardly cover the pixel or have no meaning, and none at the
+        sky: where the sky or a phrase that fits anything fits best, and no word clearly better.
 
         Args:
             place, size: the view, see `camera`.
@@ -451,11 +338,16 @@ class Scene:
         pixel[int(y), int(x)] = 1.0
         share = self._fill(camera, pixel)
         rows = share.nonzero().squeeze(1)
-        if not len(rows):
+        features = self.engine.features(rows)
+        if float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
             return []
-        feature = share[rows] @ self.engine.features(rows)
         queries = self.text.plain_queries(words).to(self.device)
-        scores = queries.relevancy_of_cosines(queries.cosines(feature))
+        cosines = queries.cosines(share[rows] @ features)
+        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature)
+        negatives = self.text.config.negatives
+        clear = any(score > CLEAR for word, score in zip(words, scores, strict=True) if word != "sky")
+        if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
+            return []
         best = scores.topk(min(most, len(words)))
         return [(words[int(i)], float(score)) for score, i in zip(best.values, best.indices, strict=True)]
 
@@ -502,6 +394,20 @@ class Scene:
         changed = copy.copy(self)
         changed.words = {known_word(word.name): word for word in words}
         return changed
+
+    def carrying(self, word: TaughtWord) -> Scene:
+        """A scene with a word that was taught elsewhere: learned anew if it was taught in these photos,
+        otherwise, or if its marks show nothing any more, as it was learned there.
+
+        Raises:
+            UserError: it was learned with another CLIP.
+        """
+        if word.examples and word.scene == Path(self.file.data).name:
+            with suppress(UserError):
+                return self.teach(word.name, word.examples)
+        if word.clip != self.file.clip_identity:
+            raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
+        return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
 
     def unsure(self, word: str) -> str:
         """The training photo in which a taught word is least sure: the next one to mark.
@@ -640,61 +546,6 @@ class Scene:
         """Tells what the scene doesn't show."""
         return Doubts(self.engine.of_gaussians, lambda texts: self.text.plain_queries(texts).to(self.device))
 
-    @cached_property
-    def visible(self) -> Mapping[str, VisibleGaussians]:
-        """The Gaussians visible in the training views; measured once, with a progress bar."""
-        cameras = self._small_cameras
-        views = load_visible(self._cache, self._views_key, cameras, self.device) if self._cache else None
-        if views is None:
-            what = "measuring which Gaussians the photos show, once"
-            shown = watched(cameras.items(), what, self._watch)
-            views = {name: self._visible(name, camera) for name, camera in shown}
-            if self._cache:
-                save_visible(self._cache, views, self._views_key)
-        return views
-
-    def _visible(self, name: str, camera: Camera) -> VisibleGaussians:
-        mask = self.file.photo(name).foreground((camera.height, camera.width))
-        weight = torch.ones(camera.height, camera.width) if mask is None else mask.float()
-        return VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
-
-    def _fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
-        drawn = partial(composite, self.splats, camera, backend=self.backend)
-        return filled_pixels(drawn, weight, len(self.splats))
-
-    @cached_property
-    def mass(self) -> Float[Tensor, " n"]:
-        """Pixels that every Gaussian fills, over all views."""
-        mass = self.splats.means.new_zeros(len(self.splats))
-        for view in self.visible.values():
-            mass[view.rows.long()] += view.pixels.float()
-        return mass
-
-    @cached_property
-    def trained_side(self) -> int:
-        """Longer side of the photos in training, pixels: their median."""
-        sides = sorted(max(p.camera.width, p.camera.height) for p in self.photos if p.split == "train")
-        return sides[len(sides) // 2] if sides else LARGEST
-
-    @cached_property
-    def gap(self) -> float:
-        """Matches closer than this are connected: 3 % of the median distance at which the scene is seen,
-        about eight pixels of a small view."""
-        distances = torch.tensor([view.distance(self.splats.means) for view in self.visible.values()])
-        return 0.03 * float(distances.nanmedian())
-
-    @cached_property
-    def _small_cameras(self) -> dict[str, Camera]:
-        photos = [photo for photo in self.photos if photo.split == "train"]
-        count = min(self.config.views, len(photos))
-        chosen = [photos[i * len(photos) // count] for i in range(count)]
-        return {photo.name: resized(photo.camera, self.config.view_side) for photo in chosen}
-
-    @cached_property
-    def _views_key(self) -> str:
-        c, shapes = self.config, vars(self.splats.gaussians)
-        return fingerprint(shapes, [asdict(self.file), c.views, c.view_side])
-
 
 def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
     """The CLIP that a scene's features come from. Raises UserError if there is none, or it has changed."""
@@ -706,6 +557,16 @@ def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
             f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
         )
     return encoder.encode_texts
+
+
+def _expect_match(question: Question) -> None:
+    """Raises UserError if no Gaussian matches the first prompt."""
+    if not question.gaussians[0].any():
+        best, level = float(question.relevancy[0].max()), question.thresholds[0]
+        raise UserError(
+            f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
+            f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
+        )
 
 
 def _listed(texts: Any) -> list[Any]:

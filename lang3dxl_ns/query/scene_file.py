@@ -225,7 +225,7 @@ def read_scene(
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
     """What a scene file says of itself: `provenance`, `scene`, `gaussians`, `photos`, `clip`, `decoder`,
-    `looks` and `bytes`.
+    `looks`, `taught` (the words taught by example) and `bytes`.
 
     Raises UserError as `read_scene` does; no tensor is read.
     """
@@ -240,6 +240,7 @@ def describe_scene_file(path: str | Path) -> dict[str, Any]:
             "clip": described.scene.clip,
             "decoder": described.decoder,
             "looks": described.looks is not None,
+            "taught": described.taught,
             "bytes": path.stat().st_size,
         }
 

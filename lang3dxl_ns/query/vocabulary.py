@@ -8,7 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.doubt import UNRELATED
@@ -65,12 +64,3 @@ def whole_words(clip: str | Path) -> tuple[str, ...]:
     names = [token if isinstance(token, str) else token[0] for token in tokens]
     words = (_WHOLE.fullmatch(name) for name in names)
     return tuple(sorted({found["end"] or found["start"] for found in words if found}))
-
-
-def read_vocabulary(path: Path) -> tuple[str, ...]:
-    """Words or phrases from a text file, one per line. Raises UserError if it can't be read."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} can't be read as a list of words ({error}): give one per line") from error
-    return tuple(dict.fromkeys(line.strip() for line in lines if line.strip()))

@@ -15,7 +15,9 @@ from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.read_splats import read_splats
 from lang3dxl_ns.query.scene_file import read_scene
+from lang3dxl_ns.query.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.query.teach import Example
 
 SETTINGS = AttachConfig(
     views=6, up="z", preparation=PreparationConfig(clip="builtin", dense="builtin", dense_tokens=16)
@@ -65,6 +67,16 @@ def test_exported_and_attached_again_it_has_the_same_words_and_nothing_is_encode
     seen = (np.linalg.norm(a, axis=1) > 0) & (np.linalg.norm(b, axis=1) > 0)
     assert seen.mean() > 0.5
     assert float((a[seen] * b[seen]).sum(1).mean()) > 0.99
+
+
+@pytest.mark.slow
+def test_written_over_a_scene_it_keeps_the_words_that_were_taught(place):
+    path = place / "taught.scene"
+    scene = read_scene(place / "box.scene")
+    photo = Example(scene.photos[0].name, box=(30, 30, 80, 60))
+    write_scene_file(path, scene.teach("gizmo", photo))
+    attach(place / "box.ply", place / "photos", path, SETTINGS)
+    assert len(read_scene(path).words["gizmo"].examples) == 1
 
 
 @pytest.mark.slow

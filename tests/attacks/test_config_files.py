@@ -15,9 +15,10 @@ from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.open_scene import load_scene
-from lang3dxl_ns.plugin.load_scene import read_checkpoint
 from lang3dxl_ns.plugin.open_run import open_run
-from lang3dxl_ns.plugin.saved_config import TRUST_VARIABLE, check_command_line, read_config
+from lang3dxl_ns.plugin.trainer_config import read_config
+from lang3dxl_ns.query.run_checkpoint import read_checkpoint
+from lang3dxl_ns.query.run_settings import TRUST_VARIABLE, check_command_line
 
 TRAPS = [
     "!!python/object/apply:os.system ['touch {trap}']",

@@ -12,7 +12,7 @@ import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from lang3dxl_ns.plugin.viewer.guard import RENDER_NAME, Guard, file_name, guard_viewers
+from lang3dxl_ns.query.web.viewer_guard import RENDER_NAME, Guard, file_name, guard_viewers
 
 CAMERA = {
     "type": "ViewerCameraMessage",

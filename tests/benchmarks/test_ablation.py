@@ -221,6 +221,14 @@ def test_a_seed_that_lacks_a_scene_is_left_out_of_the_mean_over_scenes(tmp_path)
     assert full["mean"]["map"] == {"mean": pytest.approx(0.15), "std": 0.0, "runs": 1}
 
 
+def test_scenes_of_one_family_have_a_mean_and_the_deviation_between_them(tmp_path):
+    scores = {"hall-1": 0.2, "hall-2": 0.4, "mosque-1": 0.5}
+    figures = {Run(BY_NAME[FULL], Path(s), s, 0): {"map": value} for s, value in scores.items()}
+    write_ablation(tmp_path, "", [BY_NAME[FULL]], figures, {})
+    text = (tmp_path / "ablation.md").read_text()
+    assert "| mAP by family | hall | mosque |" in text and "| 0.300 ± 0.141 | 0.500 |" in text
+
+
 def test_a_line_of_the_table_is_a_run():
     text = table_of_runs({Run(Row("a", "g", "l"), Path("s"), "s", 3): {"map": 0.25, "psnr": 9.0}})
     assert text == "row,group,scene,steps,seed,map,psnr\na,g,s,1200,3,0.25,9.0\n"

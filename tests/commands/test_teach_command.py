@@ -102,6 +102,44 @@ def test_words_are_carried_to_another_scene(place, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, "'gizmo' is kept, learned anew from its examples (1)"),
+        ({"data": "tower"}, "'gizmo' is kept, as it was"),
+        ({"data": "tower", "clip_identity": "45"}, "'gizmo' is lost: 'gizmo' was learned with another CLIP"),
+    ],
+)
+def test_a_scene_written_over_another_keeps_its_words_and_says_so(place, tmp_path, capsys, change, said):
+    scene = read_scene(place, "cpu")
+    new = painted_scene(
+        splats=scene.splats, codes=scene.codes, decoder=scene.decoder, file=replace(scene.file, **change)
+    )
+    write_scene(tmp_path / "new.scene", new)
+    teach(place, "--box", DOME)
+    before = words(place)["gizmo"]
+    main(["export", str(tmp_path / "new.scene"), "--scene-file", str(place)])
+    assert said in capsys.readouterr().out.replace("\n", " ")
+    after = words(place).get("gizmo")
+    if "lost" in said:
+        assert after is None
+    else:
+        assert torch.allclose(after.vector, before.vector, atol=1e-5)
+        assert len(after.examples) == (not change)
+
+
+def test_a_scenes_own_words_win_and_a_damaged_file_is_written_over(place, tmp_path, capsys):
+    other = tmp_path / "other.scene"
+    write_scene(other, read_scene(place, "cpu"))
+    teach(other, "--at", "69,69")
+    teach(place, "--box", DOME)
+    main(["export", str(place), "--scene-file", str(other)])
+    assert words(other)["gizmo"].examples[0].box is not None
+    other.write_bytes(b"nonsense")
+    main(["export", str(place), "--scene-file", str(other)])
+    assert "are lost" in capsys.readouterr().out and words(other)["gizmo"].examples
+
+
+@pytest.mark.parametrize(
     ("flags", "message"),
     [
         (["--box", "1,2,3"], "4 numbers"),

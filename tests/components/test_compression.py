@@ -1,5 +1,7 @@
 """Laws of compressing features on Gaussians to a few numbers each."""
 
+from functools import partial
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -130,6 +132,25 @@ def test_a_hundred_times_as_many_gaussians_are_compressed_as_well():
         )
         found.append(centered_cosine(features, trained, codes))
     assert found[0] > 0.95 and found[1] > found[0] - 0.02
+
+
+@pytest.mark.parametrize(("count", "factor"), [(1, 1), (64, 1), (4 * 64, 2), (9 * 64, 3), (10**6, 3)])
+def test_work_grows_with_the_gaussians_within_limits(count, factor):
+    config = CompressionConfig(steps=10, batch=8, sample=64)
+    grown = config.grown(count)
+    assert (grown.steps, grown.sample, grown.batch) == (factor * 10, factor * 64, 8)
+
+
+def test_many_gaussians_are_fitted_in_more_steps_which_advance_the_bar_as_few_do():
+    advanced = []
+    for count in (64, 9 * 64):
+        features, _ = clusters([count // 4] * 4)
+        decoder = CompressedField(
+            SemanticFieldConfig("short", code_dim=3), CHANNELS, CompressionConfig(100, 64, sample=64)
+        )
+        decoder.learn_gaussians(features, torch.ones(len(features)), partial(advanced.append, count))
+        assert advanced.count(count) == decoder.learning_steps == 100
+    assert CompressedField(SemanticFieldConfig("short"), CHANNELS).learning_seconds(10**6) > 180
 
 
 def test_the_centered_cosine_sees_what_the_cosine_does_not():

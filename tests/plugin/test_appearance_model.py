@@ -1,5 +1,7 @@
 """The appearance field in the model: its effects, and its checkpoint."""
 
+from copy import deepcopy
+
 import pytest
 import torch
 from conftest import make_trainer
@@ -7,6 +9,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.plugin.optional_components import Lighting
+from lang3dxl_ns.preparation.handover import SceneFacts
 
 USE = "pipeline__model__appearance__use"
 CODES = "pipeline__model__decoder__name"
@@ -59,7 +63,7 @@ def test_off_builds_no_parameters(train, scene):
 
 
 def test_scene_needs_decide_what_is_auto(train, scene, monkeypatch):
-    model = train(scene, iterations=1, semantics=False).pipeline.model
+    config = deepcopy(train(scene, iterations=1, semantics=False).pipeline.model.config)
     for use, needs, expected in (
         ("auto", {}, True),
         ("auto", {"appearance": False}, False),
@@ -67,8 +71,8 @@ def test_scene_needs_decide_what_is_auto(train, scene, monkeypatch):
         ("on", {"appearance": False}, True),
         ("off", {"appearance": True}, False),
     ):
-        model.facts.needs = needs
-        assert model._wants("appearance", use) is expected
+        config.appearance.use = use
+        assert Lighting().wanted(config, SceneFacts(needs=needs)) is expected
 
 
 def test_first_iteration_moves_gaussians_as_without_appearance(train, scene):

@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+from scenes import view_of
 
-from lang3dxl_ns.plugin.cameras import lens_of, to_nerfstudio, to_rasterizer, view_of
+from lang3dxl_ns.plugin.cameras import lens_of, to_nerfstudio, to_rasterizer
 from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 
 LENS = Lens(width=64, height=48, fx=50.0, fy=57.0, cx=30.0, cy=26.0)

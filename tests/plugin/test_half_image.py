@@ -6,8 +6,9 @@ from conftest import make_trainer
 
 from lang3dxl_ns.components.looks import Look
 from lang3dxl_ns.components.losses import rgb_loss
+from lang3dxl_ns.evaluation.half_image import HalfImageProtocol
 from lang3dxl_ns.evaluation.image_metrics import psnr
-from lang3dxl_ns.plugin.half_image import fit_look, half_image
+from lang3dxl_ns.plugin.cameras import to_rasterizer
 
 USE = "pipeline__model__appearance__use"
 SHIFT = "pipeline__model__appearance__opacity_shift"
@@ -36,6 +37,20 @@ def photo(pipeline):
     return next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
 
 
+def protocol(model):
+    background, weight = model._get_background_color(), model.config.ssim_lambda
+    return HalfImageProtocol(model.splats(), model.appearance, model.image_metrics, background, weight)
+
+
+def half_image(model, camera, batch):
+    mask = batch["mask"][..., 0] if "mask" in batch else None
+    return protocol(model).measure(to_rasterizer(camera), model.get_gt_img(batch["image"]), mask)
+
+
+def fit_look(model, camera, left, steps):
+    return protocol(model).fit(to_rasterizer(camera), left, steps=steps)
+
+
 def halves(image):
     middle = image.shape[1] // 2
     return image[:, :middle], image[:, middle:]
@@ -61,7 +76,7 @@ def test_nothing_of_the_right_half_is_seen(pipeline, photo):
 def test_nothing_of_the_left_half_is_scored(pipeline, photo, monkeypatch):
     camera, batch = photo
     vector = pipeline.model.appearance.vectors[0].detach()
-    monkeypatch.setattr("lang3dxl_ns.plugin.half_image.fit_look", lambda *_: vector)
+    monkeypatch.setattr(HalfImageProtocol, "fit", lambda *_: vector)
     changed = batch | {"image": batch["image"].clone()}
     halves(changed["image"])[0][:] = 0
     first, second = (half_image(pipeline.model, camera, b).figures for b in (batch, changed))

@@ -48,7 +48,6 @@ def test_the_help_does_not_offer_them(capsys):
         ("pipeline.model.warm_up", 0.5),
         ("pipeline.model.feature_gradient_to_geometry", True),
         ("pipeline.model.downsampler", DownsamplerConfig(hidden=8)),
-        ("pipeline.model.decoder.start", "gathered"),
         ("pipeline.datamanager.regions", "felzenszwalb"),
     ],
 )

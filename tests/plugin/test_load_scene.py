@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 from math import isqrt
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,15 +13,15 @@ import torch
 from conftest import make_trainer
 from PIL import Image
 from plyfile import PlyData
-from scenes import write_scene
+from scenes import view_of, write_scene
 
 import lang3dxl_ns
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.language import open_scorer
-from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
-from lang3dxl_ns.query.scene_file import describe_scene_file
+from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words
+from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 
@@ -85,6 +86,23 @@ def test_training_leaves_a_scene_file_that_answers_like_the_run(scene, trainer):
         assert 10 * np.log10(1 / max(np.square(here - there).mean(), 1e-9)) > 40
     # The mask's file has moved with the data, but the scene holds it.
     assert found.file.photo("photo_001").foreground() is not None
+
+
+def test_a_resumed_run_keeps_the_words_that_were_taught(train, scene_photos):
+    first = train(scene_photos, iterations=2)
+    (path,) = first.base_dir.glob("*.scene")
+    keep_words(path, taught_in(path).words.values())
+    again = train(scene_photos, iterations=3, load_dir=first.checkpoint_dir)
+    assert again.base_dir != first.base_dir
+    assert len(lang3dxl_ns.load_scene(again.base_dir).words["gizmo"].examples) == 1
+
+
+def taught_in(path: Path):
+    """A scene that was taught a word."""
+    scene = lang3dxl_ns.load_scene(path)
+    photo = scene.photos[0]
+    width, height = photo.lens.width, photo.lens.height
+    return scene.teach("gizmo", Example(photo.name, box=(width / 4, height / 4, width / 2, height / 2)))
 
 
 def test_asking_a_scene_file_loads_neither_nerfstudio_nor_the_trainer(trainer):

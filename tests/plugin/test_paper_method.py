@@ -1,17 +1,13 @@
 """`ns-train lang3dxl-paper`: the paper's settings, and what they train."""
 
 from copy import deepcopy
-from functools import partial
 
 import pytest
 import torch
 from conftest import make_trainer
 
 from lang3dxl_ns.methods import METHODS, lang3dxl_paper
-from lang3dxl_ns.plugin import pipeline
-from lang3dxl_ns.plugin.lift_features import start_codes
 from lang3dxl_ns.plugin.optimizers import RunSchedule
-from lang3dxl_ns.rendering.gathering import Pixels, gather
 
 ITERATIONS = 70_000
 
@@ -70,6 +66,18 @@ def test_weights_sizes_and_schedules_are_the_published_ones(fitted):
     assert (data.crops, data.regions, data.scale_mode) == ("pyramid", "sam", "physical")
 
 
+@pytest.mark.parametrize(
+    ("iterations", "decoder", "preset"),
+    [(4_999, "paper", "short"), (5_000, "paper", "paper"), (5_000, "fmgs", "default")],
+)
+def test_the_field_is_as_printed_in_runs_that_are_long_enough_for_it(iterations, decoder, preset, capsys):
+    config = deepcopy(lang3dxl_paper.config)
+    config.max_num_iterations, config.pipeline.model.decoder.name = iterations, decoder
+    config.fit_to_run()
+    assert config.pipeline.model.semantic_field.preset == preset
+    assert (f"preset {preset}" in capsys.readouterr().out) == (decoder == "paper")
+
+
 def test_the_default_is_another_method_with_settings_of_its_own():
     default = METHODS["lang3dxl"].config
     assert default.method_name == "lang3dxl" and lang3dxl_paper.config.method_name == "lang3dxl-paper"
@@ -125,38 +133,3 @@ def test_a_run_has_words_at_its_last_iteration_and_reads_as_this_method(trained)
     assert not trained.pipeline.has_words_to_learn
     assert trained.base_dir.parent.name == "lang3dxl-paper"
     assert list(trained.base_dir.glob("*.scene"))
-
-
-def test_codes_may_start_as_the_principal_components_of_gathered_features(trained):
-    model, data = trained.pipeline.model.train(), trained.pipeline.datamanager
-    pixels = [(camera, batch["clip_target"]) for camera, batch in data.train_photos()]
-    views = [
-        (partial(model.composite, camera), Pixels.of([target], (int(camera.height), int(camera.width)), None))
-        for camera, target in pixels
-    ]
-    features, mass = gather(model.num_points, views, pixels[0][1].shape[-1], model.means.detach())
-    seen, codes = mass > 0, model.gauss_params["codes"]
-    with torch.no_grad():
-        before = codes.fill_(9.0).clone()
-    start_codes(model, data.train_photos())
-    assert torch.equal(codes[~seen], before[~seen])
-    rows = torch.cat([target.flatten(0, 1) for _, target in pixels]).double()
-    _, axes = torch.linalg.eigh((rows - rows.mean(0)).T @ (rows - rows.mean(0)))
-    places = (features[seen].double() - rows.mean(0)) @ axes[:, -3:].flip(1)
-    expected = (places / places.std(0)).clamp(-3, 3).float()
-    torch.testing.assert_close(codes[seen].abs(), expected.abs(), rtol=1e-2, atol=1e-2)
-
-
-def test_they_do_when_the_warm_up_ends(scene, tiny_clip, tiny_dense, tmp_path, monkeypatch):
-    steps = []
-    monkeypatch.setattr(pipeline, "start_codes", lambda model, photos: steps.append(model.step))
-    changes = {
-        "pipeline__datamanager__regions": "none",
-        "pipeline__model__decoder__start": "gathered",
-        "pipeline__model__warm_up": 0.3,
-        "pipeline__model__downsampler__hidden": 0,
-    }
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path, 5, method="lang3dxl-paper", **changes)
-    trainer.setup()
-    trainer.train()
-    assert steps == [2]

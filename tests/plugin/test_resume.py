@@ -57,7 +57,7 @@ def test_resumed_at_a_step_the_run_ends_as_if_it_had_never_stopped(train, scene,
     """Densification follows both steps, and its statistics are half collected at 5."""
     middle = whole.checkpoint_dir / f"step-{step:09d}.ckpt"
     resumed = train(scene, iterations=24, load_checkpoint=middle, **EVERYTHING)
-    assert resumed.first_iteration == step + 1
+    assert resumed._start_step == step + 1
     before = len(torch.load(middle, weights_only=True)["pipeline"]["_model.gauss_params.means"])
     assert resumed.pipeline.model.num_points > before
     assert same(last_checkpoint(whole), last_checkpoint(resumed)) == []

@@ -11,7 +11,7 @@ SMALL = {
     "datamanager__regions": "felzenszwalb",
     "datamanager__dense_tokens": 16,
     "datamanager__foreground": "none",
-    "model__decode_size": (28, 40),
+    "model__decode_size": (48, 64),
     "model__downsampler__hidden": 8,
     "model__feature_gradient_to_geometry": False,
     "model__appearance__use": "off",
@@ -19,9 +19,10 @@ SMALL = {
 """The published network at a fraction of its costs per step."""
 
 
-@pytest.mark.nightly
-@pytest.mark.xfail(strict=True, reason="at 300 iterations: mAP .083, chance .061, teacher .561")
-def test_words_are_found_far_above_chance_and_half_as_well_as_by_the_teacher(tmp_path):
+@pytest.mark.slow
+def test_words_are_found_half_as_well_as_by_the_teacher_and_none_collapses(tmp_path):
+    """The field as printed has mAP .13 after as many iterations, and the best word a half of the teacher's,
+    the others a quarter or less."""
     shape = {"photos": 14, "test_views": 6, "width": 288, "height": 216}
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=620, family="cathedral", wild=False, **shape))
     changes = {f"pipeline__{path}": value for path, value in SMALL.items()}
@@ -33,3 +34,7 @@ def test_words_are_found_far_above_chance_and_half_as_well_as_by_the_teacher(tmp
     found = average([photo.metrics for photo in trainer.pipeline.evaluation.evaluate("test")])
     assert found["map"] > 3 * found["chance_map"]
     assert found["map"] > 0.5 * found["teacher_map"]
+    words = [name.removeprefix("teacher_ap_") for name in found if name.startswith("teacher_ap_")]
+    assert len(words) == 4
+    for word in words:
+        assert found[f"ap_{word}"] > found[f"teacher_ap_{word}"] / 3, word

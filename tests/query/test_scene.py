@@ -1,5 +1,6 @@
 """Queries on a scene with known answers."""
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.scene import QueryConfig, Scene
+from lang3dxl_ns.rendering.rasterize import rasterize
 from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.scene.camera import camera_to_world
 
@@ -105,6 +107,24 @@ def test_several_prompts_share_one_rendering(scene):
     assert matches[0].view is matches[2].view
 
 
+@pytest.mark.parametrize(("size", "passes"), [(48, 1), (96, 1), (192, 2)])
+def test_a_view_of_at_most_the_training_size_takes_one_pass(scene, monkeypatch, size, passes):
+    drawn = []
+
+    def counted(gaussians, camera, *args, **settings):
+        drawn.append(camera.width)
+        return rasterize(gaussians, camera, *args, **settings)
+
+    question = scene.ask("dome; window")
+    monkeypatch.setattr(sys.modules["lang3dxl_ns.rendering.render"], "rasterize", counted)
+    match, _ = scene.matches(question, "all/0003.jpg", size)
+    assert drawn == [size, 96][:passes]
+    if passes == 1:
+        apart = composite(scene.splats, match.view.camera, question.channels)
+        expected = question.maps(replace(match.view.rendering, channels=apart))[0][0]
+        np.testing.assert_allclose(match.relevancy, expected, atol=1e-6)
+
+
 def test_a_negative_takes_its_pixels_away(scene):
     alone, against = scene.query(['dome; dome not "domes"'], "right/0002.jpg")
     assert alone.mask.any() and not against.mask.any()
@@ -159,6 +179,27 @@ def test_a_pixel_is_named(scene):
     assert len(scene.what_is("right/0002.jpg", column, row, most=3)) == 3
     with pytest.raises(UserError, match="outside the view"):
         scene.what_is("0003", 5000, 3)
+
+
+def test_words_of_a_pixel_have_the_relevancies_of_its_gaussians():
+    scene = painted_scene(config=QueryConfig(temperature=1.0))
+    dome = scene.ask("dome").gaussians[0].nonzero()[0, 0]
+    expected = scene.engine.of_gaussians(scene.text.plain_queries(["dome"]))[0, dome]
+    column, row = scene.query("dome", "right/0002.jpg").peak
+    ((_, score),) = scene.what_is("right/0002.jpg", column, row, words=["dome"])
+    assert scene.engine.temperature != 1 and 0.55 < expected < 0.9
+    assert score == pytest.approx(float(expected), abs=1e-3)
+
+
+def test_nothing_is_named_at_the_sky_and_where_nothing_has_a_meaning(scene):
+    place = ("right/0002.jpg", *scene.query("dome", "right/0002.jpg").peak)
+    dome, codes = scene.ask("dome").gaussians[0], scene.codes
+    sky = F.normalize(encode_texts(["sky"]), dim=1)
+    for changed in (sky, torch.full_like(sky, torch.nan)):
+        other = painted_scene(codes=torch.where(dome[:, None], changed, codes))
+        assert other.what_is(*place) == []
+        column, row = other.query("windows", "left/0001.jpg").peak
+        assert other.what_is("left/0001.jpg", column, row)[0][0] in ("window", "windows")
 
 
 def test_features_are_unit_vectors_and_unseen_gaussians_have_none(scene):

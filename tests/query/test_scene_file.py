@@ -13,6 +13,7 @@ from painted_scene import (
     encode_texts,
     painted_file,
     painted_gaussians,
+    painted_looks,
     painted_scene,
     painted_splats,
 )
@@ -20,23 +21,9 @@ from PIL import Image
 
 from lang3dxl_ns.baselines.decoders import NAMES, DecoderConfig, make_decoder
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
-from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import Provenance, describe_scene_file, read_scene, write_scene
-
-
-def looks(seed: int = 0) -> Looks:
-    generator = torch.Generator().manual_seed(seed)
-    names = [photo.name for photo in painted_file().photos if photo.split == "train"]
-    field = AppearanceField(AppearanceConfig(), names, torch.zeros(3), 5.0, generator=generator)
-    with torch.no_grad():
-        field.output.weight.normal_(0, 0.2, generator=generator)
-        for photo in painted_file().photos[:3]:
-            pose = photo.camera.view_matrix
-            field.remember(photo.name, -pose[:3, :3].T @ pose[:3, 3], pose[2, :3])
-    return Looks(field.eval().requires_grad_(False))
 
 
 def decoded(name: str, seed: int = 0) -> dict:
@@ -60,7 +47,9 @@ def decoded(name: str, seed: int = 0) -> dict:
 
 @pytest.fixture
 def written(tmp_path):
-    scene = painted_scene(**decoded("gathered"), looks=looks(), background=torch.tensor([0.2, 0.0, 1.0]))
+    scene = painted_scene(
+        **decoded("gathered"), looks=painted_looks(), background=torch.tensor([0.2, 0.0, 1.0])
+    )
     path = tmp_path / "wall.scene"
     write_scene(path, scene, Provenance(title="A wall", credit="Painters", license="CC BY 4.0"))
     return scene, path
@@ -86,7 +75,7 @@ def asdict_of(photo):
     return photo.name, photo.split, photo.camera_to_world, photo.lens, photo.size
 
 
-@pytest.mark.parametrize("looks", [None, looks()], ids=["one lighting", "looks"])
+@pytest.mark.parametrize("looks", [None, painted_looks()], ids=["one lighting", "looks"])
 def test_common_words_need_no_clip(tmp_path, looks):
     """The CLIP that this scene names is nowhere."""
     scene, path = painted_scene(**decoded("gathered"), looks=looks), tmp_path / "wall.scene"

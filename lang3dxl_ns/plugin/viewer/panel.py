@@ -14,17 +14,17 @@ from nerfstudio.viewer.viewer_elements import ViewerControl
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.worker import Worker
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.plugin.viewer.fly_to import stand_of
 from lang3dxl_ns.plugin.viewer.frame_size import keep_frames_recognizable
-from lang3dxl_ns.plugin.viewer.guard import Guard, guard_viewers
-from lang3dxl_ns.plugin.viewer.session import Conversation, plain
-from lang3dxl_ns.plugin.viewer.worker import Worker
+from lang3dxl_ns.query.conversation import Conversation, plain
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.run_file import SceneFile
+from lang3dxl_ns.query.web.viewer_guard import Guard, guard_viewers
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.scene.stand import stand_of
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
@@ -230,8 +230,6 @@ def _place_camera(client: viser.ClientHandle, camera: Camera, target: tuple[floa
 
 class _Answers:
     """The panel's answers to renderings."""
-
-    look = None
 
     def __init__(self, panel: AskPanel) -> None:
         self._panel = panel

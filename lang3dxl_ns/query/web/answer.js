@@ -1,5 +1,6 @@
 // Answers: cosines to relevancy, the threshold from which a place matches, and doubt, as in Python's query/.
 
+const CLEAR = 0.55; // relevancy from which a word names a place that is else sky, or nothing in particular
 const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.4, BEST = 0.005, LEAST_PEAK = 0.1;
 const TIE = 0.999; // numbers of 16 bits: what is equal in Python may differ by less than this
 
@@ -9,6 +10,7 @@ export class Answers {
   constructor(rows, vocabulary, words) {
     Object.assign(this, { rows, vocabulary, words });
     this.competing = []; // cosines with shared negatives as 16-bit integers, made when first needed
+    this.foreground = null; // 1 for Gaussians that may match
   }
 
   competitor(i) {
@@ -16,39 +18,43 @@ export class Answers {
     return this.competing[i];
   }
 
-  /** Relevancy of every Gaussian, 0…1: sigmoid(τ (best of near − best of the others)); 0 where nothing is known. */
-  relevancy({ near, against }, negatives = []) {
+  /** Relevancy of every Gaussian, 0…1: sigmoid(τ margin), 0 where nothing is known. The margin of a text is the
+   * best of near − the best of the others; a taught word adds a share of it to its own. */
+  relevancy({ near, against, taught }, negatives = []) {
     const best = largest(near.map((vector) => this.rows.times(vector)));
     const own = negatives.map((vector) => this.rows.times(vector)), shared = against.map((i) => this.competitor(i));
-    const { temperature } = this.words, { scales } = this.rows;
+    const { temperature } = this.words, { scales } = this.rows, learned = taught && this.rows.times(taught.vector);
     for (let i = 0; i < best.length; i++) {
       let other = -32768;
       for (const cosines of shared) if (cosines[i] > other) other = cosines[i];
       other /= 32767;
       for (const cosines of own) if (cosines[i] > other) other = cosines[i];
-      best[i] = scales[i] ? sigmoid(temperature * (best[i] - other)) : 0;
+      const margin = taught ? learned[i] + taught.bias + taught.text * (best[i] - other) : best[i] - other;
+      best[i] = scales[i] ? sigmoid(temperature * margin) : 0;
     }
     return best;
   }
 
-  /** What is found: peak, doubt, threshold, and the number of Gaussians that match. */
-  verdict(relevancy, named, threshold = null) {
+  /** What is found: peak, doubt, threshold, and the number of Gaussians of the foreground that match.
+   * strict: whether it has to beat negatives of its own, or was taught; doubt: where it is known. */
+  verdict(relevancy, { strict = false, doubt = null, threshold = null }) {
     const sorted = relevancy.slice().sort(), count = sorted.length;
     let fit = 0;
     const top = Math.max(Math.ceil(BEST * count), 1);
     for (let i = count - top; i < count; i++) fit += sorted[i] / top;
     const { unrelated } = this.words;
     const asWell = unrelated.filter((other) => other >= fit * TIE).length;
-    const doubt = fit < LEAST_PEAK ? 1 : (1 + asWell) / (1 + unrelated.length);
+    doubt ??= fit < LEAST_PEAK ? 1 : (1 + asWell) / (1 + unrelated.length);
     const low = sorted[(count - 1) >> 1]; // the median, as torch takes it
-    const own = doubt > DOUBTFUL || named ? EVEN : Math.min(low + SHARE * (fit - low), EVEN);
-    const level = threshold ?? this.words.threshold ?? own;
-    let matching = 0;
-    for (let i = count - 1; i >= 0 && sorted[i] > level; i--) matching++;
-    return { peak: sorted[count - 1], doubt, doubtful: doubt > DOUBTFUL, threshold: level, matching };
+    const own = doubt > DOUBTFUL || strict ? EVEN : Math.min(low + SHARE * (fit - low), EVEN);
+    const level = threshold ?? own, { foreground } = this;
+    const confined = foreground ? relevancy.map((value, i) => value * foreground[i]) : relevancy;
+    let matching = 0, peak = 0;
+    for (const value of confined) (peak = Math.max(peak, value)), (matching += value > level);
+    return { relevancy: confined, peak, doubt, doubtful: doubt > DOUBTFUL, threshold: level, matching };
   }
 
-  /** The words that fit a blend of rows best, with their relevancy, best first. */
+  /** The words that fit a blend of rows best, with their relevancy, best first; none at the sky. */
   naming(blend, most = 5) {
     const { vocabulary, words } = this, length = norm(blend, words.gram);
     const cosine = (vector) => dot(blend, vector) / length;
@@ -57,7 +63,8 @@ export class Answers {
       const { own, against } = vocabulary.word(i);
       return [word, sigmoid(words.temperature * (cosine(own) - Math.max(...against.map((k) => others[k]))))];
     });
-    return scored.sort((a, b) => b[1] - a[1]).slice(0, most);
+    const named = scored.sort((a, b) => b[1] - a[1]).find(([word]) => word !== "sky")[1] > CLEAR;
+    return named || !vocabulary.nothing.includes(others.indexOf(Math.max(...others))) ? scored.slice(0, most) : [];
   }
 }
 

@@ -14,19 +14,21 @@ export function say(message) {
   document.getElementById("status").textContent = message;
 }
 
-export const explain = ({ count, known, live }) =>
-  `${count.toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`);
+export const explain = ({ count, known, live, foreground }) =>
+  `${count.toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`) +
+  (foreground.length ? ` Matches lie on ${foreground.map(([text]) => shown(text)).join(" or ")}.` : "");
 
-function doubtIn({ examples, open, doubt, doubtful }) {
+function doubtIn({ examples, open, taught, doubt, doubtful }) {
   const count = examples && `${examples.length} example${examples.length > 1 ? "s" : ""}`;
-  if (examples) return open ? `${count}: click for more, with Alt for what it is not.` : `${count}.`;
+  if (examples) return open ? `${count}: click for more, with Alt or “Not this” for what it is not.` : `${count}.`;
+  if (taught) return doubtful ? `Doubtful: ${percent(doubt)} of what was not marked fits as well.` : "Taught by example.";
   if (doubt === 1) return "Doubtful: it fits no place. It may not be here, or this scene's CLIP may not know the word.";
   if (doubtful) return `Doubtful: ${percent(doubt)} of unrelated words fit this scene as well. It may not be here, or this scene's CLIP may not know the word.`;
   return `Fits better than ${percent(1 - doubt)} of unrelated words.`;
 }
 
-/** acts: { fly, remove, rename, setThreshold, teach }, each called with the prompt. */
-export function promptCard(prompt, { fly, remove, rename, setThreshold, teach }) {
+/** acts: { fly, remove, rename, setThreshold, teach, undo, forget }, each called with the prompt. */
+export function promptCard(prompt, { fly, remove, rename, setThreshold, teach, undo, forget }) {
   const { text, negatives, color, threshold, peak, matching, views, examples, open } = prompt;
   const card = element("li");
   card.style.setProperty("--color", `rgb(${color})`);
@@ -35,8 +37,12 @@ export function promptCard(prompt, { fly, remove, rename, setThreshold, teach })
   const away = element("button", { className: "small", ariaLabel: `Remove ${shown(text)}`, onclick: () => remove(prompt) }, "×");
   const heading = examples ? element("input", { value: text, ariaLabel: "Name", maxLength: 60 }) : element("strong", {}, name);
   heading.addEventListener("change", () => rename(prompt, heading.value));
-  const more = element("button", { className: "small", ariaPressed: Boolean(open), onclick: () => teach(prompt) }, open ? "Done" : "Add");
-  card.append(element("header", {}, heading, ...(examples ? [more] : []), go, away));
+  const button = (label, act, pressed) => element("button", { className: "small", ariaPressed: pressed, onclick: () => act(prompt) }, label);
+  card.append(element("header", {}, heading, ...(examples ? [button(open ? "Done" : "Add", teach, open)] : []), go, away));
+  if (open) {
+    const without = button("Not this", () => (without.ariaPressed = prompt.without = !prompt.without), prompt.without);
+    card.append(element("div", { className: "teach" }, without, button("Undo", undo), ...(prompt.named ? [button("Forget", forget)] : [])));
+  }
   if (threshold == null) return card;
   const slider = element("input", { type: "range", min: 0, max: 1, step: 0.01, value: threshold, ariaLabel: `Threshold of ${shown(text)}` });
   slider.addEventListener("change", () => setThreshold(prompt, Number(slider.value)));

@@ -1,18 +1,17 @@
 // Where a match is: the views that show it best, and a box around its strongest part, as in Python's query/.
 
-const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, OUTLIERS = 0.02, CORE = 0.002;
+const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, OUTLIERS = 0.02, CORE = 0.002, BINS = 1000;
 
-/** Views with the Gaussians that they show, and the pixels that each fills. */
+/** Views with the Gaussians that they show, and the share of the view that each fills: sizes[codes[k]]. */
 export function readViews(about, buffer) {
   const { count, pixels: [least, steps] } = about.words, bits = Math.ceil(count / 8);
   let start = 0;
   return about.views.map((view) => {
     const seen = new Uint8Array(buffer, start, bits), codes = new Uint8Array(buffer, start + bits, view.bytes - bits);
     start += view.bytes;
-    const rows = new Uint32Array(codes.length), shares = new Float32Array(codes.length);
+    const rows = new Uint32Array(codes.length), area = view.width * view.height;
     for (let i = 0, k = 0; i < count; i++) if ((seen[i >> 3] >> (i & 7)) & 1) rows[k++] = i;
-    for (let k = 0; k < codes.length; k++) shares[k] = (least * 2 ** (codes[k] / steps)) / (view.width * view.height);
-    return { ...view, rows, shares };
+    return { ...view, rows, codes, sizes: Float32Array.from({ length: 256 }, (_, code) => (least * 2 ** (code / steps)) / area) };
   });
 }
 
@@ -22,15 +21,15 @@ export function rankViews(views, centers, relevancy, threshold) {
   const low = top > threshold ? threshold : relevancy.slice().sort()[(relevancy.length - 1) >> 1];
   const level = low + STRONG * (top - low);
   const ranked = views.map((view, v) => {
-    const { rows, shares } = view;
+    const { rows, codes, sizes } = view;
     let area = 0, strong = 0, excess = 0, centered = 0;
     for (let k = 0; k < rows.length; k++) {
-      const value = relevancy[rows[k]];
-      if (value > threshold) area += shares[k];
+      const value = relevancy[rows[k]], share = sizes[codes[k]];
+      if (value > threshold) area += share;
       if (value <= level) continue;
-      strong += shares[k];
-      excess += (value - low) * shares[k];
-      centered += (value - low) * shares[k] * centeredness(view, centers, rows[k]);
+      strong += share;
+      excess += (value - low) * share;
+      centered += (value - low) * share * centeredness(view, centers, rows[k]);
     }
     const closeness = Math.max(0, Math.min((peaks[v] - low) / Math.max(top - low, 1e-9), 1));
     const rank = (closeness * Math.sqrt(Math.min(strong / LARGE, 1)) * centered) / Math.max(excess, 1e-12);
@@ -39,13 +38,21 @@ export function rankViews(views, centers, relevancy, threshold) {
   return ranked.sort((a, b) => b.shown - a.shown || b.rank - a.rank);
 }
 
-function peakOf({ rows, shares }, relevancy) {
-  const order = rows.map((_, k) => k).sort((a, b) => relevancy[rows[b]] - relevancy[rows[a]]);
+/** Mean relevancy of the most relevant share PEAK of a view. */
+function peakOf({ rows, codes, sizes }, relevancy) {
+  const filled = new Float32Array(BINS + 1), bin = (k) => Math.floor(BINS * relevancy[rows[k]]);
+  for (let k = 0; k < rows.length; k++) filled[bin(k)] += sizes[codes[k]];
+  let level = BINS, reached = filled[level];
+  while (level > 0 && reached < PEAK) reached += filled[--level];
+  const order = [];
+  for (let k = 0; k < rows.length; k++) if (bin(k) >= level) order.push(k);
+  order.sort((a, b) => relevancy[rows[b]] - relevancy[rows[a]]);
   let before = 0, sum = 0;
   for (const k of order) {
     if (before >= PEAK) break;
-    sum += Math.min(PEAK - before, shares[k]) * relevancy[rows[k]];
-    before += shares[k];
+    const share = sizes[codes[k]];
+    sum += Math.min(PEAK - before, share) * relevancy[rows[k]];
+    before += share;
   }
   return sum / PEAK;
 }
@@ -61,7 +68,7 @@ function centeredness({ pose, fx, fy, cx, cy, width, height }, centers, row) {
 /** Pixels that every Gaussian fills, over all views. */
 export function massOf(views, count) {
   const mass = new Float32Array(count);
-  for (const { rows, shares, width, height } of views) rows.forEach((row, k) => (mass[row] += shares[k] * width * height));
+  for (const { rows, codes, sizes, width, height } of views) rows.forEach((row, k) => (mass[row] += sizes[codes[k]] * width * height));
   return mass;
 }
 

@@ -3,7 +3,8 @@ import { element, explain, percent, promptCard, say, shown } from "./cards.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
-const MOST_REMEMBERED = 20, TYPING = 500; // earlier prompts; milliseconds until negatives take effect
+const MOST_KEPT = 20, TYPING = 500; // earlier prompts, and named words; milliseconds until negatives take effect
+const UNNAMED = /^like this \d+$/;
 const $ = (id) => document.getElementById(id);
 const prompts = [];
 let about, view, latest = null, read = "", settled = false; // settled: the address has been read
@@ -38,12 +39,20 @@ async function answer(prompt) {
   const turn = (prompt.turn = {}); // a later answer to the same prompt wins
   const found = await think("ask", { text, examples, negatives, threshold });
   if (turn !== prompt.turn || !found.known) return found;
-  Object.assign(prompt, found, { views: null, box: null });
-  prompt.finding = think("find", { relevancy: found.relevancy, threshold: found.threshold }).then((places) => {
-    if (turn === prompt.turn) Object.assign(prompt, places);
-    draw();
-  });
-  return found;
+  return Object.assign(prompt, found, { views: null, box: null, finding: null });
+}
+
+/** Look for the views that show prompts best, once their heat is drawn. */
+function findPlaces() {
+  for (const prompt of prompts.filter((one) => one.relevancy && !one.finding)) {
+    const { relevancy, threshold, turn } = prompt;
+    prompt.finding = think("find", { relevancy, threshold }).then((places) => {
+      if (turn !== prompt.turn) return;
+      Object.assign(prompt, places);
+      prompt.card.querySelector(".fly").disabled = !places.views.length;
+      drawBoxes();
+    });
+  }
 }
 
 /** Ask prompts as if typed: several are separated by `;`. Resolves to the answer to the last. */
@@ -52,8 +61,8 @@ async function ask(typed) {
   $("near").replaceChildren();
   let found = null;
   for (const { text, negatives } of about.words ? parsePrompts(String(typed)) : []) {
-    const old = prompts.find((prompt) => !prompt.examples && prompt.text === text && String(prompt.negatives) === String(negatives));
-    const prompt = old ?? { text, negatives, color: unusedColor() };
+    const old = prompts.find((prompt) => prompt.text === text && String(prompt.negatives) === String(negatives));
+    const prompt = old ?? { negatives, color: unusedColor(), ...(namedWord(text) ?? { text }) };
     found = await answer(prompt);
     if (!found.known) {
       offerClosest(found);
@@ -61,7 +70,7 @@ async function ask(typed) {
     }
     if (!old) prompts.push(prompt);
     remember(text);
-    draw();
+    draw(prompt);
   }
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
@@ -86,10 +95,13 @@ async function attempt(work) {
 
 // ── showing ──
 
-function draw() {
-  const acts = { fly, remove, rename, setThreshold, teach };
-  $("prompts").replaceChildren(...prompts.map((prompt) => promptCard(prompt, acts)));
+/** Show all prompts; newest: the one to scroll to, where the panel is small. */
+function draw(newest = null) {
+  const acts = { fly, remove, rename, setThreshold, teach, undo, forget };
+  for (const prompt of prompts) prompt.card = promptCard(prompt, acts);
+  $("prompts").replaceChildren(...prompts.map(({ card }) => card));
   view.recolor(prompts.filter((prompt) => prompt.relevancy));
+  newest?.card.scrollIntoView({ block: "nearest" });
   drawBoxes();
   writeAddress();
 }
@@ -129,7 +141,10 @@ function remove(prompt) {
 }
 
 function rename(prompt, name) {
-  prompt.text = tidy(name).replaceAll("~", " ") || prompt.text;
+  const before = prompt.text;
+  prompt.text = tidy(name).replaceAll("~", " ") || before;
+  prompt.named = true;
+  keepWord(prompt, before);
   draw();
 }
 
@@ -150,13 +165,13 @@ async function whatIs(x, y, most = 5) {
 
 async function tell({ x, y, without }) {
   if (!about.words) return;
-  const words = await whatIs(x, y), teaching = prompts.find((prompt) => prompt.examples && prompt.open);
-  if (teaching && latest.rows.length) return addExample(teaching, without);
+  const words = await whatIs(x, y), teaching = prompts.find((prompt) => prompt.examples && prompt.open), { rows } = latest;
+  if (teaching && rows.length) return addExample(teaching, without || teaching.without);
   const buttons = words.map(([word, score]) =>
     element("button", { className: "small", onclick: () => attempt(() => ask(word)) }, `${word} ${percent(score)}`));
   const like = element("button", { className: "small", onclick: likeThis }, "Like this");
-  $("here").replaceChildren(element("p", {}, words.length ? "Here, words that fit best:" : "Nothing is here that has a meaning."),
-    element("div", {}, ...buttons, ...(words.length ? [like] : []))); // prettier-ignore
+  $("here").replaceChildren(element("p", {}, words.length ? "Here, words that fit best:" : `Nothing is there${rows.length ? " that has a name" : ""}.`),
+    element("div", {}, ...buttons, ...(rows.length ? [like] : []))); // prettier-ignore
   $("here").hidden = false;
 }
 
@@ -176,9 +191,43 @@ function teach(prompt, open = !prompt.open) {
   draw();
 }
 
-function addExample(prompt, without) {
-  prompt.examples.push({ rows: latest.rows, without });
-  return answer(prompt).then(draw);
+async function addExample(prompt, without) {
+  prompt.examples.push({ rows: latest.rows, without: Boolean(without) });
+  await answer(prompt);
+  keepWord(prompt);
+  draw(prompt);
+}
+
+/** Take the latest example back. */
+async function undo(prompt) {
+  if (prompt.examples.length === 1) return remove(prompt);
+  prompt.examples.pop();
+  await answer(prompt);
+  keepWord(prompt);
+  draw();
+}
+
+function forget(prompt) {
+  store("words", stored("words").filter(({ name }) => name !== prompt.text));
+  remove(prompt);
+}
+
+/** Keep a named word in this browser, instead of one of the same name and of its former name. */
+function keepWord({ text, examples, named }, before = text) {
+  const others = stored("words").filter(({ name }) => ![text, before].includes(name));
+  if (named) store("words", [{ name: text, examples }, ...others]);
+}
+
+/** A word that was named in this browser, as a prompt. */
+function namedWord(text) {
+  const found = stored("words").find(({ name }) => name?.toLowerCase() === text.toLowerCase());
+  return found && areExamples(found.examples) ? { text: found.name, examples: found.examples, named: true } : null;
+}
+
+/** Whether these are examples in this scene, the first one of what is meant. */
+function areExamples(examples) {
+  const known = (row) => Number.isInteger(row) && row >= 0 && row < about.count;
+  return Array.isArray(examples) && examples.length > 0 && !examples[0].without && examples.every(({ rows }) => rows?.length && rows.every(known));
 }
 
 // ── address, history ──
@@ -212,36 +261,38 @@ async function readAddress() {
 async function readExamples(like) {
   const [text, ...examples] = like.split("~");
   const parsed = examples.map((one) => ({ rows: one.replace("-", "").split(".").map(Number), without: one.startsWith("-") }));
-  const known = (row) => Number.isInteger(row) && row >= 0 && row < about.count;
-  if (!parsed.length || !parsed.every(({ rows }) => rows.every(known))) return;
-  const prompt = { text: tidy(text), negatives: [], examples: parsed, color: unusedColor() };
+  if (!areExamples(parsed)) return;
+  const prompt = { text: tidy(text), negatives: [], examples: parsed, color: unusedColor(), named: !UNNAMED.test(text) };
   prompts.push(prompt);
   await answer(prompt);
 }
 
-const memory = `lang3dxl ${location.pathname}`;
+/** What this browser keeps about the scene: earlier "prompts" and named "words", latest first. */
+const memory = (kind) => `lang3dxl ${kind} ${about.title} ${about.count} ${about.center}`;
 
-function remembered() {
+function stored(kind) {
   try {
-    return JSON.parse(localStorage.getItem(memory) ?? "[]").map(String);
+    return [JSON.parse(localStorage.getItem(memory(kind)))].flat().filter(Boolean);
   } catch {
     return []; // a browser that keeps nothing
   }
 }
 
-function remember(text) {
-  const texts = [text, ...remembered().filter((other) => other !== text)].slice(0, MOST_REMEMBERED);
+function store(kind, list) {
   try {
-    localStorage.setItem(memory, JSON.stringify(texts));
+    localStorage.setItem(memory(kind), JSON.stringify(list.slice(0, MOST_KEPT)));
   } catch {} // the same
 }
+
+const remember = (text) => store("prompts", [text, ...stored("prompts").filter((other) => other !== text)]);
 
 // ── controls ──
 
 async function offer() {
   const typed = $("word").value.split(";").at(-1), before = $("word").value.slice(0, $("word").value.length - typed.length);
-  const words = tidy(typed) ? await think("offered", { typed }) : remembered();
-  $("offered").replaceChildren(...words.map((word) => element("option", { value: before + word })));
+  const own = stored("words").map(({ name }) => String(name)), start = tidy(typed).toLowerCase();
+  const words = start ? [...own.filter((name) => name.toLowerCase().includes(start)), ...(await think("offered", { typed }))] : [...own, ...stored("prompts").map(String)];
+  $("offered").replaceChildren(...[...new Set(words)].map((word) => element("option", { value: before + word })));
 }
 
 function listen() {
@@ -269,6 +320,7 @@ function listen() {
   $("link").addEventListener("click", () => attempt(copyLink));
   $("look").addEventListener("change", () => attempt(light));
   view.addEventListener("click", ({ detail }) => attempt(() => tell(detail)));
+  view.addEventListener("drawn", findPlaces);
   view.addEventListener("moved", () => {
     drawBoxes();
     clearTimeout(moving);
@@ -301,12 +353,10 @@ async function copyLink() {
   say("The link is in the clipboard: it opens what you see.");
 }
 
-/** Colors in the lighting of a photo, from the server. */
+/** Colors in the lighting of a photo. */
 async function light() {
   const photo = $("look").value;
-  const colors = photo ? await fetch(`api/look?photo=${encodeURIComponent(photo)}`) : null;
-  if (colors && !colors.ok) throw new Error(await colors.text());
-  view.light(colors ? new Uint8Array(await colors.arrayBuffer()) : view.own);
+  view.light(photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.own);
 }
 
 // ── start ──
@@ -320,9 +370,9 @@ async function fetched(name) {
 async function open() {
   about = await (await fetched("scene.json")).json();
   document.title = $("title").textContent = about.title;
-  $("credit").textContent = [about.credit, about.license, about.made].filter(Boolean).join("\n");
-  $("lighting").hidden = !about.looks.length;
-  $("look").append(...about.looks.map((name) => element("option", { value: name }, name)));
+  $("credit").textContent = [about.credit, about.license, about.made, ...about.left_out].filter(Boolean).join("\n");
+  $("lighting").hidden = !Object.keys(about.looks).length;
+  $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
   const splats = await (await fetched("splats.bin")).arrayBuffer();
   view = new View(about, $("frame"));
   await view.show(splats);
@@ -348,14 +398,12 @@ async function begin() {
 
 const drawing = open(), reading = drawing.then(readMeaning);
 window.lang3dxl = {
-  drawing,
   ready: reading.then(begin),
   ask,
   whatIs,
-  get resting() {
-    return view.resting;
+  get view() {
+    return view;
   },
-  relevancy: async (text) => [...prompts.find((prompt) => prompt.text === text).relevancy],
   get seconds() {
     return about.seconds;
   },

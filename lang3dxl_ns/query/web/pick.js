@@ -2,6 +2,7 @@
 import { floats } from "./decode.js";
 
 const BLUR = 0.3; // square pixels that every splat is widened by, as in training
+const MARGIN = 1.3; // half sizes of the picture beyond which a splat's shape is that at this place: see ellipses.py
 
 /** Centers [3n] (relative to the scene's origin), axes [9n] scaled by the standard deviations, opacities [n]. */
 export function unpackSplats(buffer) {
@@ -31,6 +32,8 @@ function rotation(axis, angle) {
  * Returns pairs of row and weight. */
 export function gaussiansAt({ centers, axes, opacities }, { view, focal, width, height }, x, y, antialiased) {
   const hits = [];
+  const [widest, highest] = [width, height].map((side) => (MARGIN * side) / 2 / focal);
+  const within = (slope, most) => Math.max(-most, Math.min(slope, most));
   const turned = (a, b, c) => [0, 1, 2].map((k) => view[k] * a + view[4 + k] * b + view[8 + k] * c);
   for (let i = 0; i < opacities.length; i++) {
     const [a, b, c] = [centers[3 * i], centers[3 * i + 1], centers[3 * i + 2]];
@@ -43,9 +46,10 @@ export function gaussiansAt({ centers, axes, opacities }, { view, focal, width, 
     for (let k = 0; k < 9; k++) reach = Math.max(reach, Math.abs(axes[9 * i + k]));
     if (Math.max(Math.abs(du), Math.abs(dv)) > 2 + (8 * focal * reach) / depth) continue;
     let uu = 0, uv = 0, vv = 0;
+    const [sideways, upwards] = [within(right, widest), within(up, highest)];
     for (let k = 9 * i; k < 9 * i + 9; k += 3) {
       const [p, q, r] = turned(axes[k], axes[k + 1], axes[k + 2]);
-      const u = (focal * (p + right * r)) / depth, v = (-focal * (q + up * r)) / depth;
+      const u = (focal * (p + sideways * r)) / depth, v = (-focal * (q + upwards * r)) / depth;
       (uu += u * u), (uv += u * v), (vv += v * v);
     }
     const sharp = uu * vv - uv * uv;

@@ -2,28 +2,31 @@
 import { OrbitControls, PackedSplats, PerspectiveCamera, Scene, SparkRenderer, SplatMesh, Vector3, WebGLRenderer } from "./splats.js";
 
 const FLIGHT = 1200, WIDEST = 85, HEAT = 0.7, BLUR = 0.3; // milliseconds, degrees, opacity, square pixels
+const FLUENT = 40, COARSEST = 0.3, STILL = 150; // milliseconds of a frame, share of the pixels' side, milliseconds
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 
 export class View extends EventTarget {
-  /** about: the page's description; frame: the element to fill. Fires `moved` and `click`. */
+  /** about: the page's description; frame: the element to fill. Fires `moved`, `drawn` and `click`. */
   constructor(about, frame) {
     super();
     Object.assign(this, { about, frame });
-    this.renderer = new WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer = new WebGLRenderer({ antialias: false });
+    Object.assign(this, { cost: 4 * FLUENT, sharp: false, changed: false, asked: false, drawing: null, order: "" });
     const [red, green, blue] = about.background.map((value) => Math.round(255 * value));
     this.renderer.setClearColor(`rgb(${red}, ${green}, ${blue})`);
     this.canvas = frame.appendChild(this.renderer.domElement);
     const [preBlurAmount, blurAmount] = about.antialiased ? [0, BLUR] : [BLUR, 0];
     this.scene = new Scene();
-    this.scene.add(new SparkRenderer({ renderer: this.renderer, preBlurAmount, blurAmount, onDirty: () => this.wake() }));
+    this.spark = new SparkRenderer({ renderer: this.renderer, preBlurAmount, blurAmount, enableLod: false, onDirty: () => this.sorted() });
+    this.scene.add(this.spark);
     const start = this.standing(about.start), distance = start.position.distanceTo(start.target);
     this.camera = new PerspectiveCamera(50, 1, 1e-3 * distance, 1e3 * distance);
     this.camera.up.fromArray(about.up);
     this.controls = new OrbitControls(this.camera, this.canvas);
-    this.controls.enableDamping = !still.matches;
+    this.controls.enableDamping = false;
     this.controls.addEventListener("change", () => this.wake());
-    this.controls.addEventListener("start", () => (this.flight = null));
+    this.controls.addEventListener("start", () => Object.assign(this, { flight: null, held: true }));
+    this.controls.addEventListener("end", () => Object.assign(this, { held: false }));
     new ResizeObserver(() => this.resize()).observe(frame);
     this.resize();
     this.place(this.standing(about.start));
@@ -46,19 +49,20 @@ export class View extends EventTarget {
     this.scene.add(this.splats);
     await this.splats.initialized;
     this.recolor();
-    requestAnimationFrame((now) => this.step(now));
   }
 
   /** Colors and opacities of all splats, four bytes each, before heat. */
   light(colors) {
     this.plain = colors;
-    this.recolor();
+    this.layers = null;
+    this.recolor(this.shown);
   }
 
   /** Show heat: layers of { relevancy, threshold, peak, color }, the strongest where several match. */
-  recolor(layers = this.layers ?? []) {
-    this.layers = layers;
-    if (!this.splats) return;
+  recolor(layers = []) {
+    const told = layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color]);
+    if (!this.splats || (told.length === this.layers?.length && told.every((value, k) => value === this.layers[k]))) return;
+    Object.assign(this, { layers: told, shown: layers });
     for (let i = 0; i < this.plain.length / 4; i++) {
       let best = 0, chosen = null;
       for (const layer of layers) {
@@ -134,23 +138,65 @@ export class View extends EventTarget {
 
   // ── frames ──
 
-  /** Draw some frames: sorting follows the camera a few frames later, and calls this again. */
+  /** Draw anew: a draft that keeps up on slow machines and, once nothing changes, a sharp picture. */
   wake() {
-    this.frames = 6;
+    this.changed = true;
+    this.moved = performance.now();
+    this.request();
+  }
+
+  request() {
+    if (!this.asked) requestAnimationFrame((now) => this.step(now));
+    this.asked = true;
   }
 
   /** Whether nothing is left to draw. */
   get resting() {
-    return !this.flight && this.frames <= 0;
+    return !this.flight && !this.changed && this.sharp && !this.drawing;
   }
 
   step(now) {
-    requestAnimationFrame((next) => this.step(next));
+    this.asked = false;
+    if (!this.splats || !this.drawn()) return this.splats && this.request();
     if (this.flight) this.advance(now);
-    if (this.frames-- <= 0) return;
     this.controls.update();
+    if (this.changed) {
+      this.draw(Math.max(Math.min(Math.sqrt(FLUENT / this.cost), 1), COARSEST));
+      this.dispatchEvent(new Event("moved"));
+    } else if (!this.sharp && !this.held && now - this.moved > Math.max(STILL, this.cost / 4)) this.draw(1);
+    if (!this.resting) this.request();
+  }
+
+  /** Whether the last frame has been drawn. Its time tells how many pixels a fluent one may have. */
+  drawn() {
+    if (!this.drawing) return true;
+    const { fence, start, share } = this.drawing, gl = this.renderer.getContext();
+    if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
+    gl.deleteSync(fence);
+    this.drawing = null;
+    this.dispatchEvent(new Event("drawn"));
+    if (share === 1 || !this.measured) this.cost = Math.min((performance.now() - start) / share ** 2, 2000);
+    this.measured ||= share === 1;
+    this.controls.enableDamping = !still.matches && this.cost < 2 * FLUENT; // it takes a hundred frames
+    return true;
+  }
+
+  /** Draw with this share of the screen's pixels along each side. */
+  draw(share) {
+    const gl = this.renderer.getContext(), ratio = share * Math.min(devicePixelRatio, 2), start = performance.now();
+    if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
     this.renderer.render(this.scene, this.camera);
-    this.dispatchEvent(new Event("moved"));
+    this.drawing = { fence: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), start, share };
+    gl.flush();
+    Object.assign(this, { changed: false, sharp: share === 1 });
+  }
+
+  /** Splats were sorted: draw them if they now have another order. */
+  sorted() {
+    const { sortedCenter, sortedDir, sorting } = this.spark, order = [...sortedCenter, ...sortedDir].join();
+    if (sorting || order === this.order) return;
+    this.order = order;
+    this.wake();
   }
 
   resize() {
@@ -213,7 +259,7 @@ export class View extends EventTarget {
 
   /** The picture as a PNG, with lines of text ([text, color]) below. */
   async picture(lines) {
-    this.renderer.render(this.scene, this.camera);
+    this.draw(1);
     const canvas = document.createElement("canvas"), size = Math.max(this.canvas.width / 48, 14);
     [canvas.width, canvas.height] = [this.canvas.width, this.canvas.height + lines.length * 1.6 * size];
     const pen = canvas.getContext("2d");

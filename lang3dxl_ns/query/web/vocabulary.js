@@ -29,16 +29,16 @@ export class Vocabulary {
     return this.numbers.subarray(i * this.width, (i + 1) * this.width);
   }
 
-  /** Itself, what is searched for, and the shared negatives that it competes with. */
+  /** Itself, what is searched for, the shared negatives that it competes with, and what examples taught. */
   word(i) {
     const own = this.row(this.negatives.length + i), [near, against] = this.special[i] ?? [];
-    return { own, near: near ? near.map((row) => this.row(row)) : [own], against: against ?? this.all };
+    return { own, near: near?.map((row) => this.row(row)) ?? [own], against: against ?? this.all, taught: this.taught[i] };
   }
 
   /** The same for any phrase; null if this page doesn't know it. */
   async phrase(text) {
     const plain = tidy(text), known = this.index.get(plain.toLowerCase());
-    if (!this.live) return known === undefined ? null : this.word(known);
+    if (!this.live || this.taught[known]) return known === undefined ? null : this.word(known);
     if (!this.encoded.has(plain)) {
       const answer = await fetch(`api/encode?text=${encodeURIComponent(plain)}`);
       if (!answer.ok) throw new Error(await answer.text());

@@ -9,6 +9,29 @@ import { Vocabulary } from "./vocabulary.js";
 const EXAMPLE = 5; // Gaussians that stand for a clicked place
 let about, answers, vocabulary, geometry, views, mass;
 
+/** Numbers of phrases, and the first one that is unknown. */
+async function understood(phrases) {
+  const found = await Promise.all(phrases.map((phrase) => vocabulary.phrase(phrase)));
+  return { found, unknown: phrases.find((_, i) => !found[i]) };
+}
+
+/** The verdict about a prompt whose phrases are known. */
+function judged([text, ...negatives], threshold) {
+  const relevancy = answers.relevancy(text, negatives.map(({ own }) => own));
+  return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold });
+}
+
+/** Which Gaussians may match: 1 where any of these prompts does; null without prompts. */
+async function foregroundOf(prompts) {
+  if (!prompts.length) return null;
+  const mask = new Uint8Array(about.words.count);
+  for (const phrases of prompts) {
+    const { relevancy, threshold } = judged((await understood(phrases)).found);
+    relevancy.forEach((value, i) => (mask[i] ||= value > threshold));
+  }
+  return mask;
+}
+
 async function file(name) {
   const answer = await fetch(name);
   if (!answer.ok) throw new Error(`${name} is missing (${answer.status})`);
@@ -32,20 +55,17 @@ const jobs = {
       pose: view.pose.map((row, axis) => (axis < 3 ? [...row.slice(0, 3), row[3] - about.center[axis]] : row)),
     }));
     mass = massOf(views, words.count);
+    answers.foreground = await foregroundOf(about.foreground);
     return { seconds: (performance.now() - start) / 1000, known: vocabulary.words.length };
   },
 
   /** An answer about a phrase, or about examples: { known, relevancy, threshold, doubt, … }. */
   async ask({ text, negatives, examples, threshold }) {
-    if (examples) {
-      const relevancy = likeness(answers.rows, examples);
-      return { known: true, relevancy, ...answers.verdict(relevancy, true, threshold), doubtful: false };
-    }
-    const wanted = [text, ...negatives], found = await Promise.all(wanted.map((phrase) => vocabulary.phrase(phrase)));
-    const unknown = wanted.filter((_, i) => !found[i]);
-    if (unknown.length) return { known: false, unknown: unknown[0], closest: vocabulary.closest(unknown[0]) };
-    const relevancy = answers.relevancy(found[0], found.slice(1).map((phrase) => phrase.own));
-    return { known: true, relevancy, ...answers.verdict(relevancy, negatives.length > 0, threshold) };
+    threshold ??= about.words.threshold;
+    if (examples) return { known: true, ...answers.verdict(likeness(answers.rows, examples), { strict: true, doubt: 0, threshold }) };
+    const { found, unknown } = await understood([text, ...negatives]);
+    if (unknown !== undefined) return { known: false, unknown, closest: vocabulary.closest(unknown) };
+    return { known: true, taught: Boolean(found[0].taught), ...judged(found, threshold) };
   },
 
   find({ relevancy, threshold }) {
@@ -57,18 +77,17 @@ const jobs = {
     };
   },
 
-  /** The words that fit a pixel best, and the Gaussians that it shows. */
+  /** The words that fit a pixel best, and the Gaussians that it shows; none where little is, or little is known. */
   whatIs({ camera, x, y, most }) {
-    const hits = gaussiansAt(geometry, camera, x, y, about.antialiased);
+    const hits = gaussiansAt(geometry, camera, x, y, about.antialiased).filter(([i]) => answers.rows.scales[i]);
     const blend = new Float64Array(about.words.width);
     let covered = 0;
     for (const [i, weight] of hits) {
-      if (answers.rows.scales[i]) answers.rows.row(i).forEach((value, j) => (blend[j] += weight * value));
+      answers.rows.row(i).forEach((value, j) => (blend[j] += weight * value));
       covered += weight;
     }
-    if (covered < 0.05 || !blend.some(Boolean)) return { words: [], rows: [] };
-    const seen = hits.filter(([i]) => answers.rows.scales[i]).sort((a, b) => b[1] - a[1]);
-    return { words: answers.naming(blend, most), rows: seen.slice(0, EXAMPLE).map(([i]) => i) };
+    if (covered < about.words.covered) return { words: [], rows: [] };
+    return { words: answers.naming(blend, most), rows: hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([i]) => i) };
   },
 
   offered: ({ typed }) => vocabulary.offered(typed),

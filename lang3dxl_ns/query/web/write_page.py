@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -16,9 +17,10 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, write_atomically
 from lang3dxl_ns.common.reports import watched
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.negatives import competitors
+from lang3dxl_ns.query.negatives import NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.scene_file import Provenance
+from lang3dxl_ns.query.teach import TaughtWord, known_word
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
 from lang3dxl_ns.query.web.pack import (
@@ -36,8 +38,8 @@ from lang3dxl_ns.query.web.pack import (
 
 _HERE = Path(__file__).parent
 _KINDS = (".html", ".css", ".js", ".txt")
-_MOST_VIEWS = 24
-"""Training views that the page flies to, evenly chosen."""
+_MOST_BYTES = 8_000_000
+"""Of the views that the page flies to, and of the photos' lightings; of more, evenly chosen ones are kept."""
 _TEXTS = 256
 """Texts encoded at a time."""
 MOST_TEXT = 2_000
@@ -69,8 +71,12 @@ class Page:
     ) -> None:
         self.scene, self.live = scene, live
         self.prompts = scene.prompts(list(texts)) if texts else []
+        self._foreground = scene.prompts(scene.config.foreground) if scene.config.foreground else []
+        self.left_out: list[str] = []
+        """Sentences about what the files lack, for their size."""
         self._about = provenance or Provenance()
         self._look, self._words, self._more = look, words, more
+        self._looks = list(scene.looks.names) if scene.looks else []
         self._toward = scene.overview.camera.position.to(scene.device)
         self._meaning: PackedMeaning | None = None
         if scene.decoder is not None and scene.codes is not None:
@@ -78,7 +84,7 @@ class Page:
 
     def files(self) -> dict[str, bytes]:
         """Content of every file, by name."""
-        scene = self.scene
+        scene, self.left_out = self.scene, []
         means = scene.splats.means[scene.splats.sound()]
         center = means.median(0).values if len(means) else self._toward
         files = {path.name: path.read_bytes() for path in _HERE.iterdir() if path.suffix in _KINDS}
@@ -97,22 +103,37 @@ class Page:
             "start": camera_json(scene.overview.full_camera),
             "colors": PROMPT_COLORS,
             "live": self.live,
-            "looks": scene.looks.names if self.live and scene.looks else [],
             "prompts": [[prompt.text, *prompt.negatives] for prompt in self.prompts],
             "words": None,
         }
+        about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
+        if not self.live:  # without a server they are files, read when they are chosen
+            chosen = self._within_limits("lightings", self._looks, [4 * len(scene.splats)] * len(self._looks))
+            about["looks"] = {name: f"look{i}.bin" for i, name in enumerate(chosen)}
+            files |= {f"look{i}.bin": self.colors(name) for i, name in enumerate(chosen)}
         if self._meaning is not None:
             about["words"] = self._meaning.description | self._settings()
             files |= self._meaning.files | self._vocabulary(self._meaning)
-            views = spread(list(scene.visible.items()), _MOST_VIEWS)
-            packed = [pack_view(view, len(scene.splats)) for _, view in views]
-            files["views.bin"] = b"".join(packed)
+            packed = {name: pack_view(view, len(scene.splats)) for name, view in scene.visible.items()}
+            views = self._within_limits("views", list(packed), list(map(len, packed.values())))
+            files["views.bin"] = b"".join(packed[name] for name in views)
             about["views"] = [
-                {"name": name, "bytes": len(data), **camera_json(view.camera)}
-                for (name, view), data in zip(views, packed, strict=True)
+                {"name": name, "bytes": len(packed[name]), **camera_json(scene.visible[name].camera)}
+                for name in views
             ]
+            about["foreground"] = [[prompt.text, *prompt.negatives] for prompt in self._foreground]
+        about["left_out"] = self.left_out
         files["scene.json"] = json.dumps(about).encode()
         return files
+
+    def _within_limits(self, what: str, names: list[str], sizes: list[int]) -> list[str]:
+        """Evenly chosen ones that take at most `_MOST_BYTES`; says which share is left out."""
+        count = len(names)
+        while count and sum(spread(sizes, count)) > _MOST_BYTES:
+            count -= 1
+        if count < len(names):
+            self.left_out.append(f"{len(names) - count} of {len(names)} {what} are left out, to load quickly")
+        return spread(names, count)
 
     def _settings(self) -> dict[str, Any]:
         """What answers depend on besides rows and words."""
@@ -122,19 +143,23 @@ class Page:
             "threshold": scene.config.threshold,
             "unrelated": scene.doubts._unrelated.tolist(),
             "gap": scene.gap,
+            "covered": scene.config.min_alpha,
             "pixels": [LEAST_PIXELS, PIXEL_STEPS],
         }
 
     def _vocabulary(self, meaning: PackedMeaning) -> dict[str, bytes]:
         """The words that the page knows: those that may name a place first, then all others."""
         negatives = list(self.scene.text.config.negatives)
-        asked = [plain(phrase) for prompt in self.prompts for phrase in (prompt.text, *prompt.negatives)]
+        prompts = [*self.prompts, *self._foreground]
+        asked = [plain(phrase) for prompt in prompts for phrase in (prompt.text, *prompt.negatives)]
         naming = list(dict.fromkeys(filter(None, map(plain, [*shipped_vocabulary(), *self._words, *asked]))))
-        words = list(dict.fromkeys([*naming, *common_words(), *filter(None, map(plain, self._more))]))
+        taught = self.scene.words
+        others = [*(plain(word.name) for word in taught.values()), *common_words(), *map(plain, self._more)]
+        words = list(dict.fromkeys([*naming, *filter(None, others)]))
         own = torch.cat([*self._encoded(meaning, negatives), *self._encoded(meaning, words)])
         special, extra = {}, [own]
         for i, word in enumerate(words):
-            if i < len(naming):
+            if i < len(naming) or known_word(word) in taught:
                 near, against = self._meant(meaning, word)
             else:
                 near, against = own[:1], competitors(negatives, [word])
@@ -143,6 +168,12 @@ class Page:
                 special[i] = [list(rows) if len(near) > 1 else [len(negatives) + i], against]
                 extra += [near] if len(near) > 1 else []
         described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
+        described["nothing"] = [i for i, phrase in enumerate(negatives) if phrase in NOTHING]
+        described["taught"] = {
+            i: self._learned(meaning, taught[known_word(word)])
+            for i, word in enumerate(words)
+            if known_word(word) in taught
+        }
         return {
             "vocabulary.json": json.dumps(described).encode(),
             "vocabulary.bin": pack_words(torch.cat(extra)),
@@ -150,8 +181,13 @@ class Page:
 
     def _meant(self, meaning: PackedMeaning, word: str) -> tuple[Float[Tensor, "s r"], list[int]]:
         """Vectors that are searched for along with a word, and the negatives that it competes with."""
-        queries = self.scene.queries([Prompt(word)])
+        queries = self.scene.queries(self.scene.prompts([Prompt(word)]))
         return meaning.of_texts(queries.vectors[list(queries.positive[0])]).cpu(), list(queries.negative[0])
+
+    def _learned(self, meaning: PackedMeaning, word: TaughtWord) -> dict[str, Any]:
+        """What examples taught, in the scene's own numbers."""
+        vector = meaning.of_texts(word.vector[None].to(self.scene.device))[0].tolist()
+        return {"vector": vector, "bias": word.bias, "text": word.text, "doubt": word.doubt}
 
     def _encoded(self, meaning: PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
         parts = [texts[row : row + _TEXTS] for row in range(0, len(texts), _TEXTS)]

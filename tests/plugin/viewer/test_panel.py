@@ -13,16 +13,15 @@ from conftest import make_trainer
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
-from scenes import write_scene
+from scenes import view_of, write_scene
 
-from lang3dxl_ns.plugin.cameras import view_of
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
-from lang3dxl_ns.plugin.viewer import session
-from lang3dxl_ns.plugin.viewer.fly_to import stand_of
 from lang3dxl_ns.plugin.viewer.frame_size import least_size
 from lang3dxl_ns.plugin.viewer.panel import INVITATION
+from lang3dxl_ns.query import conversation as session
 from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.scene.stand import stand_of
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from painted_scene import photo
 
-from lang3dxl_ns.plugin.viewer.fly_to import stand_of
+from lang3dxl_ns.scene.stand import stand_of
 
 
 def test_a_stand_is_where_the_photo_was_taken():

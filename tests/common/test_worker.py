@@ -2,7 +2,7 @@
 
 import threading
 
-from lang3dxl_ns.plugin.viewer.worker import Worker
+from lang3dxl_ns.common.worker import Worker
 
 
 def test_the_last_of_several_waiting_jobs_is_done():

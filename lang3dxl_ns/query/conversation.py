@@ -1,4 +1,4 @@
-"""Query session of nerfstudio's viewer: questions to snapshots of a model, without user interface."""
+"""Questions to snapshots of a model that may be in training, without user interface."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.query.answer import pictures
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
+from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import SceneFile
-from lang3dxl_ns.query.scene import QueryConfig, Scene, text_encoder
+from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 
@@ -31,7 +32,7 @@ class Conversation:
     waits for training. If the model trains and its words don't, they are learned from the photos first.
 
     Args:
-        model: the model.
+        model: a `Lang3DXLModel`, trained or in training.
         file: photos, cameras and CLIP.
         run: folder of the run, for what is computed once.
         lock: held while using the model.
@@ -41,11 +42,9 @@ class Conversation:
         watch: called with a short description of slow work.
     """
 
-    look: str | None = None
-
     def __init__(
         self,
-        model: Lang3DXLModel,
+        model: Any,
         file: SceneFile,
         run: Path,
         lock: AbstractContextManager,
@@ -112,7 +111,7 @@ class Conversation:
         field = self._model.semantic_field
         with self._lock, torch.no_grad():
             training = self._model.training
-            self._model.eval()
+            self._model.train(False)
             try:
                 if learning and field is not None and field.needs_lifting:
                     self._watch("gathering the photos' features onto the present scene…")

@@ -1,18 +1,15 @@
 """The limit: exact labels lifted to the Gaussians and rendered back."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
 
 from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.average_precision import average_precision
+from lang3dxl_ns.evaluation.label_limit import label_limit
 from lang3dxl_ns.evaluation.scores import bounds
-from lang3dxl_ns.plugin.cameras import to_rasterizer
-from lang3dxl_ns.plugin.label_limit import label_limit
-from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera
 
 SIZE = 24
 
@@ -21,22 +18,17 @@ def wall(opacity=0.99):
     """A wall of opaque Gaussians in front of the camera, a fifth of a pixel wide, four per pixel."""
     steps = (torch.arange(2 * SIZE) + 0.5) / 2 - SIZE / 2
     y, x = torch.meshgrid(steps, steps, indexing="ij")
-    means = torch.stack([x.flatten(), y.flatten(), torch.full((4 * SIZE**2,), -float(SIZE))], dim=1)
+    means = torch.stack([x.flatten(), y.flatten(), torch.full((4 * SIZE**2,), float(SIZE))], dim=1)
     count = len(means)
     quats = torch.tensor([1.0, 0, 0, 0]).expand(count, 4)
-    gaussians = Gaussians(means, quats, torch.full((count, 3), 0.2), torch.full((count,), opacity))
-
-    def composite(camera, features):
-        view = to_rasterizer(camera, camera.camera_to_worlds[0])
-        return rasterize(gaussians, view, features).image
-
-    return SimpleNamespace(means=means, num_points=count, composite=composite)
+    scales, opacities = torch.full((count, 3), 0.2), torch.full((count,), opacity)
+    return Splats(means, quats, scales, opacities, torch.zeros(count, 1, 3))
 
 
-def camera(shift=0.0):
-    pose = torch.eye(4)[None, :3].clone()
-    pose[0, 0, 3] = shift
-    return Cameras(pose, float(SIZE), float(SIZE), SIZE / 2, SIZE / 2, SIZE, SIZE)
+def camera():
+    middle = SIZE / 2
+    intrinsics = torch.tensor([[SIZE, 0.0, middle], [0, SIZE, middle], [0, 0, 1]])
+    return Camera(torch.eye(4), intrinsics, SIZE, SIZE)
 
 
 @pytest.fixture

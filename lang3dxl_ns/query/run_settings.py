@@ -12,15 +12,12 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_text
-
-if TYPE_CHECKING:  # with nerfstudio's trainer, which takes two seconds to load and which queries don't need
-    from nerfstudio.engine.trainer import TrainerConfig
 
 TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
 _PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
@@ -37,34 +34,27 @@ _UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
 """nerfstudio's classes that unpickle what they read."""
 
 
-def read_config(path: Path) -> TrainerConfig:
-    """The configuration of a run. The file is parsed as data only: settings, paths, and classes by name from
-    nerfstudio and this package (nerfstudio's own commands call whatever a file names).
-
-    Raises UserError for a missing or damaged file, one of another version, and one that asks for more.
-    """
-    from nerfstudio.engine.trainer import TrainerConfig
-
-    (config,) = _read(path, [()])
-    if not isinstance(config, TrainerConfig):
-        raise _no_config(path)
-    return config
-
-
 def read_model_config(path: Path) -> tuple[Any, Path]:
     """The model's settings of a run, and the folder of its checkpoints, relative to the run's: as
-    `read_config`, but without loading what the other settings belong to. Settings that an earlier version
+    `read_settings`, but without loading what the other settings belong to. Settings that an earlier version
     did not have take their defaults: the checkpoint beside the file tells whether they fit."""
-    model, checkpoints = _read(path, [("pipeline", "model"), ("relative_model_dir",)], complete=True)
+    model, checkpoints = read_settings(path, [("pipeline", "model"), ("relative_model_dir",)], complete=True)
     if not is_dataclass(model) or not isinstance(checkpoints, Path):
-        raise _no_config(path)
+        raise no_config(path)
     return model, checkpoints
 
 
-def _read(path: Path, places: Sequence[Sequence[str]], complete: bool = False) -> list[Any]:
-    """The settings at these places of a file, each named from the outermost in; None where there are none.
+def read_settings(path: Path, places: Sequence[Sequence[str]], complete: bool = False) -> list[Any]:
+    """Settings in a run's config.yml. The file is parsed as data only: settings, paths, and classes by name
+    from nerfstudio and this package (nerfstudio's own commands call whatever a file names).
 
-    complete: give missing settings their defaults.
+    Args:
+        path: the file.
+        places: which settings, each named from the outermost in; () for all. None where there are none.
+        complete: give missing settings their defaults.
+
+    Raises:
+        UserError: the file is missing, damaged, or of another version, or asks for more than settings.
     """
     try:
         found = _construct(read_text(path), places)
@@ -109,7 +99,8 @@ def _at(node: yaml.Node | None, place: Sequence[str]) -> yaml.Node | None:
     return node
 
 
-def _no_config(path: Path) -> UserError:
+def no_config(path: Path) -> UserError:
+    """The error of a file that holds other settings than a run's."""
     return UserError(f"{path} is not the config.yml of a nerfstudio run")
 
 

@@ -9,37 +9,43 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from nerfstudio.cameras.cameras import Cameras
 from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.evaluation.scores import Maps
-from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.rendering.gathering import Pixels, gather
+from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering.render import composite
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera
 
 Masks = Mapping[str, Bool[Array, "h w"]]
 
 
 def label_limit(
-    model: Lang3DXLModel, views: Iterable[tuple[Cameras, Masks]], categories: list[str]
-) -> Callable[[Cameras], Maps]:
+    splats: Splats,
+    views: Iterable[tuple[Camera, Masks]],
+    categories: list[str],
+    backend: Backend = "auto",
+) -> Callable[[Camera], Maps]:
     """Returns a function from a view to its maps by category, at the size of the rendering.
 
     Each Gaussian gets the mean label of the pixels it contributes to, weighted by compositing
-    weight, over all `views`; a category uses those with a label of it. model: in evaluation mode.
+    weight, over all `views`; a category uses those with a label of it.
     """
 
     def probes():
         for camera, masks in views:
-            size = int(camera.height.item()), int(camera.width.item())
-            yield partial(model.composite, camera), Pixels.of([_labels(masks, categories, size)], size)
+            size = camera.height, camera.width
+            labels = Pixels.of([_labels(masks, categories, size)], size)
+            yield partial(composite, splats, camera, backend=backend), labels
 
-    lifted, _ = gather(model.num_points, probes(), 2 * len(categories), model.means.detach())
+    lifted, _ = gather(len(splats), probes(), 2 * len(categories), splats.means)
     labels, labeled = lifted.chunk(2, dim=1)
     shares = torch.where(labeled > 0, labels / labeled, 0.0)
 
-    def maps(camera: Cameras) -> Maps:
-        found = model.composite(camera, shares)
+    def maps(camera: Camera) -> Maps:
+        found = composite(splats, camera, shares, backend)
         return dict(zip(categories, found.permute(2, 0, 1), strict=True))
 
     return maps

@@ -51,6 +51,11 @@ class SceneFacts:
     dense_targets: Callable[[], Iterator[Float[Tensor, "t t d"]]] | None = None
     """Their dense features; None without a dense encoder."""
 
+    def wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
+        """Whether a component (named as in `needs`) is to be built, for the setting `on`, `off` or `auto`:
+        then by its need, or `unmeasured`."""
+        return self.needs.get(component, unmeasured) if choice == "auto" else choice == "on"
+
     def into(self, metadata: dict[str, Any]) -> None:
         """Put them where nerfstudio carries them from dataset to model."""
         metadata[_KEY] = self

@@ -1,0 +1,76 @@
+"""Initial Gaussians of training: from the COLMAP points, and a sky."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn import Parameter
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.rendering.splats import harmonics_of
+from lang3dxl_ns.scene.geometry import sphere_around
+
+FIRST_OPACITY = 0.1
+FEWEST = 4
+"""Fewest positions, so that each has three neighbors."""
+
+
+def seed_positions(
+    points: tuple[Tensor, Tensor] | None, count: int, side: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Initial positions of Gaussians and their colors (0…1): those of points with colors in bytes or, without
+    points, `count` random ones in a box of a side, world units.
+
+    Raises UserError if there are too few points.
+    """
+    if points is None:
+        return (torch.rand(count, 3) - 0.5) * side, torch.rand(count, 3)
+    if len(points[0]) < FEWEST:
+        raise UserError(
+            f"the scene has {len(points[0])} 3D points, too few to start from: reconstruct it again (colmap "
+            "point_triangulator), or start from random Gaussians: --pipeline.model.random-init True"
+        )
+    return points[0].float(), points[1].float() / 255
+
+
+def initial_gaussians(
+    means: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], sky: int, degree: int
+) -> dict[str, Parameter]:
+    """Parameters of the sky's Gaussians, then of one per position, as wide as the mean distance to its three
+    nearest neighbors.
+
+    Args:
+        means: at least `FEWEST` positions, world units.
+        colors: at these positions, 0…1.
+        sky: Gaussians on a sphere around them.
+        degree: of the colors' spherical harmonics.
+    """
+    sphere = sphere_around(means, sky)
+    means = torch.cat([sphere, means])
+    colors = torch.cat([torch.full_like(sphere, 0.5), colors])
+    n = len(means)
+    return {
+        "means": Parameter(means),
+        "scales": Parameter(_spacing(means).log().repeat(1, 3)),
+        # Uniform over rotations; with its own generator, so that preparation does not affect it.
+        "quats": Parameter(F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)),
+        "features_dc": Parameter(color_parameters(colors, degree)),
+        "features_rest": Parameter(torch.zeros(n, (degree + 1) ** 2 - 1, 3)),
+        "opacities": Parameter(torch.logit(torch.full((n, 1), FIRST_OPACITY))),
+    }
+
+
+def color_parameters(colors: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n 3"]:
+    """Colors (0…1) as the model stores them: harmonics of degree 0, or logits where these are all."""
+    return harmonics_of(colors)[:, 0] if degree > 0 else torch.logit(colors, eps=1e-4)
+
+
+def _spacing(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
+    points = means.numpy()
+    distances = cKDTree(points).query(points, k=4)[0][:, 1:]
+    spacing = torch.from_numpy(distances).float().mean(dim=-1, keepdim=True)
+    # Coincident points would make Gaussians of zero size.
+    return spacing.clamp_min(1e-3 * float(spacing.median().clamp_min(1e-6)))

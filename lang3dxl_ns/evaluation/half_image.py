@@ -1,0 +1,120 @@
+"""Half-image protocol: the look of an unseen photo is fitted on its left half, and its right half is scored.
+
+Nobody can know the light of a photo that training never saw, so a comparison of the whole photo measures the
+guess of its light more than the scene. NeRF in the Wild (Martin-Brualla et al. 2021), WildGaussians and
+NerfBaselines therefore let half of the photo tell its light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lang3dxl_ns.common.reports import synchronize
+from lang3dxl_ns.components.appearance import AppearanceField
+from lang3dxl_ns.components.looks import Look, Looks, render_in_look
+from lang3dxl_ns.components.losses import rgb_loss
+from lang3dxl_ns.rendering.rasterize import Backend, rasterize
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera, in_view
+
+STEPS = 64
+"""Steps of the fit."""
+RATE = 0.1
+"""Adam's rate at its beginning; it falls to nothing as a cosine."""
+PROTOCOL = "half_…: each photo's look is fitted on its left half, and its right half is scored"
+
+
+@dataclass(frozen=True)
+class HalfImage:
+    """A photo in the look of its left half."""
+
+    vector: Float[Tensor, " v"]
+    """The fitted look."""
+    rendering: Float[Tensor, "h w 3"]
+    """Of the whole photo, in this look."""
+    figures: dict[str, float]
+    """Of the right half: `half_psnr` (dB), `half_ssim`, and `half_lpips` if its weights are available; and
+    `fit_seconds`."""
+
+
+@dataclass(frozen=True)
+class HalfImageProtocol:
+    """The protocol for photos of one scene, whose Gaussians and looks stay as they are."""
+
+    splats: Splats
+    field: AppearanceField
+    """Makes the looks."""
+    metrics: Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], dict[str, float]]
+    """Scores of a rendering, and of the photo that it should be: `psnr` etc."""
+    background: Float[Tensor, "3"]
+    """Color behind the scene, 0…1."""
+    ssim_weight: float
+    """Of 1 − SSIM in the color loss, as in training."""
+    backend: Backend = "auto"
+
+    @torch.no_grad()
+    def measure(
+        self, camera: Camera, photo: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None
+    ) -> HalfImage:
+        """Fit the look on a photo's left half, and score the right one.
+
+        Args:
+            camera: the photo's, of its size.
+            photo: its colors, 0…1.
+            mask: its foreground.
+        """
+        middle = photo.shape[1] // 2
+        start = perf_counter()
+        vector = self.fit(camera, photo[:, :middle], None if mask is None else mask[:, :middle])
+        synchronize()
+        seconds = perf_counter() - start
+        look = Look(self.field, vector)
+        rendering = render_in_look(
+            self.splats, camera, look, background=self.background, backend=self.backend
+        ).rgb
+        scores = self.metrics(rendering[:, middle:], photo[:, middle:])
+        figures = {f"half_{name}": value for name, value in scores.items()} | {"fit_seconds": seconds}
+        return HalfImage(vector, rendering, figures)
+
+    def fit(
+        self,
+        camera: Camera,
+        left: Float[Tensor, "h w 3"],
+        mask: Bool[Tensor, "h w"] | None = None,
+        steps: int = STEPS,
+    ) -> Float[Tensor, " v"]:
+        """The appearance vector that fits the left part of a photo, by the training's color loss. It begins
+        as the vector of an unseen view.
+
+        Args:
+            camera: the photo's.
+            left: the leftmost w columns of the photo, 0…1.
+            mask: their foreground.
+            steps: 0 for the vector to begin with.
+        """
+        camera = camera.to(self.splats.means.device)
+        vector = Looks(self.field).of_view(camera).vector.clone().requires_grad_()
+        view = Camera(camera.view_matrix, camera.intrinsics, left.shape[1], left.shape[0])
+        splats = self.splats.select(in_view(view, self.splats.means, self.splats.scales))
+        gaussians, colors = splats.gaussians, splats.colors(view.position)
+        everything = torch.arange(len(splats), device=colors.device)
+        settings: dict[str, Any] = {"antialiased": splats.antialiased, "backend": self.backend}
+        optimizer = torch.optim.Adam([vector], lr=RATE)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(steps, 1))
+        with torch.enable_grad():
+            for _ in range(steps):
+                lit, shown = self.field(gaussians, colors, vector, everything)
+                image = rasterize(shown, view, lit, self.background, **settings).image
+                loss = rgb_loss(image.clamp(0.0, 1.0), left, mask, self.ssim_weight)
+                # Of the vector alone: the field's parameters get no gradient.
+                (vector.grad,) = torch.autograd.grad(loss, [vector])
+                optimizer.step()
+                schedule.step()
+        return vector.detach()

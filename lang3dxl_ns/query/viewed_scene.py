@@ -1,0 +1,229 @@
+"""`ViewedScene`: the part of a scene that one looks at, without words: Gaussians, photos and lighting."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+from jaxtyping import Float
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import watched
+from lang3dxl_ns.components.looks import Look, Looks, render_in_look
+from lang3dxl_ns.query.cache import fingerprint
+from lang3dxl_ns.query.match import View
+from lang3dxl_ns.query.overview import overview
+from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
+from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
+from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering.render import Rendering, composite
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
+
+LARGEST = 1920
+"""Longer side of pictures in pixels, where no size is requested."""
+Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
+"""A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
+
+
+class ViewedScene:
+    """Gaussians, and the photos they were made from.
+
+    It is data, and never changes; which Gaussians each photo shows is computed once. Any number of threads
+    may use it.
+
+    Args:
+        splats: the Gaussians, in the model's frame.
+        file: photos and cameras.
+        looks: lighting of the photos; None where all share one.
+        background: color behind the scene, 0…1; None for black.
+        config: sizes of pictures, and of the views that `visible` measures.
+        cache: file to keep which Gaussians the photos show; None: they are measured in every process.
+        backend: the rasterizer, see `rasterize`.
+        watch: called with a short description of slow work; None: a progress bar.
+    """
+
+    def __init__(
+        self,
+        splats: Splats,
+        file: SceneFile,
+        looks: Looks | None = None,
+        background: Float[Tensor, "3"] | None = None,
+        config: QueryConfig | None = None,
+        cache: Path | None = None,
+        backend: Backend = "auto",
+        watch: Callable[[str], None] | None = None,
+    ) -> None:
+        self.splats, self.file, self.config = splats, file, config or QueryConfig()
+        self.looks, self.background, self.backend = looks, background, backend
+        self._cache, self._watch = cache, watch
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        return self.splats.means.device
+
+    @property
+    def photos(self) -> list[ScenePhoto]:
+        """Training photos, then held-out ones: names, cameras, poses."""
+        return self.file.photos
+
+    @cached_property
+    def overview(self) -> ScenePhoto:
+        """The photo that shows the scene as a whole."""
+        return overview(self.photos, tuple(self.splats.means.median(0).values.tolist()))
+
+    def camera(self, place: Place, size: int | None = None, fov: float | None = None) -> Camera:
+        """A camera of the scene.
+
+        Args:
+            place: a camera; a photo by name; or a pose (camera → world in the model's frame, nerfstudio's
+                axes), which gets the first photo's lens.
+            size: longer side in pixels; by default a camera's own, and for photos that of the file, at most
+                1920.
+            fov: vertical field of view in degrees; by default that of the lens.
+
+        Raises:
+            UserError: no photo has this name, or the size or field of view is impossible.
+        """
+        size = self.config.size if size is None else size
+        if isinstance(place, Camera):
+            camera = place if size is None else with_longer_side(place, size)
+        else:
+            photo = self.file.photo(place) if isinstance(place, str) else self.photos[0]
+            camera = photo.full_camera
+            if not isinstance(place, str):
+                camera = posed(torch.as_tensor(place), camera)
+            camera = resized(camera, LARGEST) if size is None else with_longer_side(camera, size)
+        return camera if fov is None else with_field_of_view(camera, fov)
+
+    def render(
+        self, place: Place, size: int | None = None, fov: float | None = None, look: str | None = None
+    ) -> View:
+        """The scene from a photo's viewpoint, a camera or a pose.
+
+        Args:
+            place, size, fov: see `camera`.
+            look: training photo whose lighting is used; default: by the scene's rule for this view.
+
+        Raises:
+            UserError: see `camera`; or there is no look of this photo.
+        """
+        return self._view(self.camera(place, size, fov), self._name(place), look)
+
+    def draw(
+        self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
+    ) -> Rendering:
+        """Render a camera, as tensors on the scene's device.
+
+        Args:
+            camera: where to render from.
+            channels: further values of the Gaussians to composite.
+            look: the lighting; default: by the scene's rule for this view.
+        """
+        if look is None and self.looks is not None:
+            look = self.looks.of_view(camera)
+        return render_in_look(
+            self.splats, camera, look, channels, background=self.background, backend=self.backend
+        )
+
+    def _view(
+        self,
+        camera: Camera,
+        name: str | None,
+        look: str | None = None,
+        channels: Float[Tensor, "n d"] | None = None,
+    ) -> View:
+        start = time.perf_counter()
+        rendering = self.draw(camera, channels, self._look(look))
+        return View(rendering, name, time.perf_counter() - start)
+
+    def _look(self, photo: str | None) -> Look | None:
+        if photo is None:
+            return None
+        if self.looks is None:
+            raise UserError("all photos of this scene share one lighting: there is no look to choose")
+        return self.looks.of_photo(photo)
+
+    def _name(self, place: Place) -> str | None:
+        return self.file.photo(place).name if isinstance(place, str) else None
+
+    def baked(self, look: str | None = None) -> Splats:
+        """The Gaussians for viewers that know no looks: under that of a training photo.
+
+        Args:
+            look: the photo; default: the overview photo. Without looks the Gaussians are returned as they
+                are.
+        """
+        if self.looks is None:
+            if look is not None:
+                self._look(look)
+            return self.splats
+        camera = self.overview.camera
+        return (self._look(look) or self.looks.of_view(camera)).apply(self.splats, camera)
+
+    # ── what the photos show ────────────────────────────────────────────────────────────────────────
+
+    @cached_property
+    def visible(self) -> Mapping[str, VisibleGaussians]:
+        """The Gaussians visible in the training views; measured once, with a progress bar."""
+        cameras = self._small_cameras
+        views = load_visible(self._cache, self._views_key, cameras, self.device) if self._cache else None
+        if views is None:
+            what = "measuring which Gaussians the photos show, once"
+            shown = watched(cameras.items(), what, self._watch)
+            views = {name: self._visible(name, camera) for name, camera in shown}
+            if self._cache:
+                save_visible(self._cache, views, self._views_key)
+        return views
+
+    def _visible(self, name: str, camera: Camera) -> VisibleGaussians:
+        mask = self.file.photo(name).foreground((camera.height, camera.width))
+        weight = torch.ones(camera.height, camera.width) if mask is None else mask.float()
+        return VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
+
+    def _fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
+        drawn = partial(composite, self.splats, camera, backend=self.backend)
+        return filled_pixels(drawn, weight, len(self.splats))
+
+    @cached_property
+    def mass(self) -> Float[Tensor, " n"]:
+        """Pixels that every Gaussian fills, over all views."""
+        mass = self.splats.means.new_zeros(len(self.splats))
+        for view in self.visible.values():
+            mass[view.rows.long()] += view.pixels.float()
+        return mass
+
+    @cached_property
+    def trained_side(self) -> int:
+        """Longer side of the photos in training, pixels: their median."""
+        sides = sorted(max(p.camera.width, p.camera.height) for p in self.photos if p.split == "train")
+        return sides[len(sides) // 2] if sides else LARGEST
+
+    @cached_property
+    def gap(self) -> float:
+        """Matches closer than this are connected: 3 % of the median distance at which the scene is seen,
+        about eight pixels of a small view."""
+        distances = torch.tensor([view.distance(self.splats.means) for view in self.visible.values()])
+        return 0.03 * float(distances.nanmedian())
+
+    @cached_property
+    def _small_cameras(self) -> dict[str, Camera]:
+        photos = [photo for photo in self.photos if photo.split == "train"]
+        count = min(self.config.views, len(photos))
+        chosen = [photos[i * len(photos) // count] for i in range(count)]
+        return {photo.name: resized(photo.camera, self.config.view_side) for photo in chosen}
+
+    @cached_property
+    def _views_key(self) -> str:
+        c, shapes = self.config, vars(self.splats.gaussians)
+        return fingerprint(shapes, [asdict(self.file), c.views, c.view_side])

@@ -1,0 +1,51 @@
+"""Optional components: what a model and its checkpoint hold with and without them."""
+
+import pytest
+
+from lang3dxl_ns.plugin.optional_components import (
+    COMPONENTS,
+    CameraRefinement,
+    Lighting,
+    Semantics,
+    SmoothSky,
+)
+
+PARTS = {
+    SmoothSky: {"sky"},
+    CameraRefinement: {"camera_optimizer"},
+    Semantics: {"semantic_field", "downsampler", "clip_mean", "dense_mean"},
+    Lighting: {"appearance"},
+}
+"""Names in a checkpoint by component: earlier checkpoints have them too."""
+
+
+def parts(model) -> set[str]:
+    names = {name.split(".")[0] for name in model.state_dict()}
+    return names & set().union(*PARTS.values())
+
+
+@pytest.fixture
+def model(train, scene):
+    """One with semantics learned from renderings, a smooth sky, and refined cameras."""
+    changes = {
+        "pipeline__model__appearance__use": "off",
+        "pipeline__model__sky_gaussians": 50,
+        "pipeline__model__camera_optimization": "on",
+        "pipeline__model__decoder__name": "paper",
+    }
+    return train(scene, iterations=1, **changes).pipeline.model
+
+
+def test_every_component_can_be_left_out_and_built_again_under_the_names_of_checkpoints(model):
+    assert {type(component) for component in COMPONENTS} == set(PARTS)
+    assert parts(model) == set().union(*PARTS.values()) - PARTS[Lighting]
+    for component in COMPONENTS:
+        model.register_buffer("clip_mean", None), model.register_buffer("dense_mean", None)
+        for one in COMPONENTS:
+            one.leave_out(model)
+        model.config.camera_optimizer.mode = "off"
+        assert parts(model) == set() and set(model.get_param_groups()) <= set(model.gauss_params)
+        component.build(model)
+        assert parts(model) == PARTS[type(component)]
+        assert component.parameters(model)
+        assert not any(one.parameters(model) for one in COMPONENTS if one is not component)
