@@ -263,9 +263,9 @@ def test_no_photo_of_a_query_is_waited_for(default, fake):
         question = scene.ask("tower; window")
         camera, channels = scene.camera(scene.file.photos[0].name), question.channels
         with gpu.counting() as waits:
-            maps = question.maps(scene.draw(camera, channels))
+            maps, masks = question.maps(scene.draw(camera, channels))
         assert waits == {"gsplat": 1}
-        assert maps.device == CUDA
+        assert maps.device == masks.device == CUDA
         counts = []
         for views in (scene.visible, dict(list(scene.visible.items())[:1])):
             scene.__dict__["visible"] = views

@@ -39,7 +39,8 @@ def test_query_writes_pictures_map_and_report(run, tmp_path, capsys):
     column, row = view["matches"][0]["peak"]
     assert relevancy[row, column] == relevancy.max() == pytest.approx(view["matches"][0]["score"])
     mask = np.asarray(Image.open(tmp_path / "dome" / "all_0003.mask.png"))
-    np.testing.assert_array_equal(mask == 255, relevancy > 0.5)
+    match = painted_scene().query('dome not "window"', "all/0003.jpg")
+    np.testing.assert_array_equal(mask == 255, match.mask)
     picture = np.asarray(Image.open(tmp_path / "dome" / "all_0003.overlay.png")).astype(int)
     assert (np.ptp(picture[mask == 0], axis=1) == 0).all() and (
         np.ptp(picture[mask == 255], axis=1) > 0
@@ -99,7 +100,7 @@ def test_mistakes_end_in_a_sentence(run, tmp_path, words, message):
 
 def test_settings_are_flags(run, tmp_path):
     words = ("query", "c", "--text", "dome", "--image", "0002", "--out", tmp_path)
-    run(*words, "--threshold", 0.9999, "--synonyms", "off")
+    run(*words, "--threshold", 1, "--synonyms", "off")
     assert not np.asarray(Image.open(tmp_path / "dome" / "right_0002.mask.png")).any()
 
 
