@@ -77,5 +77,6 @@ def _share(scene: Scene, photo: Photo, camera: Camera, chosen: Bool[Tensor, " n"
     both = torch.stack([chosen, torch.ones_like(chosen)], dim=1).to(scene.splats.means)
     drawn = composite(scene.splats, small, both, scene.backend)
     foreground = photo.read_mask(small.width / photo.width)
-    filled = (drawn if foreground is None else drawn[foreground.to(drawn.device)]).flatten(0, -2).sum(0)
+    keep = Pixels.of([drawn], (small.height, small.width), foreground).foreground
+    filled = (drawn * keep[..., None]).flatten(0, -2).sum(0)
     return float(filled[0] / filled[1].clamp_min(1e-6))

@@ -369,8 +369,9 @@ class Lang3DXLTrainer(Trainer):
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
         how = f"{self.config.method_name}, {config.decoder.name}, {self.config.max_num_iterations} iterations"
-        scene, checkpoint = self.pipeline.model.scene(self.pipeline.scene_file), self._checkpoint_to_load()
-        for folder in (self.base_dir, *([] if checkpoint is None else [checkpoint.parents[1]])):
+        scene, place = self.pipeline.model.scene(self.pipeline.scene_file), self.config.load_checkpoint
+        checkpoints = self.config.load_dir or (place and place.parent)
+        for folder in (self.base_dir, *([checkpoints.parent] if checkpoints else [])):
             scene = with_words_of(scene, folder / path.name)
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
         size = write_scene(path, scene, told)

@@ -1,12 +1,17 @@
 """Words taught by a segmenter: a stand-in that finds what is painted in one gray, and errs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from painted_scene import painted_scene
 
+from lang3dxl_ns.attachment.segment import _share as share_of
 from lang3dxl_ns.attachment.segment import segmented
 from lang3dxl_ns.query.match import save_picture
+from lang3dxl_ns.query.teach import MARK_SIDE
+from lang3dxl_ns.scene.camera import resized
 from lang3dxl_ns.scene.photo import Photo
 
 DOME = 1 / 3
@@ -75,3 +80,15 @@ def test_foreground_masks_keep_votes_out(scene, photos, tmp_path):
         save_picture((outside * 255).to(torch.uint8).numpy(), path)
         blocked.append(Photo(photo.name, photo.path, path, photo.lens))
     assert taught(scene, blocked, Grays(DOME)) is scene
+
+
+def test_a_photo_in_portrait_format_may_have_a_foreground_mask(scene, photos, tmp_path):
+    """Whose rows, shrunk by the ratio of the columns, are not those of the view."""
+    lens = replace(photos[0].lens, width=701, height=1103)
+    save_picture(np.full((1103, 701), 255, np.uint8), tmp_path / "mask.png")
+    photo = Photo(photos[0].name, photos[0].path, tmp_path / "mask.png", lens)
+    camera = lens.camera(scene.photos[0].full_camera.view_matrix)
+    small = resized(camera, MARK_SIDE)
+    assert photo.read_mask(small.width / photo.width).shape != (small.height, small.width)
+    everything = torch.ones(len(scene.splats), dtype=torch.bool)
+    assert share_of(scene, photo, camera, everything) == pytest.approx(1.0)
