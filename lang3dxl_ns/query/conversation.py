@@ -53,7 +53,10 @@ class Conversation:
         shown: Callable[[], set[str]],
         watch: Callable[[str], None],
     ) -> None:
-        self.question: Question | None = None
+        self._asked: tuple[Scene, Question] | None = None
+        """The question and the snapshot that it was put to, replaced together: other threads read them."""
+        self._drawn: tuple[Scene, Question] | None = None
+        """Those of the frame under way."""
         self.found: list[Found] | None = None
         """None: not searched yet."""
         self.seconds: float | None = None
@@ -68,21 +71,27 @@ class Conversation:
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
+    @property
+    def question(self) -> Question | None:
+        """The latest question."""
+        return None if self._asked is None else self._asked[1]
+
     def ask(self, text: str) -> Question:
         """Set the question: prompts as for `parse_prompts`. Raises UserError if there is none, or nothing can
         be asked."""
-        question = self._scene_now().ask(text)
-        self.question, self.found = question, None
+        scene = self._scene_now()
+        question = scene.ask(text)
+        self._asked, self.found = (scene, question), None
         return question
 
     def forget(self) -> None:
         """Clear the question."""
-        self.question = self.found = None
+        self._asked = self.found = None
 
     def find(self) -> list[Found]:
         """Matches of each prompt in the scene. First examines the scene, which takes long once."""
-        question, scene = self.question, self._scene
-        assert question is not None and scene is not None
+        assert self._asked is not None
+        scene, question = self._asked
         found = scene.places(question)
         if question is self.question:
             self.found = found
@@ -132,13 +141,18 @@ class Conversation:
         return "bottleneck" in self._shown()
 
     def channels(self) -> Tensor | None:
-        """Values that Gaussians carry in the next rendering; None while they may not be the snapshot's."""
-        return None if self.question is None or self._learning() else self.question.channels
+        """Values that Gaussians carry in the next rendering; None where they may not be the snapshot's: the
+        question was asked in training."""
+        self._drawn = self._asked
+        if self._drawn is None or self._drawn[0] is not self._scene or self._scene_step is not None:
+            return None
+        return self._drawn[1].channels
 
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """`overlay` and the relevancy of a rendering that took so many seconds. There is always an `overlay`,
-        since viewers break if an output they show is missing."""
-        start, question, scene = time.perf_counter(), self.question, self._scene
+        """`overlay` and the relevancy of a rendering that took so many seconds, for the question at the call
+        of `channels` before it. There is always an `overlay`, since viewers break if an output they show is
+        missing."""
+        start, (scene, question) = time.perf_counter(), self._drawn or (None, None)
         if question is not None and scene is not None and rendering.channels is None:
             of_snapshot = scene.draw(rendering.camera, question.channels)
             rendering = replace(rendering, channels=of_snapshot.channels, alpha=of_snapshot.alpha)

@@ -240,7 +240,13 @@ class Scene(ViewedScene):
         return [self._found(question, i, most) for i in range(len(question.prompts))]
 
     def best_views(self, question: Question) -> list[str]:
-        """For each prompt the name of the training photo whose view shows it best, or comes closest."""
+        """For each prompt the name of the training photo whose view shows it best, or comes closest.
+
+        Raises:
+            UserError: the scene has no training photos.
+        """
+        if not self.visible:
+            raise UserError("this scene has no training photos to choose from: name a photo or a camera")
         rows = range(len(question.prompts))
         return [self._ranked(question, row)[0].name for row in rows]
 

@@ -212,9 +212,9 @@ class ViewedScene:
     @cached_property
     def gap(self) -> float:
         """Matches closer than this are connected: 3 % of the median distance at which the scene is seen,
-        about eight pixels of a small view."""
+        about eight pixels of a small view; 0 if no training photo shows anything."""
         distances = torch.tensor([view.distance(self.splats.means) for view in self.visible.values()])
-        return 0.03 * float(distances.nanmedian())
+        return 0.03 * float(distances.nanmedian().nan_to_num())
 
     @cached_property
     def _small_cameras(self) -> dict[str, Camera]:

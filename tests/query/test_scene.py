@@ -331,6 +331,15 @@ def test_a_prompted_foreground_leaves_only_what_it_finds(scene):
     assert only.find("dome").box == scene.find("dome").box
 
 
+def test_a_scene_without_training_photos_answers_in_views_that_are_named(scene):
+    held_out = [replace(photo, split="eval") for photo in scene.photos]
+    other = painted_scene(file=replace(painted_file(), photos=held_out))
+    np.testing.assert_array_equal(other.query("dome", "0003").mask, scene.query("dome", "0003").mask)
+    assert other.find("dome").views == [] and other.gap == 0
+    with pytest.raises(UserError, match="no training photos"):
+        other.query("dome")
+
+
 def test_three_threads_get_the_answers_of_one():
     alone, shared = painted_scene(), painted_scene()
     texts = ["dome", "window", "wall", "object"] * 3

@@ -1,0 +1,76 @@
+"""Questions to a model that changes meanwhile: each answer is of one snapshot and one question."""
+
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import pytest
+import torch
+from painted_scene import encode_texts, painted_codes, painted_scene, painted_splats
+
+from lang3dxl_ns.query import conversation as module
+from lang3dxl_ns.query.conversation import Conversation
+
+
+@pytest.fixture
+def model():
+    """One whose snapshots have fewer Gaussians at every iteration."""
+    found = SimpleNamespace(step=1, training=True, device="cpu", semantic_field=None)
+    found.config, found.train = SimpleNamespace(total_steps=10), lambda _: None
+    found.forget_gathered_codes = lambda: None
+
+    def snapshot(*_, **settings):
+        keep = torch.arange(len(painted_splats())) < 5000 - 500 * found.step
+        return painted_scene(splats=painted_splats().select(keep), codes=painted_codes()[keep])
+
+    found.scene = snapshot
+    return found
+
+
+@pytest.fixture
+def talk(model, monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "text_encoder", lambda *_: encode_texts)
+    nothing = {"learn": lambda: None, "shown": set, "watch": lambda _: None}
+    learning = lambda: model.training  # noqa: E731
+    return Conversation(model, None, tmp_path, nullcontext(), learning, **nothing)
+
+
+def frame(talk, model, between=lambda: None):
+    """The outputs of a frame; something happens while it is rendered."""
+    scene, channels = model.scene(), talk.channels()
+    between()
+    return talk.outputs(scene.draw(scene.camera("0003", 48), channels), 0.0)
+
+
+def test_a_question_asked_in_training_is_answered_by_its_snapshot_when_training_has_ended(talk, model):
+    talk.ask("dome")
+    expected = frame(talk, model)["relevancy_0"]
+    model.step, model.training = 5, False
+    assert talk.channels() is None
+    assert torch.equal(frame(talk, model)["relevancy_0"], expected)
+    talk.ask("dome")
+    assert talk.channels().shape[0] == len(model.scene().splats)
+
+
+def test_while_a_new_snapshot_is_being_asked_the_old_question_is_answered_by_its_own(talk, model, monkeypatch):
+    talk.ask("dome")
+    expected, found = frame(talk, model)["relevancy_0"], talk.find()[0].gaussians
+    model.step = 5
+    shown = []
+
+    def meanwhile(scene, text):
+        shown.extend((frame(talk, model)["relevancy_0"], talk.find()[0].gaussians))
+
+    monkeypatch.setattr(module.Scene, "ask", meanwhile)
+    talk.ask("window")
+    assert torch.equal(shown[0], expected) and len(shown[1]) == len(found)
+
+
+def test_a_question_that_comes_while_a_frame_is_rendered_waits_for_the_next(talk, model):
+    model.training = False
+    talk.ask("dome")
+    expected = frame(talk, model)
+    found = frame(talk, model, between=lambda: talk.ask("wall; window"))
+    assert torch.equal(found["relevancy_0"], expected["relevancy_0"]) and "relevancy_1" not in found
+    assert "relevancy_1" in frame(talk, model)
+    found = frame(talk, model, between=talk.forget)
+    assert "relevancy_1" in found and set(frame(talk, model)) == {"overlay"}
