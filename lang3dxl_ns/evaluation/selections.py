@@ -17,7 +17,7 @@ from lang3dxl_ns.query.places import Box, groups
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.rendering.gathering import lift_masks
+from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.scene.camera import Camera
 
@@ -72,8 +72,10 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
 
 def _marked(scene: Scene, labels: Labels) -> Bool[Tensor, " n"]:
     """Gaussians most of whose pixels have the label."""
-    views = [(partial(composite, scene.splats, cam, backend=scene.backend), mask) for cam, mask in labels]
-    return lift_masks(len(scene.splats), views, scene.splats.means) > 0.5
+    like = scene.splats.means
+    drawn = [partial(composite, scene.splats, camera, backend=scene.backend) for camera, _ in labels]
+    pixels = [Pixels.of([mask[..., None].to(like)], (mask.shape[0], mask.shape[1])) for _, mask in labels]
+    return gather(len(scene.splats), zip(drawn, pixels, strict=True), 1, like)[0][:, 0] > 0.5
 
 
 def box_iou(a: Box, b: Box) -> float:

@@ -30,7 +30,7 @@ _MOVED = {
     }.items()
 }
 """Where settings are that earlier versions kept elsewhere."""
-_REMOVED = {"DecoderConfig": {"start"}}
+_REMOVED = {"DecoderConfig": ("start",)}
 """Settings of earlier versions, by their class, that only training read: a finished run opens without."""
 _UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
 """nerfstudio's classes that unpickle what they read."""
@@ -60,8 +60,6 @@ def read_settings(path: Path, places: Sequence[Sequence[str]], complete: bool = 
     """
     try:
         found = _construct(read_text(path), places)
-        for settings in filter(is_dataclass, found):
-            _leave_out_removed(settings)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
         raise UserError(f"{path} is not a file: pass the config.yml of a run") from error
     except (
@@ -122,15 +120,6 @@ def _differences(settings: Any, place: str = "") -> Iterator[str]:
             yield from _differences(value, f"{place}{name}.")
         elif name in hints and not _fits(value, hints[name]) and _fits(_default(settings, name), hints[name]):
             yield f"sets {place}{name} to {str(value)[:40]!r}, of another kind than this setting"
-
-
-def _leave_out_removed(settings: Any) -> None:
-    """Take out the settings that earlier versions had."""
-    for name in _REMOVED.get(type(settings).__name__, set()) & set(vars(settings)):
-        delattr(settings, name)
-    for value in vars(settings).values():
-        if is_dataclass(value) and not isinstance(value, type):
-            _leave_out_removed(value)
 
 
 def _complete(settings: Any) -> None:
@@ -294,6 +283,12 @@ class _SettingsLoader(yaml.UnsafeLoader):
     def find_python_module(self, name: str, mark: Any) -> Any:  # type: ignore[override]
         """Modules are rejected: settings contain none."""
         raise yaml.constructor.ConstructorError(None, None, f"it asks for the module {name}", mark)
+
+    def set_python_instance_state(self, instance: Any, state: Any) -> None:
+        """Settings as they were saved, but for those that are gone."""
+        for name in _REMOVED.get(type(instance).__name__, ()):
+            state.pop(name, None)
+        super().set_python_instance_state(instance, state)
 
     def make_python_instance(
         self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False

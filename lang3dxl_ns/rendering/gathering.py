@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from lang3dxl_ns.common.image import resize
@@ -91,25 +91,6 @@ def gather(
     features, mass = sums[:, :-1], sums[:, -1].clone()
     features /= torch.where(mass > 0, mass, torch.inf)[:, None]
     return features, mass
-
-
-def lift_masks(
-    count: int, views: Iterable[tuple[Composite, Bool[Tensor, "h w"]]], like: Tensor
-) -> Float[Tensor, " n"]:
-    """Votes of masks in photos about Gaussians: the share of each Gaussian's visible pixels that lie in the
-    masks, 0…1; 0 for Gaussians never visible. Above 0.5 the majority says that it belongs to what was
-    segmented.
-
-    Args:
-        count: number of Gaussians, n.
-        views: for each, a function that composites values of the Gaussians, and the mask.
-        like: gives number type and device.
-    """
-    pixels = (
-        (composite, Pixels([mask.to(like)[..., None]], torch.ones_like(mask).to(like)))
-        for composite, mask in views
-    )
-    return gather(count, pixels, 1, like)[0][:, 0]
 
 
 def filled_pixels(composite: Composite, weight: Float[Tensor, "h w"], count: int) -> Float[Tensor, " n"]:

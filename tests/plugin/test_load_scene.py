@@ -95,6 +95,11 @@ def test_a_resumed_run_keeps_the_words_that_were_taught(train, scene_photos):
     again = train(scene_photos, iterations=3, load_dir=first.checkpoint_dir)
     assert again.base_dir != first.base_dir
     assert len(lang3dxl_ns.load_scene(again.base_dir).words["gizmo"].examples) == 1
+    shutil.rmtree(first.checkpoint_dir)  # as somebody may who needs the space while it trains
+    (written,) = again.base_dir.glob("*.scene")
+    written.unlink()
+    again.write_scene()
+    assert lang3dxl_ns.load_scene(written).words
 
 
 def taught_in(path: Path):

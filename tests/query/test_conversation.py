@@ -51,7 +51,7 @@ def test_a_question_asked_in_training_is_answered_by_its_snapshot_when_training_
     assert talk.channels().shape[0] == len(model.scene().splats)
 
 
-def test_while_a_new_snapshot_is_being_asked_the_old_question_is_answered_by_its_own(talk, model, monkeypatch):
+def test_while_a_new_snapshot_is_asked_the_old_question_is_answered_by_its_own(talk, model, monkeypatch):
     talk.ask("dome")
     expected, found = frame(talk, model)["relevancy_0"], talk.find()[0].gaussians
     model.step = 5

@@ -7,7 +7,7 @@ import torch
 
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.gathering import Pixels, filled_pixels, gather, lift_masks
+from lang3dxl_ns.rendering.gathering import Pixels, filled_pixels, gather
 from lang3dxl_ns.scene.camera import Camera
 
 SIZE = 24
@@ -194,10 +194,14 @@ def test_masks_vote_for_the_gaussians_that_they_show():
     weights = torch.rand(2, 5, 7, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     weights[..., 3] = 0
     masks = torch.rand(2, 5, 7, generator=torch.Generator().manual_seed(1)) > 0.6
-    views = [(lambda carried, w=w: w @ carried, mask) for w, mask in zip(weights, masks, strict=True)]
-    votes = lift_masks(4, views, torch.zeros(1, dtype=torch.float64))
+    drawn = [lambda carried, w=w: w @ carried for w in weights]
+
+    def votes_of(masks):
+        pixels = [Pixels.of([mask[..., None].double()], (5, 7)) for mask in masks]
+        return gather(4, zip(drawn, pixels, strict=True), 1, weights)[0][:, 0]
+
+    votes = votes_of(masks)
     expected = (weights * masks[..., None]).sum((0, 1, 2)) / weights.sum((0, 1, 2)).clamp_min(1e-9)
     torch.testing.assert_close(votes, expected)
     assert votes[3] == 0 and (votes[:3] > 0).all()
-    everything = [(composite, torch.ones_like(mask)) for composite, mask in views]
-    torch.testing.assert_close(lift_masks(4, everything, weights)[:3], torch.ones(3, dtype=torch.float64))
+    torch.testing.assert_close(votes_of(torch.ones_like(masks))[:3], torch.ones(3, dtype=torch.float64))
