@@ -408,7 +408,9 @@ def test_a_named_word_is_kept_offered_and_forgotten(page, scene, browser, addres
     box.fill("my cu")
     option = page.locator("#offered option[value='my cupola']")
     option.wait_for(state="attached")
+    page.evaluate("lang3dxl.ask('my cupola')")
     found = page.evaluate("lang3dxl.ask('My Cupola')")
+    assert page.locator("#prompts li").count() == 1
     assert found["known"] and found["matching"] == int(scene.ask("dome").gaussians[0].sum())
     page.get_by_role("button", name="Add").click()
     page.get_by_role("button", name="Forget").click()

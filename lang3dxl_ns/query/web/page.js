@@ -61,8 +61,9 @@ async function ask(typed) {
   $("near").replaceChildren();
   let found = null;
   for (const { text, negatives } of about.words ? parsePrompts(String(typed)) : []) {
-    const old = prompts.find((prompt) => prompt.text === text && String(prompt.negatives) === String(negatives));
-    const prompt = old ?? { negatives, color: unusedColor(), ...(namedWord(text) ?? { text }) };
+    const word = namedWord(text) ?? { text };
+    const old = prompts.find((prompt) => prompt.text === word.text && String(prompt.negatives) === String(negatives));
+    const prompt = old ?? { negatives, color: unusedColor(), ...word };
     found = await answer(prompt);
     if (!found.known) {
       offerClosest(found);
