@@ -33,7 +33,7 @@ def test_the_version_is_told(capsys):
     ("words", "hint"),
     [
         (["qeury"], "did you mean query"),
-        (["benchmark", "rasteriser"], "did you mean rasterizer"),
+        (["benchmark", "trainig"], "did you mean training"),
         (["xyzzy"], "--help lists all"),
         (["query", "none", "--out", "found"], "there is no --text"),
         (["query", "none", "--text", " ; ", "--out", "found"], "the prompt is empty"),
