@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,8 @@ _REFINED = 3
 """Frames that are refined at most."""
 _ROUNDS = ((48, 40), (96, 40))
 """Refinement: longer sides in pixels, and steps at each."""
+_MOST = 200_000
+"""Gaussians that refinement renders, hundreds of times: of more, every so many, larger."""
 _RATE = 4e-3
 """Adam's, in radians and shares of the scene's size."""
 _COVERED = 0.05
@@ -96,12 +98,15 @@ def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
     found = max(checked, key=lambda fit: fit.score)
     if found.score >= _CLOSE:
         return found
-    worth = [fit for fit in checked if fit.score >= min(_PROMISING, found.score)]
+    worth = [found] if found.fits else [f for f in checked if f.score >= min(_PROMISING, found.score)]
+    every = -(-len(splats) // _MOST)
+    thinned = splats.select(torch.arange(0, len(splats), every))
+    thinned = replace(thinned, scales=thinned.scales * every**0.5)  # that cover as much together
     with progress("refining the frame", len(worth) * sum(steps for _, steps in _ROUNDS)) as advance:
         for fit in worth:
             refined = fit.similarity
             for side, steps in _ROUNDS:
-                refined = _Comparison.of(collection, _FEW, side).refined(splats, refined, steps, advance)
+                refined = _Comparison.of(collection, _FEW, side).refined(thinned, refined, steps, advance)
             again = large.fit(splats, f"{fit.name}, refined", refined)
             found = max(found, again, key=lambda fit: fit.score)
     return found
