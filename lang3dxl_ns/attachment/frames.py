@@ -16,7 +16,9 @@ from torch import Tensor
 from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, registered_frames
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.query.match import as_bytes
 from lang3dxl_ns.rendering.rasterize import rasterize
+from lang3dxl_ns.rendering.render import render
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.colmap import TrackedPhoto
@@ -37,7 +39,7 @@ _REFINED = 3
 _ROUNDS = ((48, 40), (96, 40))
 """Refinement: longer sides in pixels, and steps at each."""
 _MOST = 200_000
-"""Gaussians that refinement renders, hundreds of times: of more, every so many, larger."""
+"""Gaussians that refinement renders, hundreds of times."""
 _RATE = 4e-3
 """Adam's, in radians and shares of the scene's size."""
 _COVERED = 0.05
@@ -229,10 +231,8 @@ def side_by_side(splats: Splats, collection: PhotoCollection, fit: Fit) -> UInt8
     """A photo beside the rendering at its camera, to look at."""
     photo = collection.photos[len(collection.photos) // 2]
     camera = camera_in(fit.similarity, collection.reconstruction.photos[photo.name])
-    from lang3dxl_ns.rendering.render import render
-
     camera = resized(camera, 640)
-    rendering = (render(splats, camera).rgb.cpu() * 255).round().byte().numpy()
+    rendering = as_bytes(render(splats, camera).rgb)
     read = photo.read_uint8(camera.width / photo.width).numpy()
     rows, columns = min(len(read), len(rendering)), min(read.shape[1], rendering.shape[1])
     return np.concatenate([read[:rows, :columns], rendering[:rows, :columns]], axis=1)

@@ -50,9 +50,9 @@ class Pixels:
 
     def channels(self, start: int, stop: int) -> Float[Tensor, "h w part"]:
         """A range of the channels."""
-        size, found, first = self.foreground.shape, [], 0
-        weighted = [(each, self.foreground[..., None]) for each in self.maps]
-        for each, weight in (*weighted, (self.foreground[..., None], 1), (self.outside[..., None], 1)):
+        size, found, first, inside = self.foreground.shape, [], 0, self.foreground[..., None]
+        weighted = [(each, inside) for each in self.maps]
+        for each, weight in (*weighted, (inside, 1), (self.outside[..., None], 1)):
             part = each[..., max(start - first, 0) : max(stop - first, 0)]
             if part.shape[-1]:
                 found.append(resize(part, (size[0], size[1])) * weight)
@@ -68,8 +68,8 @@ def gather(
     memory: float | None = None,
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
     """Mean over all pixels p of all views, weighted by a Gaussian's contribution, Σ w(g, p) F(p) / Σ w(g, p),
-    and its mass Σ w(g, p) in pixels. Gaussians never visible have mass and mean 0. So have those with more mass
-    outside the foreground than on it: what the edges of masks show of the sky would be called a tower.
+    and its mass Σ w(g, p) in pixels. Gaussians never visible have mass and mean 0. So have those with
+    more mass outside the foreground: the sky would take what it has from the edges of towers.
 
     Compositing is linear in the values composited, map(p) = Σ_g w(g, p) f(g), so the sums are its derivative
     in the direction of F: one backward pass per view, exact.
