@@ -52,7 +52,8 @@ class Pixels:
         """A range of the channels."""
         size, found, first, inside = self.foreground.shape, [], 0, self.foreground[..., None]
         weighted = [(each, inside) for each in self.maps]
-        for each, weight in (*weighted, (inside, 1), (self.outside[..., None], 1)):
+        whole = torch.ones_like(inside)
+        for each, weight in (*weighted, (inside, whole), (self.outside[..., None], whole)):
             part = each[..., max(start - first, 0) : max(stop - first, 0)]
             if part.shape[-1]:
                 found.append(resize(part, (size[0], size[1])) * weight)
