@@ -141,7 +141,7 @@ def numerics(quick: bool) -> dict[str, Any]:
 
     cases = list(losses.cases(True, "cuda"))[:2] + list(decoder.cases(True, "cuda"))[:1]
     rows = measure_all(cases if quick else list(all_cases(True, "cuda")), quick, "cuda")
-    missed = [f"{row.component}, {row.case}, {row.mode}" for row in rows if row.misses]
+    missed = [row.name for row in rows if row.misses]
     return {"rows": len(rows), "missed": missed}
 
 
