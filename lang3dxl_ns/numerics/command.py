@@ -44,7 +44,7 @@ class Numerics:
             heading = f"`{command_line('lang3dxl numerics', self)}`\n{describe_machine(device)}."
         finally:
             torch.set_num_threads(threads)
-        all_rows = [*rows, *optimizations]
+        all_rows: list[Row | Run] = [*rows, *optimizations]
         misses = [f"{row.name}: {'; '.join(row.misses)}" for row in all_rows if row.misses]
         verdict = f"{len(all_rows) - len(misses)} of {len(all_rows)} rows pass"
         write_atomically(self.out / "numerics.md", _markdown(rows, optimizations, heading, verdict))

@@ -89,8 +89,8 @@ def _toolkit_places(major: str) -> list[Path]:
     packages = (nvidia and nvidia.submodule_search_locations) or ()
     named = os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), nvcc and Path(nvcc).resolve().parents[1]
     others = sorted(Path("/usr/local").glob(f"cuda-{major}*"), reverse=True)
-    system = [*filter(None, named), "/usr/local/cuda", *others]
-    return [*(Path(folder) / f"cu{major}" for folder in packages), *map(Path, system)]
+    system = [Path(home) for home in named if home]
+    return [*(Path(folder) / f"cu{major}" for folder in packages), *system, Path("/usr/local/cuda"), *others]
 
 
 def _headers(home: Path) -> list[Path]:
@@ -121,7 +121,9 @@ def needs(folder: Path) -> list[Need]:
     compiler = shutil.which(os.environ.get("CXX", "g++"), path=search_path())
     return [
         Need("torch with CUDA", cuda or None, "https://pytorch.org/get-started/locally"),
-        Need(f"nvcc and cub of CUDA {cuda.partition('.')[0] or '13'}", toolkit and str(toolkit), nvcc),
+        Need(
+            f"nvcc and cub of CUDA {cuda.partition('.')[0] or '13'}", str(toolkit) if toolkit else None, nvcc
+        ),
         Need("C++ compiler", compiler, apt),
         Need("Python.h", str(header) if header.is_file() else None, apt),
         Need("ninja", shutil.which("ninja", path=search_path()), "pip install ninja"),
