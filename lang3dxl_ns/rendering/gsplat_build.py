@@ -76,8 +76,8 @@ def find_toolkit(cuda: str) -> Path | None:
     major = cuda.partition(".")[0]
     for home in _toolkit_places(major):
         with contextlib.suppress(OSError, subprocess.SubprocessError):
-            nvcc = [home / "bin" / "nvcc", "--version"]
-            told = subprocess.run(nvcc, capture_output=True, text=True, timeout=30).stdout
+            nvcc = str(home / "bin" / "nvcc")
+            told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, timeout=30).stdout
             if f"release {major}." in told and _headers(home):
                 return home
     return None
