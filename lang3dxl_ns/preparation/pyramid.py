@@ -29,11 +29,6 @@ class ClipTarget:
     scales: list[float]
     """Side of each scale's crops in world units (or as a fraction of the width)."""
 
-    @property
-    def range_factor(self) -> float:
-        """Ratio of the largest to the smallest scale."""
-        return max(self.scales) / min(self.scales)
-
 
 HALF, THIRD = 2, 3
 """Crops per side: how many steps a crop's own side is, from one center to the next."""

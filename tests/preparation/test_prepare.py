@@ -117,7 +117,6 @@ def test_the_reader_gives_what_the_encoders_made(photos, config, store, models):
     torch.testing.assert_close(found.features, expected.features.half(), atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(found.valid, expected.valid.half())
     assert found.crop_fractions == [0.4, 0.8]
-    assert found.range_factor == 2
     assert targets.reader.names == NAMES
     assert targets.encoded == 3
     assert targets.left_out == {}

@@ -180,7 +180,7 @@ def test_every_scale_counts_the_same():
         batch_size=10_000,
     )
     assert torch.allclose(target.features, torch.tensor(37.0))
-    assert (target.crop_sides, target.scales, target.range_factor) == ([32, 64, 128], [0.5, 1.0, 2.0], 4.0)
+    assert (target.crop_sides, target.scales) == ([32, 64, 128], [0.5, 1.0, 2.0])
 
 
 def test_cells_lie_where_the_grid_says():
