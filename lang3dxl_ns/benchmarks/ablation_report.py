@@ -11,7 +11,13 @@ from typing import Any
 
 from lang3dxl_ns.baselines.rows import BOUNDS, FULL, Row
 from lang3dxl_ns.benchmarks.scored_runs import Run
-from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_atomically, write_report
+from lang3dxl_ns.common.reports import (
+    as_png,
+    describe_machine,
+    markdown_table,
+    write_atomically,
+    write_report,
+)
 
 FIGURES = {
     "test_map": ("mAP, test views", ".3f"),
@@ -227,6 +233,4 @@ def plot(lengths: Mapping[int, Sequence[Mapping[str, Any]]], quality: str) -> by
     axes.set(xscale="log", xlabel="training, s of one core", ylabel="mAP")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=7)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=150)
-    return file.getvalue()
+    return as_png(figure)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import math
 import os
@@ -24,6 +25,7 @@ from lang3dxl_ns.common.files import write_atomically
 
 if TYPE_CHECKING:  # imported where it is used: a command's help comes without it
     import torch
+    from matplotlib.figure import Figure
 
 Result = TypeVar("Result")
 
@@ -187,6 +189,13 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> s
     """A markdown table; None becomes a dash."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join("–" if c is None else str(c) for c in line) + " |" for line in lines)
+
+
+def as_png(figure: Figure) -> bytes:
+    """A matplotlib figure as the bytes of a PNG."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=150)
+    return file.getvalue()
 
 
 def write_report(folder: Path, name: str, markdown: str, data: Mapping[str, Any]) -> None:

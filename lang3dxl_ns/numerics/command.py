@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import torch
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, progress_bar
+from lang3dxl_ns.common.reports import as_png, command_line, describe_machine, markdown_table, progress_bar
 from lang3dxl_ns.numerics.catalog import all_cases
 from lang3dxl_ns.numerics.measure import Case, Row, measure
 from lang3dxl_ns.numerics.optimization import Run, runs
@@ -143,6 +142,4 @@ def _plot(rows: Sequence[Row]) -> bytes:
         panel.grid(alpha=0.25)
     panels[0].set_ylabel(f"relative RMS error (0 drawn at {SMALLEST:.0e})")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=130)
-    return file.getvalue()
+    return as_png(figure)
