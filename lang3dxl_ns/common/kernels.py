@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
 import os
 
 import torch
 from torch import Tensor
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import in_a_line
 
 VARIABLE = "LANG3DXL_CPU_KERNELS"
 """Environment variable: "torch" disables the compiled kernels, as in the tests."""
 
 
 def takes_kernels(tensor: Tensor, wanted: str | None = None) -> bool:
-    """Whether the compiled kernels are installed, enabled, and support a tensor's device and number type.
+    """Whether the compiled kernels can be had, are enabled, and support a tensor's device and number type.
 
     wanted: "numba" or "torch"; None reads the environment variable.
     """
     wanted = wanted or os.environ.get(VARIABLE, "numba")
     fits = tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64)
-    return wanted == "numba" and fits and numba_is_installed()
+    return wanted == "numba" and fits and numba_works()
 
 
 @functools.cache
-def numba_is_installed() -> bool:
-    """Whether numba is available."""
-    return importlib.util.find_spec("numba") is not None
+def numba_works() -> bool:
+    """Whether numba is installed, and not broken, which is said: it fits few versions of numpy, for example."""
+    try:
+        import numba  # noqa: F401
+    except Exception as error:  # of any kind, depending on what doesn't fit
+        if not (isinstance(error, ModuleNotFoundError) and error.name == "numba"):
+            say(f"numba does not work ({in_a_line(error)}): torch takes its place, at 2 to 4 times the time")
+        return False
+    return True

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
 
-from lang3dxl_ns.common.kernels import numba_is_installed
+from lang3dxl_ns.common.kernels import numba_works
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, HASH_PRIMES, HashGrid
 from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 
@@ -23,7 +23,7 @@ LARGE = 512.0
 def cases(quick: bool, device: str) -> Iterator[Case]:
     """Coordinates, tables and number types; in torch operations, and on the CPU by the compiled kernels."""
     yield from _cases("hash grid", "torch")
-    if device == "cpu" and numba_is_installed():
+    if device == "cpu" and numba_works():
         yield from _cases("hash grid, numba", "numba")
 
 

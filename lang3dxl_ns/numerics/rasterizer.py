@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.common.kernels import numba_is_installed
+from lang3dxl_ns.common.kernels import numba_works
 from lang3dxl_ns.numerics.measure import Bounds, Case, Maps, Problem
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
@@ -30,7 +30,7 @@ GSPLAT = {"float32": Bounds(0.1, 1e-2, 0.5, 0.1, flipped=1.0)}
 def cases(quick: bool, device: str) -> Iterator[Case]:
     """All cases, by the torch backend, on the CPU by the compiled kernels, on a GPU by gsplat."""
     yield from _cases("rasterizer, torch", "torch", MODES, quick)
-    if device == "cpu" and numba_is_installed():
+    if device == "cpu" and numba_works():
         yield from _cases("rasterizer, numba", "numba", MODES, quick)
     if device == "cuda":
         yield from _cases("rasterizer, gsplat", "gsplat", GSPLAT, quick)

@@ -201,6 +201,14 @@ def test_the_page_counts_no_visits_and_says_when_it_is_too_narrow(local):
     assert b'id="narrow"' in content and b'type="module"' in content
 
 
+def test_headers_given_twice_do_not_end_in_an_error(local):
+    answer = reply(
+        local,
+        "GET /manifest.json HTTP/1.1\nHost: 127.0.0.1:{port}\nAccept-Encoding: br\nAccept-Encoding: gzip",
+    )
+    assert answer[:12] == b"HTTP/1.1 200" and b"Content-Encoding: gzip" in answer
+
+
 # ── origins ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -267,6 +275,23 @@ def test_a_page_cannot_open_a_tunnel(local, kind):
         tell(socket_, **CAMERA)
         tell(socket_, type=kind)
         assert heard(local, socket_) == []
+
+
+def test_messages_before_the_first_camera_and_values_of_other_kinds_are_passed_over(local, caplog, capfd):
+    with page(local) as socket_:
+        set_value(socket_, local, "FPS", value=31.0)
+        for bytes_ in (b"", b"\xff", b"\x80", b"\x93\x01", "text"):
+            socket_.send(bytes_)
+        for message in ({"type": "Nope"}, {"type": 3}, {"type": "GuiUpdateMessage"}, {}):
+            tell(socket_, **message)
+        time.sleep(0.1)
+        tell(socket_, **CAMERA)
+        for updates in ({"value": [1, 2]}, {"value": None}, {"label": "x"}, {"nope": 1}, {}, [1], 3):
+            tell(socket_, type="GuiUpdateMessage", id=handle_of(local, "FPS")._impl.id, updates=updates)
+        for path in (["one"], "none", 3, "two"):
+            set_value(socket_, local, "Path", value=path)
+        assert heard(local, socket_) == ["two"]
+    assert not caplog.records and "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -20,10 +20,12 @@ from urllib.parse import urlsplit
 
 import viser.infra._infra as infra
 import websockets.server
+from msgspec import MsgspecError
 from viser import _messages
 from websockets.datastructures import Headers
 from websockets.legacy.server import WebSocketServerProtocol
 
+from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.query.web.access import Access, Response
 
 RENDER_NAME = "Render name"
@@ -84,8 +86,12 @@ class Guard(Access):
             return self.public
         if isinstance(message, _messages.ViewerCameraMessage):
             return is_camera(message)
-        if isinstance(message, _messages.GuiUpdateMessage) and _label(handler, message.id) == RENDER_NAME:
-            message.updates["value"] = file_name(str(message.updates.get("value")))
+        if isinstance(message, _messages.GuiUpdateMessage):
+            known, value = _input(handler, message.id), message.updates.get("value")
+            if known is not None and known._impl.label == RENDER_NAME:
+                message.updates["value"] = file_name(str(value))
+            # No page changes what inputs are, nor chooses what they don't offer.
+            return list(message.updates) == ["value"] and value in getattr(known, "options", [value])
         return True
 
 
@@ -107,12 +113,12 @@ def is_camera(message: _messages.ViewerCameraMessage) -> bool:
     )
 
 
-def _label(handler: infra.WebsockMessageHandler, name: str) -> str | None:
-    """Label of an input; only viser's handler knows the interface."""
+def _input(handler: infra.WebsockMessageHandler, name: str) -> Any:
+    """An input by its name; only viser's handler knows the interface."""
     for callback in handler._incoming_handlers.get(_messages.GuiUpdateMessage, ()):
         known = getattr(callback, "__self__", None)
         if known is not None and name in known._gui_input_handle_from_id:
-            return known._gui_input_handle_from_id[name]._impl.label
+            return known._gui_input_handle_from_id[name]
     return None
 
 
@@ -139,7 +145,8 @@ def guard_viewers() -> None:
 
     def guarded_handle(self: infra.WebsockMessageHandler, client_id: Any, message: Any) -> None:
         guard: Guard | None = getattr(self, "guard", None)
-        with contextlib.suppress(TypeError, ValueError, AttributeError):  # fields of other types
+        # Fields of other types, and messages before the camera that makes a client known.
+        with contextlib.suppress(TypeError, ValueError, AttributeError, LookupError, AssertionError):
             if guard is None or guard.admits(self, message):
                 handle(self, client_id, message)
 
@@ -173,4 +180,13 @@ class GuardedProtocol(WebSocketServerProtocol):
         response = self.guard.response(path, request_headers)
         if response is not None or _is_handshake(request_headers):
             return response
-        return await super().process_request(self.guard.file(path) or "/none", request_headers)
+        plain = Headers({"Accept-Encoding": ", ".join(request_headers.get_all("Accept-Encoding"))})
+        return await super().process_request(self.guard.file(path) or "/none", plain)
+
+    async def recv(self) -> Any:
+        """The next message that is one; viser would end at others with a traceback."""
+        while True:
+            raw = await super().recv()
+            with contextlib.suppress(*DAMAGE, MsgspecError):
+                _messages.Message.deserialize(raw)  # type: ignore[arg-type]
+                return raw

@@ -1,0 +1,28 @@
+"""Where numba can't be had, torch takes its place."""
+
+import sys
+
+import pytest
+import torch
+
+from lang3dxl_ns.common.kernels import numba_works, takes_kernels
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [("raise ImportError('numpy is too new')", True), ("import nosuchllvm", True), ("1 / 0", True), (None, False)],
+)
+def test_a_broken_numba_is_told_of_and_a_missing_one_is_not(tmp_path, monkeypatch, capsys, content, told):
+    monkeypatch.delenv("LANG3DXL_CPU_KERNELS", raising=False)
+    monkeypatch.delitem(sys.modules, "numba", raising=False)
+    if content is None:
+        monkeypatch.setitem(sys.modules, "numba", None)
+    else:
+        (tmp_path / "numba.py").write_text(content)
+        monkeypatch.syspath_prepend(tmp_path)
+    numba_works.cache_clear()
+    try:
+        assert not takes_kernels(torch.zeros(3)) and not takes_kernels(torch.zeros(3))
+    finally:
+        numba_works.cache_clear()
+    assert capsys.readouterr().out.count("numba does not work") == told
