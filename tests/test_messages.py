@@ -13,7 +13,7 @@ from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.query.match import together
-from lang3dxl_ns.query.text import parse_prompts
+from lang3dxl_ns.query.text import Prompt, parse_prompts
 
 
 def report(path: Path, scene: str, layout: str = "plain", scored: bool = True) -> None:
@@ -149,6 +149,30 @@ def test_the_test_views_have_labels_of_their_own():
 def test_prompts_that_are_no_text_are_type_errors_that_say_so(text):
     with pytest.raises(TypeError, match="a prompt is a text"):
         parse_prompts(text)
+
+
+@pytest.mark.parametrize("value", [3, b"dome", None, float("nan"), object(), ["dome", 3], Path("dome")])
+def test_python_calls_with_anything_else_name_what_was_expected(value):
+    scene = painted_scene()
+    name = scene.photos[0].name
+    one = value if isinstance(value, list) else [value]
+    for ask in (
+        lambda: scene.query(value, name),
+        lambda: scene.find(value),
+        lambda: scene.ask("dome", negatives=one),
+        lambda: scene.encode(value),
+        lambda: scene.what_is(name, 5, 5, words=one),
+        lambda: Prompt(value),
+    ):
+        with pytest.raises(TypeError, match="is a text, not "):
+            ask()
+    for look in (scene.render, scene.camera, lambda place: scene.what_is(place, 5, 5)):
+        with pytest.raises((TypeError, UserError), match=r"a place is a photo's name|a pose has shape"):
+            look(value)
+    assert scene.what_is(name, 5, 5, most=-1) == []
+    assert scene.ask("dome", negatives="door").prompts[0].negatives == ("door",)
+    assert len(scene.encode([])) == 0
+    assert len(scene.encode("dome\ud800")) == len(scene.encode("dome"))
 
 
 @pytest.mark.parametrize("typed", ["rose window not door", "‘window’ not door", "a NOT 'b'"])

@@ -17,6 +17,7 @@ from lang3dxl_ns.attachment.views import Up, rendered_views
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
@@ -75,7 +76,7 @@ def attach(
     Raises:
         UserError: the splat or the photos can't be read, or the photos don't show the splat.
     """
-    config, place = config or AttachConfig(), None if out is None else Path(out).expanduser().absolute()
+    config, place = config or AttachConfig(), None if out is None else expanded(out).absolute()
     if place is not None and place.suffix != SUFFIX:
         raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
     if data is None and place is None:
@@ -99,7 +100,7 @@ def attach(
             collection = read_collection(data)
             similarity = _frame(splats, collection, path, place)
     with stages.stage("prepare"):
-        cache = (config.cache_dir or collection.folder / "lang3dxl_cache").expanduser()
+        cache = expanded(config.cache_dir or collection.folder / "lang3dxl_cache")
         collection, targets = prepare_photos(collection, preparation, cache, worker)
     tracked = collection.reconstruction.photos
     cameras = {photo.name: camera_in(similarity, tracked[photo.name]) for photo in collection.photos}

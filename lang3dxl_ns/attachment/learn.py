@@ -14,6 +14,7 @@ from torch import Tensor
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
@@ -115,7 +116,7 @@ def scene_file(
     config: PreparationConfig,
 ) -> SceneFile:
     """What a scene keeps of its photos, and of the frame: splat's = similarity · photos'."""
-    known, local = find_model(config.clip, CLIP_OPTION), Path(config.clip).expanduser()
+    known, local = find_model(config.clip, CLIP_OPTION), expanded(config.clip)
     scale = float(torch.from_numpy(similarity[:3, :3]).double().det().pow(1 / 3))
     return SceneFile(
         photos=[_scene_photo(photo, cameras[photo.name]) for photo in collection.photos],

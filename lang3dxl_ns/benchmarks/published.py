@@ -15,6 +15,7 @@ from lang3dxl_ns.benchmarks.ablation import make_all
 from lang3dxl_ns.benchmarks.kept_runs import KeptRuns
 from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.presets import load_preset, scene_presets, train_flags
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
@@ -99,7 +100,7 @@ class _Benchmark:
 
     def _find(self) -> list[BenchmarkScene]:
         """The scenes below `data`. Raises UserError if there is none."""
-        root = self.data.expanduser().absolute()
+        root = expanded(self.data).absolute()
         if not root.is_dir():
             raise UserError(f"{root} is not a folder: pass the one that holds the downloaded scenes")
         folders = list(_folders(root, _DEPTH))

@@ -22,6 +22,7 @@ import torch
 
 from lang3dxl_ns.baselines.rows import CLIPSEG, LANGSAM, SAM3, SEGMENTERS, Row
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import host_peak, in_own_process, write_atomically
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
     Raises UserError for a scene that is missing, has no ground truth, or is given twice.
     """
     labels: dict[str, Path] = {}
-    for scene in (path.expanduser().absolute() for path in scenes):
+    for scene in (expanded(path).absolute() for path in scenes):
         if not (scene / "ground_truth").is_dir():
             raise UserError(
                 f"{scene} has no ground_truth folder to score with: make a scene with `lang3dxl demo-scene`"

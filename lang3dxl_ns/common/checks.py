@@ -6,7 +6,7 @@ import errno
 import socket
 from collections.abc import Mapping
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, in_a_line
 
 FARTHEST = 1e12
 """Largest coordinate, world units; map coordinates are below 1e8."""
@@ -51,11 +51,11 @@ def check_address(host: str, port: int | None) -> None:
         with socket.socket(family, kind, protocol) as trial:
             trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do after a restart
             trial.bind(address)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
+    except (OSError, UnicodeError) as error:
+        if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise UserError(f"port {port} is taken by another program: name another, or none") from error
         raise UserError(
-            f"{host} is not an address of this machine ({error.strerror}): use 127.0.0.1, or 0.0.0.0 for all"
+            f"{host} is no address of this machine ({in_a_line(error)}): use 127.0.0.1, or 0.0.0.0 for all"
         ) from error
 
 

@@ -27,7 +27,7 @@ def takes_kernels(tensor: Tensor, wanted: str | None = None) -> bool:
 
 @functools.cache
 def numba_works() -> bool:
-    """Whether numba is installed, and not broken, which is said: it fits few versions of numpy, for example."""
+    """Whether numba is installed, and not broken, which is said: it may not fit numpy, for example."""
     try:
         import numba  # noqa: F401
     except Exception as error:  # of any kind, depending on what doesn't fit

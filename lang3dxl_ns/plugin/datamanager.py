@@ -28,6 +28,7 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.common.timing import part
@@ -305,7 +306,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @property
     def cache_dir(self) -> Path:
         """Folder of prepared targets."""
-        return (self.config.cache_dir or self.data_folder / "lang3dxl_cache").expanduser()
+        return expanded(self.config.cache_dir or self.data_folder / "lang3dxl_cache")
 
     def _reconstruction(self) -> Reconstruction:
         """The model in its own units: COLMAP's, or for other dataparsers one made from the seed points."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
@@ -14,7 +14,7 @@ def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
     """The scene description kept in a run's folder."""
     outputs, clip = datamanager.train_dataparser_outputs, datamanager.config.clip
     known = None if clip == "none" else find_model(clip, CLIP_OPTION)
-    local, trained = Path(clip).expanduser(), _photos(datamanager, "train")
+    local, trained = expanded(clip), _photos(datamanager, "train")
     names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are held out
     return SceneFile(
         photos=[*trained, *(photo for photo in _photos(datamanager, "eval") if photo.name not in names)],
@@ -22,7 +22,7 @@ def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
         clip_identity=None if known is None else known.identity,
         scale=float(outputs.dataparser_scale),
         transform=outputs.dataparser_transform.tolist(),
-        data=str(Path(datamanager.config.dataparser.data).expanduser().absolute()),
+        data=str(expanded(datamanager.config.dataparser.data).absolute()),
     )
 
 

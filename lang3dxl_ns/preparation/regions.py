@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_array
 from lang3dxl_ns.common.image import fitted_size, resize
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.model_files import ModelFiles
@@ -194,11 +194,11 @@ def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
     """A file's labels: integers, negative for no region (0 in a picture, which has no sign)."""
     try:
         if path.suffix == ".npy":
-            labels, first = np.load(path, allow_pickle=False), 0
+            labels, first = read_array(path), 0
         else:
             with open_picture(path) as picture:
                 labels, first = np.asarray(picture), 1
-    except (OSError, NoPictureError, SyntaxError, ValueError, EOFError, MemoryError, TokenError) as error:
+    except (OSError, NoPictureError, ValueError) as error:
         raise UserError(
             f"regions of {name}: can't read {path} ({error}): make it again, or remove it"
         ) from error

@@ -48,7 +48,8 @@ class GaussianFeatures:
             else:
                 rows = F.pad(decoder.hidden(part), (0, 1), value=1.0)
                 rows = rows / ((rows @ gram) * rows).sum(1, keepdim=True).clamp_min(1e-12).sqrt()
-            return torch.where(seen, rows, 0.0).half()
+            # A feature that all but vanishes says nothing, and its row may exceed half precision.
+            return torch.where(seen & (rows.abs() < 6e4).all(1, keepdim=True), rows, 0.0).half()
 
         rows = _in_chunks(decode, carried, decoder.clip_dim)
         return cls(rows, head, (rows != 0).any(1))

@@ -33,7 +33,7 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import MARK_SIDE, Example, TaughtWord, Weights, known_word, learn, marks
-from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched, texts_of
 from lang3dxl_ns.query.threshold import match_thresholds
 from lang3dxl_ns.query.viewed_scene import Place, ViewedScene
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
@@ -129,7 +129,8 @@ class Scene(ViewedScene):
         requested = self.config.threshold if threshold is None else threshold
         if requested is not None and not 0 <= requested <= 1:
             raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
-        prompts = [replace(p, negatives=(*p.negatives, *negatives)) for p in self.prompts(texts)]
+        rivals = texts_of(negatives, "a negative")
+        prompts = [replace(p, negatives=(*p.negatives, *rivals)) for p in self.prompts(texts)]
         within = self.config.foreground if foreground is None else foreground
         everything, count = [*prompts, *(self.prompts(within) if within else ())], len(prompts)
         queries = self.queries(everything)
@@ -301,7 +302,7 @@ class Scene(ViewedScene):
 
     def encode(self, texts: str | Sequence[str]) -> Float[Array, "n c"]:
         """Unit vectors of texts in the space of the scene's CLIP: [c] for one text, [n, c] for a list."""
-        vectors = self.text.vectors([texts] if isinstance(texts, str) else list(texts)).cpu().numpy()
+        vectors = self.text.vectors(texts).cpu().numpy()
         return vectors[0] if isinstance(texts, str) else vectors
 
     @property
@@ -339,7 +340,7 @@ class Scene(ViewedScene):
         camera = self.camera(place, size)
         if not (0 <= x < camera.width and 0 <= y < camera.height):
             raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
-        words = list(shipped_vocabulary() if words is None else words)
+        words = shipped_vocabulary() if words is None else texts_of(words, "a word")
         pixel = torch.zeros(camera.height, camera.width, device=self.device)
         pixel[int(y), int(x)] = 1.0
         share = self._fill(camera, pixel)
@@ -354,7 +355,7 @@ class Scene(ViewedScene):
         clear = any(score > CLEAR for word, score in zip(words, scores, strict=True) if word != "sky")
         if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
             return []
-        best = scores.topk(min(most, len(words)))
+        best = scores.topk(max(min(most, len(words)), 0))
         return [(words[int(i)], float(score)) for score, i in zip(best.values, best.indices, strict=True)]
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
@@ -455,10 +456,10 @@ class Scene(ViewedScene):
         for text in _listed(texts):
             if isinstance(text, Prompt):
                 prompts.append(self._with_taught(text))
-            elif isinstance(text, str):
-                prompts += map(self._with_taught, parse_prompts(text))
-            else:
+            elif isinstance(text, Tensor | Array):
                 prompts.append(Prompt("vector", vector=self._vector(text)))
+            else:
+                prompts += map(self._with_taught, parse_prompts(text))
         return prompts or parse_prompts("")
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:

@@ -23,7 +23,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.query.coco import mask_of, run_lengths
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.run_file import ScenePhoto
@@ -299,7 +299,7 @@ def save_words(path: Path, words: Sequence[TaughtWord]) -> None:
 def load_words(path: Path) -> list[TaughtWord]:
     """Words from a file. Raises UserError if it is missing or damaged, or a newer version wrote it."""
     try:
-        told = json.loads(path.expanduser().read_text(encoding="utf-8"))
+        told = read_json(expanded(path))
         if told["version"] != _VERSION:
             raise UserError(f"{path} has format {told['version']}: update lang3dxl-ns to read it")
         return words_from_json(told["words"])

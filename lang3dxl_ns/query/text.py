@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -45,6 +45,19 @@ class Prompt:
     taught: TaughtWord | None = field(default=None, compare=False, repr=False)
     """What the scene has learned of this word from examples."""
 
+    def __post_init__(self) -> None:
+        """Raises TypeError for what is no text."""
+        texts_of((self.text, *self.negatives), "a prompt")
+
+
+def texts_of(texts: Any, what: str) -> list[str]:
+    """One text or several as a list, without unpaired UTF-16 surrogates, as from a broken paste: tokenizers
+    reject them. Raises TypeError, which names `what`, for anything else."""
+    listed = [texts] if isinstance(texts, str) else list(texts) if isinstance(texts, Iterable) else [texts]
+    if wrong := [text for text in listed if not isinstance(text, str)]:
+        raise TypeError(f"{what} is a text, not {type(wrong[0]).__name__}: {wrong[0]!r:.40}")
+    return [text.encode("utf-8", "ignore").decode() for text in listed]
+
 
 def parse_prompts(typed: str) -> list[Prompt]:
     """Prompts separated by `;`, each with optional negatives: `"windows" not "decorative opening"; dome`.
@@ -52,11 +65,8 @@ def parse_prompts(typed: str) -> list[Prompt]:
     `not` is special only before a quoted phrase (several: `not "a", "b"`), so that phrases may contain the
     word; a `;` in quotes doesn't separate. Raises UserError if there is no prompt.
     """
-    # An unpaired UTF-16 surrogate, as from a broken paste, is invalid text: tokenizers reject it.
-    if not isinstance(typed, str):
-        raise TypeError(f"a prompt is a text, not {type(typed).__name__}: {typed!r:.40}")
-    clean = typed.encode("utf-8", "ignore").decode().translate(_CURLY_QUOTES)
-    clean = _SINGLE_QUOTES.sub(r'"\1"', clean)
+    (clean,) = texts_of([typed], "a prompt")
+    clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES))
     parts = re.findall(rf"(?:{_QUOTED}|[^;])+", clean)
     prompts = [_parse_prompt(part) for part in parts if part.strip(' "\t\r\n\0')]
     if not prompts:
@@ -232,10 +242,11 @@ class TextEncoder:
 
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:
         """Unit vectors of texts."""
+        texts = texts_of(texts, "what is encoded")
         with self._lock:  # tokenizers can't be used by two threads at once
             new = [text for text in dict.fromkeys(texts) if text not in self._vectors]
             if new:
                 self._vectors |= zip(new, F.normalize(self._encode(new), dim=-1), strict=True)
-        if texts:
-            return torch.stack([self._vectors[text] for text in texts])
-        return next(iter(self._vectors.values()))[None][:0]
+        if not texts:
+            return self.vectors(NEGATIVES[:1])[:0]
+        return torch.stack([self._vectors[text] for text in texts])

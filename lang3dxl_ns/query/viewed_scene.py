@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -102,7 +102,7 @@ class ViewedScene:
             photo = self.file.photo(place) if isinstance(place, str) else self.photos[0]
             camera = photo.full_camera
             if not isinstance(place, str):
-                camera = posed(torch.as_tensor(place), camera)
+                camera = posed(_pose(place), camera)
             camera = resized(camera, LARGEST) if size is None else with_longer_side(camera, size)
         return camera if fov is None else with_field_of_view(camera, fov)
 
@@ -227,3 +227,10 @@ class ViewedScene:
     def _views_key(self) -> str:
         c, shapes = self.config, vars(self.splats.gaussians)
         return fingerprint(shapes, [asdict(self.file), c.views, c.view_side])
+
+
+def _pose(place: Any) -> Float[Tensor, "rows 4"]:
+    try:
+        return torch.as_tensor(place, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"a place is a photo's name, a camera or a pose, not {place!r:.40}") from error

@@ -43,9 +43,11 @@ def test_the_version_is_told(capsys):
         (["demo", "--steps", "-5"], "--steps is -5"),
         (["view", "none", "--port", "99999"], "the port is 99999"),
         (["view", "none", "--port", "-1"], "the port is -1"),
-        (["view", "none", "--host", "no.such.host.invalid"], "is not an address of this machine"),
-        (["view", "none", "--host", "192.0.2.1"], "is not an address of this machine"),
+        (["view", "none", "--host", "no.such.host.invalid"], "is no address of this machine"),
+        (["view", "none", "--host", "192.0.2.1"], "is no address of this machine"),
+        (["view", "none", "--host", "a" * 70], "is no address of this machine"),
         (["query", "~nosuchuser/run", "--text", "a", "--out", "found"], "no such user"),
+        (["demo-scene", "--out", "~nosuchuser/scene"], "no such user"),
     ],
 )
 def test_mistakes_are_told_with_the_remedy(words, hint, tmp_path, monkeypatch):

@@ -10,7 +10,12 @@ from lang3dxl_ns.common.kernels import numba_works, takes_kernels
 
 @pytest.mark.parametrize(
     ("content", "told"),
-    [("raise ImportError('numpy is too new')", True), ("import nosuchllvm", True), ("1 / 0", True), (None, False)],
+    [
+        ("raise ImportError('numpy is too new')", True),
+        ("import nosuchllvm", True),
+        ("1 / 0", True),
+        (None, False),
+    ],
 )
 def test_a_broken_numba_is_told_of_and_a_missing_one_is_not(tmp_path, monkeypatch, capsys, content, told):
     monkeypatch.delenv("LANG3DXL_CPU_KERNELS", raising=False)

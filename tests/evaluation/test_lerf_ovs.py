@@ -53,6 +53,7 @@ def broken(**changes):
         (broken(segmentation=[[1, 1, 1], [9, 1, 1], [2, 2, 2]]), "can't be used"),
         (broken(segmentation=[[1, "1"], [9, 1], [2, 2]]), "'1' is not a coordinate"),
         (broken(segmentation=[[1, float("nan")], [9, 1], [2, 2]]), "nan is not a coordinate"),
+        (broken(bbox=[1, 1, 10**400, 9]), "is not a coordinate"),
         (broken(segmentation=[[1, True], [9, 1], [2, 2]]), "True is not a coordinate"),
         (broken(category=""), "not a plain name"),
         (broken(category=7), "not a plain name"),

@@ -109,6 +109,7 @@ def test_a_missing_map_is_named(scene):
         (np.zeros(7), r"has shape \(7,\)"),
         (np.zeros((0, 7)), r"has shape \(0, 7\)"),
         (np.full((20, 30), np.nan), "NaN"),
+        (np.full((20, 30), 1e300), "infinity"),
         (np.zeros((20, 30), complex), "not numbers"),
         (np.array([[{}] * 30] * 20), "can't be read"),  # needs pickle, which can run code
         (np.zeros((30, 20)), "another aspect ratio"),

@@ -1,9 +1,10 @@
 """Words taught by example, on a scene with known answers."""
 
-from dataclasses import replace
+from dataclasses import os
 
 import numpy as np
 import pytest
+import replace
 import torch
 from painted_scene import Painted, painted_gaussians, painted_scene
 
@@ -190,6 +191,9 @@ def test_damaged_files_are_one_sentence(tmp_path, content):
     (tmp_path / "w.json").write_text(content)
     with pytest.raises(UserError, match="taught words"):
         load_words(tmp_path / "w.json")
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(UserError, match="not a regular file"):
+        load_words(tmp_path / "pipe.json")
 
 
 def test_the_fit_is_where_its_loss_has_no_slope():

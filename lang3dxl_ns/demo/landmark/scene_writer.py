@@ -17,6 +17,7 @@ from PIL import Image
 
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
 from lang3dxl_ns.demo.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
 from lang3dxl_ns.demo.landmark.landmark import Landmark
@@ -77,7 +78,7 @@ def write_scene(scene: DemoScene) -> Path:
     The folder appears once everything is written. Raises UserError for a folder that is not empty, and for
     invalid numbers.
     """
-    out = Path(scene.out).expanduser().absolute()
+    out = expanded(scene.out).absolute()
     _check(scene, out)
     landmark = Landmark.from_seed(scene.seed, scene.family)
     unfinished = out.with_name(f".{out.name}.unfinished")
