@@ -241,6 +241,15 @@ def test_configs_of_other_methods_are_left_to_nerfstudio(tmp_path):
     check_command_line(["--load-config", str(path)])
 
 
+def test_photos_that_may_not_be_read_are_not_taken_for_gone(copy, monkeypatch):
+    def refused(_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("lang3dxl_ns.plugin.datamanager.check_transforms", refused)
+    with pytest.raises(PermissionError):
+        open_run(copy / "config.yml")
+
+
 def test_pipes_in_place_of_checkpoints_are_refused(copy):
     path = max((copy / "nerfstudio_models").glob("*.ckpt"))
     path.unlink()

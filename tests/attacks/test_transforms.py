@@ -31,8 +31,12 @@ def write(folder, text=None, top=None, **frame):
     return NerfstudioDataParserConfig(data=folder)
 
 
-def test_a_sound_scene_passes(folder):
+def test_a_sound_scene_passes_and_one_without_points_is_told(folder, capsys):
     check_transforms(write(folder))
+    assert "names no points" in capsys.readouterr().out
+    (folder / "points.ply").write_text("ply")
+    check_transforms(write(folder, top={"ply_file_path": "points.ply"}))
+    assert not capsys.readouterr().out
     check_transforms(write(folder, file_path=str(folder / "images" / "a.png")))
     os.symlink(folder / "images", folder / "linked")
     check_transforms(write(folder, file_path="linked/a.png"))

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import replace_durably, write_atomically
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path, monkeypatch):
@@ -20,6 +20,18 @@ def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path, monkeypat
         write_atomically(target, b"new")
     assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]
     assert target.read_bytes() == b"old"
+
+
+def test_what_replaces_a_file_is_on_the_disk_before(tmp_path, monkeypatch):
+    """A loss of power after the renaming, and before the content is written, would leave neither."""
+    calls, fsync, replace = [], os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda file: calls.append("fsync") or fsync(file))
+    monkeypatch.setattr(os, "replace", lambda *names: calls.append("replace") or replace(*names))
+    (tmp_path / "partial").write_text("new")
+    replace_durably(tmp_path / "partial", tmp_path / "a.ckpt")
+    write_atomically(tmp_path / "b.json", "new")
+    assert calls == ["fsync", "replace", "fsync", "fsync", "replace"]
+    assert (tmp_path / "a.ckpt").read_text() == (tmp_path / "b.json").read_text() == "new"
 
 
 def test_a_device_or_a_pipe_is_written_to_and_a_link_stays_a_link(tmp_path):

@@ -1,10 +1,10 @@
 """Words taught by example, on a scene with known answers."""
 
-from dataclasses import os
+import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import replace
 import torch
 from painted_scene import Painted, painted_gaussians, painted_scene
 

@@ -357,7 +357,8 @@ async function copyLink() {
 /** Colors in the lighting of a photo. */
 async function light() {
   const photo = $("look").value;
-  view.light(photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.own);
+  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.own;
+  if ($("look").value === photo) view.light(colors); // a later choice may have been read before
 }
 
 // ── start ──
