@@ -511,6 +511,30 @@ def test_lightings_are_files_of_a_page_or_answers_of_a_server(monkeypatch):
     assert any("lightings are left out" in told for told in static.left_out)
 
 
+TWO_LIGHTINGS = """async () => {
+  const look = document.getElementById("look"), names = [...look.options].map((one) => one.value).filter(Boolean);
+  const { fetch } = window, wait = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds));
+  let delay = 1, shown = 0;
+  window.fetch = async (file) => (await wait(delay--), fetch(file));
+  lang3dxl.view.light = () => shown++;
+  for (const name of names.slice(0, 2)) {
+    look.value = name;
+    look.dispatchEvent(new Event("change"));
+  }
+  await wait(3);
+  return shown;
+}"""
+
+
+@pytest.mark.slow
+def test_of_two_lightings_the_one_chosen_last_is_shown(browser, tmp_path):
+    write_page(Page(painted_scene(looks=painted_looks())), tmp_path)
+    with served(tmp_path) as address:
+        page = opened(browser, address, DESK)
+        assert page.evaluate(TWO_LIGHTINGS) == 1
+        page.close()
+
+
 def test_a_field_takes_eight_bytes_a_gaussian():
     scene = field_scene(3)
     files = Page(scene).files()
