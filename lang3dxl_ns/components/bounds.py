@@ -12,8 +12,10 @@ from torch import Tensor
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.components.initialization import color_parameters
 
-LONGEST = 0.25
+LONGEST = 1.0
 """Longest standard deviation, relative to the scene's radius or, outside, to the distance from its center."""
+NEEDLE = 0.25
+"""The same for Gaussians more than twice as long as wide; ground and distant hills are wide."""
 FREE = 0.02
 """Radius of the space around every training camera that stays empty, relative to the scene's radius."""
 _STEEPEST = 0.5
@@ -35,7 +37,9 @@ def keep_in_bounds(
     """
     g = {name: parameter[first:] for name, parameter in gaussians.items()}
     away = (g["means"] - to_device(center, g["means"].device)).norm(dim=1, keepdim=True).clamp_min(radius)
-    g["scales"].copy_(g["scales"].minimum((LONGEST * away).log()))
+    wide = 2 * g["scales"].median(dim=1, keepdim=True).values.exp()
+    longest = wide.maximum(NEEDLE * away).minimum(LONGEST * away)
+    g["scales"].copy_(g["scales"].minimum(longest.log()))
     if degree > 0:  # otherwise colors are logits
         g["features_dc"].clamp_(*color_parameters(torch.tensor([[0.0], [1.0]]), degree).flatten().tolist())
         norms = g["features_rest"].norm(dim=1, keepdim=True)

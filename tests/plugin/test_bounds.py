@@ -5,7 +5,7 @@ import pytest
 import torch
 from conftest import make_trainer
 
-from lang3dxl_ns.components.bounds import FREE, LONGEST
+from lang3dxl_ns.components.bounds import FREE, LONGEST, NEEDLE, keep_in_bounds
 from lang3dxl_ns.query.read_splats import read_splats
 from lang3dxl_ns.query.splat_file import write_splats
 from lang3dxl_ns.rendering import Gaussians, rasterize
@@ -13,7 +13,7 @@ from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 from lang3dxl_ns.scene.camera import Lens
 
 SKY = 40
-"""So few that each is far longer than other Gaussians may be."""
+"""Few, so that they are large."""
 
 
 @pytest.fixture
@@ -56,11 +56,22 @@ def test_no_needle_stays_and_the_sky_keeps_its_size(planted):
     trainer, sky = planted(pipeline__model__densify_until=0.0)
     model = trainer.pipeline.model
     center, radius = model.extent
-    longest = model.scales.detach().exp().amax(1)
-    bound = LONGEST * (model.means.detach() - center).norm(dim=1).clamp_min(radius)
+    _, wide, longest = model.scales.detach().exp().sort(dim=1).values.unbind(1)
+    away = (model.means.detach() - center).norm(dim=1).clamp_min(radius)
+    bound = (2 * wide).maximum(NEEDLE * away).minimum(LONGEST * away)
     assert (longest[SKY:] <= 1.001 * bound[SKY:]).all()
+    assert longest[-2] <= NEEDLE * away[-2]
     assert torch.equal(model.gauss_params["scales"][:SKY], sky)
-    assert (longest[:SKY] > 1.05 * bound[:SKY]).any()
+
+
+def test_needles_and_giants_are_shortened_sheets_and_the_sky_are_not():
+    sizes = torch.tensor([[50.0, 50, 50], [0.6, 0.01, 0.4], [0.6, 0.01, 0.1], [9, 8, 7], [0.01, 0.01, 1]])
+    means = torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [20, 0, 0]])
+    g = torch.nn.ParameterDict({"means": means, "scales": sizes.log()})
+    keep_in_bounds(g, torch.zeros(3), 2.0, 1, 0)
+    expected = sizes.clone()
+    expected[2, 0], expected[3] = 0.5, 2.0
+    torch.testing.assert_close(g["scales"].exp(), expected)
 
 
 def test_exported_colors_are_near_0_to_1_from_everywhere(planted, tmp_path):
