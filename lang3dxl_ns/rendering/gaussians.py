@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.scene.camera import Camera, depth_and_distance
+from lang3dxl_ns.scene.camera import Camera
 
 MAX_LOG_SCALE = 60.0
 """Clamp log scales to this before `exp`: an infinite scale has the gradient 0 · ∞ = NaN."""
 CLOSEST = 1.5
-"""Gaussians beside the picture show from this depth on, in standard deviations of their longest axis; from
-twice that, fully."""
+"""Gaussians show from this depth on, in standard deviations of their longest axis; from twice that, fully."""
 
 
 @dataclass
@@ -38,15 +37,15 @@ class Gaussians:
         )
 
     def seen_from(self, camera: Camera) -> Gaussians:
-        """The same Gaussians, transparent where they are beside the picture and hardly deeper than long.
+        """The same Gaussians, transparent where the camera is hardly farther from them than they are long.
 
-        A splat is affine, right only where a Gaussian is small beside its depth: at a camera that stands at
+        A splat is affine, right only where a Gaussian is small for its depth: at a camera that stands at
         a wall, one of a finger's breadth beside the picture would cover it.
         """
         with torch.no_grad():
-            depth, beside = depth_and_distance(camera, self.means)
-            sigma = self.scales.amax(1).clamp_min(1e-30)
-            shown = torch.maximum(depth / sigma / CLOSEST - 1, 1 - 2 * beside / sigma).clamp(0.0, 1.0)
+            view = camera.detach().to(self.means.device)
+            depth = (self.means - view.position.to(self.means)) @ view.view_matrix[2, :3].to(self.means)
+            shown = (depth / (CLOSEST * self.scales.amax(1)).clamp_min(1e-30) - 1).clamp(0.0, 1.0)
         return replace(self, opacities=self.opacities * shown)
 
     def moved(self, by: Float[Tensor, "3"]) -> Gaussians:

@@ -164,22 +164,16 @@ def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "
 
     Tests the ball of 3.5 standard deviations around each against the planes through the image's edges.
     """
-    depth, beside = depth_and_distance(camera, means)
-    return (depth > 0) & (beside <= 3.5 * scales.amax(dim=1))
-
-
-def depth_and_distance(
-    camera: Camera, points: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-    """Depths of points, and how far each is beyond the planes through the image's edges (0: within all)."""
-    camera = camera.detach().to(points.device)
-    x, y, z = ((points - camera.position) @ camera.view_matrix[:3, :3].T.to(points)).unbind(1)
-    margin, beside = 8, torch.zeros_like(z)  # pixels: the rasterizer blurs every splat by one or two
-    for across, axis, size in ((x, 0, camera.width), (y, 1, camera.height)):
+    points = means @ camera.view_matrix[:3, :3].T + camera.view_matrix[:3, 3]
+    reach = 3.5 * scales.amax(dim=1)
+    seen = points[:, 2] > 0
+    margin = 8  # pixels: the rasterizer blurs every splat by one or two
+    for axis, size in ((0, camera.width), (1, camera.height)):
         focal, middle = camera.intrinsics[axis, axis], camera.intrinsics[axis, 2]
         for side, edge in ((-1, middle + margin), (1, size + margin - middle)):
-            beside = beside.maximum((side * focal * across - edge * z) / torch.hypot(focal, edge))
-    return z, beside
+            outside = side * focal * points[:, axis] - edge * points[:, 2]
+            seen &= outside <= reach * torch.hypot(focal, edge)
+    return seen
 
 
 _PER_PIXEL = 20

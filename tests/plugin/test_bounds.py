@@ -106,14 +106,12 @@ def test_one_beside_the_camera_does_not_cover_the_picture():
     torch.testing.assert_close(seen, alone)
 
 
-def test_beside_the_picture_only_what_is_small_for_its_depth_shows():
+def test_only_what_is_small_for_its_depth_shows():
     camera = Lens(32, 24, 30.0, 33.0, 16.0, 12.0).camera(torch.eye(4))
     depths = torch.tensor([-1.0, 0.0, 1.4, 2.0, 2.5, 3.1, 100.0])
-    means = torch.stack([torch.zeros(7), 20 + 5 * depths, depths], dim=1)
+    means = torch.stack([torch.zeros(7), torch.zeros(7), depths], dim=1)
     opacities = torch.full((7,), 0.6, requires_grad=True)
     sizes = torch.tensor([0.1, 1.0, 0.5]).expand(7, 3)
     seen = Gaussians(means, torch.ones(7, 4), sizes, opacities).seen_from(camera)
     expected = 0.6 * torch.tensor([0, 0, 0, 1 / 3, 2 / 3, 1, 1])
     torch.testing.assert_close(seen.opacities, expected)
-    within = Gaussians(torch.tensor([[0.0, 0.0, 0.1]]), torch.ones(1, 4), sizes[:1], opacities[:1])
-    torch.testing.assert_close(within.seen_from(camera).opacities, within.opacities)
