@@ -43,8 +43,8 @@ class Gaussians:
         a wall, one of a finger's breadth beside the picture would cover it.
         """
         with torch.no_grad():
-            view = camera.detach().to(self.means.device)
-            depth = (self.means - view.position.to(self.means)) @ view.view_matrix[2, :3].to(self.means)
+            moved, place = camera.at_origin(self.means)
+            depth = (self.means - place) @ moved.view_matrix[2, :3] + moved.view_matrix[2, 3]
             shown = (depth / (CLOSEST * self.scales.amax(1)).clamp_min(1e-30) - 1).clamp(0.0, 1.0)
         return replace(self, opacities=self.opacities * shown)
 
