@@ -84,13 +84,11 @@ def attach(
     option_prefix.set("--")
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
-    stages, where = (
-        Stages(_SHARES if found is None else _SHARES | {"segment": 0.3}),
-        torch.device(device or best_device()),
-    )
+    stages = Stages(_SHARES if found is None else _SHARES | {"segment": 0.3})
+    worker = torch.device(device or best_device())
     with stages.stage("splat"):
         path = find_splats(splat)
-        splats = read_splats(path).to(where)
+        splats = read_splats(path).to(worker)
         say(f"{path}: {splats}")
     with stages.stage("frame"):
         if data is None:
@@ -102,25 +100,28 @@ def attach(
             similarity = _frame(splats, collection, path, place)
     with stages.stage("prepare"):
         cache = (config.cache_dir or collection.folder / "lang3dxl_cache").expanduser()
-        collection, targets = prepare_photos(collection, preparation, cache, where)
+        collection, targets = prepare_photos(collection, preparation, cache, worker)
     tracked = collection.reconstruction.photos
     cameras = {photo.name: camera_in(similarity, tracked[photo.name]) for photo in collection.photos}
     with stages.stage("learn"):
         decoder, codes = learn(splats, collection, cameras, targets)
     seen = float(codes.isfinite().all(1).float().mean())
     what = "photos" if data is not None else "views"
-    say(f"{len(collection.photos)} {what} show {seen:.0%} of the Gaussians; the others match nothing")
+    where = " in their foreground" if any(photo.mask_path for photo in collection.photos) else ""
+    say(f"{len(collection.photos)} {what} show {seen:.0%} of the Gaussians{where}; the others match nothing")
     file = scene_file(collection, cameras, similarity, preparation)
     visible = None if place is None else place.with_name(f".{place.stem}.visible")
     scene = Scene(splats, file, decoder, codes, cache=visible)
     if found is not None:
         with stages.stage("segment"):
-            segmenter = load_text_segmenter(found, where)
+            segmenter = load_text_segmenter(found, worker)
             for word in config.segment:
                 scene = segmented(scene, word, segmenter, collection.photos, cameras)
     if place is not None:
         scene = with_words_of(scene, place)
-        written = write_scene(place, scene, _provenance(path, len(collection.photos), what))
+        made = f"attached to {path.name} from {len(collection.photos)} {what}"
+        origin = Provenance(made_by=f"lang3dxl-ns {version('lang3dxl-ns')}", made_how=made)
+        written = write_scene(place, scene, origin)
         say(f"Wrote {written / 1e6:.1f} MB to {place}")
     return scene
 
@@ -152,8 +153,3 @@ def _no_fit(splats: Splats, collection: PhotoCollection, fit: Fit, place: Path |
         f"{fit.name}, agrees to {fit.score:.2f} of 1){told}: give the photos and poses that the splat was "
         "trained with, or leave out --data"
     )
-
-
-def _provenance(path: Path, count: int, what: str) -> Provenance:
-    made = f"attached to {path.name} from {count} {what}"
-    return Provenance(made_by=f"lang3dxl-ns {version('lang3dxl-ns')}", made_how=made)

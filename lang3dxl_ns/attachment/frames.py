@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,9 @@ from torch import Tensor
 from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, registered_frames
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.query.match import as_bytes
 from lang3dxl_ns.rendering.rasterize import rasterize
+from lang3dxl_ns.rendering.render import render
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.colmap import TrackedPhoto
@@ -36,6 +38,8 @@ _REFINED = 3
 """Frames that are refined at most."""
 _ROUNDS = ((48, 40), (96, 40))
 """Refinement: longer sides in pixels, and steps at each."""
+_MOST = 200_000
+"""Gaussians that refinement renders, hundreds of times."""
 _RATE = 4e-3
 """Adam's, in radians and shares of the scene's size."""
 _COVERED = 0.05
@@ -96,12 +100,15 @@ def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
     found = max(checked, key=lambda fit: fit.score)
     if found.score >= _CLOSE:
         return found
-    worth = [fit for fit in checked if fit.score >= min(_PROMISING, found.score)]
+    worth = [found] if found.fits else [f for f in checked if f.score >= min(_PROMISING, found.score)]
+    every = -(-len(splats) // _MOST)
+    thinned = splats.select(torch.arange(0, len(splats), every))
+    thinned = replace(thinned, scales=thinned.scales * every**0.5)  # that cover as much together
     with progress("refining the frame", len(worth) * sum(steps for _, steps in _ROUNDS)) as advance:
         for fit in worth:
             refined = fit.similarity
             for side, steps in _ROUNDS:
-                refined = _Comparison.of(collection, _FEW, side).refined(splats, refined, steps, advance)
+                refined = _Comparison.of(collection, _FEW, side).refined(thinned, refined, steps, advance)
             again = large.fit(splats, f"{fit.name}, refined", refined)
             found = max(found, again, key=lambda fit: fit.score)
     return found
@@ -225,10 +232,8 @@ def side_by_side(splats: Splats, collection: PhotoCollection, fit: Fit) -> UInt8
     """A photo beside the rendering at its camera, to look at."""
     photo = collection.photos[len(collection.photos) // 2]
     camera = camera_in(fit.similarity, collection.reconstruction.photos[photo.name])
-    from lang3dxl_ns.rendering.render import render
-
     camera = resized(camera, 640)
-    rendering = (render(splats, camera).rgb.cpu() * 255).round().byte().numpy()
+    rendering = as_bytes(render(splats, camera).rgb)
     read = photo.read_uint8(camera.width / photo.width).numpy()
     rows, columns = min(len(read), len(rendering)), min(read.shape[1], rendering.shape[1])
     return np.concatenate([read[:rows, :columns], rendering[:rows, :columns]], axis=1)

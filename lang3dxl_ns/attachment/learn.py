@@ -84,14 +84,8 @@ def learn(
         photos = bar.track(collection.photos, description="gathering features")
         learning = bar.add_task("learning codes", total=decoder.learning_steps or None)
         views = _views(splats, photos, cameras, targets)
-        codes = learn_codes(
-            decoder,
-            views,
-            splats.means,
-            partial(targets.clip_features, names),
-            dense,
-            lambda: bar.advance(learning),
-        )
+        clip, advance = partial(targets.clip_features, names), partial(bar.advance, learning)
+        codes = learn_codes(decoder, views, splats.means, clip, dense, advance)
     if decoder.learned is not None:
         say(decoder.learned)
     return decoder.eval().requires_grad_(False), codes

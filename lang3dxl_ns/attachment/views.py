@@ -155,17 +155,17 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCol
         UserError: no view shows the splat well.
     """
     stamp = fingerprint(vars(splats.gaussians), [_RULE, count, up])
-    cameras = _kept(folder, stamp)
-    if cameras is None:
-        cameras = choose_views(splats, Extent.of(splats, up), count)
+    kept = _kept(folder, stamp)
+    cameras = kept or choose_views(splats, Extent.of(splats, up), count)
+    background = splats.means.new_tensor(BACKGROUND)
     names = [f"{i:04d}.png" for i in range(len(cameras))]
     make_folder(folder)
     tracked, chosen = {}, np.random.default_rng(0)
     with progress("rendering views", len(cameras)) as advance:
         for name, camera in zip(names, cameras, strict=True):
-            view = _draw(splats, camera)
+            view = render(splats, camera, background=background)
             path = folder / "images" / name
-            if not path.is_file() or _kept(folder, stamp) is None:
+            if kept is None or not path.is_file():
                 save_picture(as_bytes(view.rgb), path)
             tracked[name] = _tracked(name, view, chosen)
             advance()
@@ -188,10 +188,6 @@ def _kept(folder: Path, stamp: str) -> list[Camera] | None:
         ]
     except (OSError, ValueError, LookupError, TypeError):
         return None
-
-
-def _draw(splats: Splats, camera: Camera) -> Rendering:
-    return render(splats, camera, background=splats.means.new_tensor(BACKGROUND))
 
 
 def _tracked(name: str, view: Rendering, chosen: np.random.Generator) -> TrackedPhoto:

@@ -60,22 +60,22 @@ class Attach(PreparationConfig):
 
 
 def _show(scene, texts: list[str], out: Path) -> None:
-    """Write a picture for each view that shows a prompt best, with the heat of all its prompts."""
+    """Write a picture, named after its prompts, of each view that shows one best."""
     from lang3dxl_ns.common.files import slugs
     from lang3dxl_ns.query.doubt import doubtful
     from lang3dxl_ns.query.match import save_picture, together
 
-    question = scene.ask(texts)
-    best = scene.best_views(question)
-    for name, slug in zip(dict.fromkeys(best), slugs(list(dict.fromkeys(best))), strict=True):
-        shown = [p for p, view in zip(question.prompts, best, strict=True) if view == name]
-        matches = scene.matches(scene.ask(shown), name)
-        picture = out.with_name(f"{out.stem}.{slug}.png")
+    question, shown = scene.ask(texts), dict[str, list]()
+    for prompt, view in zip(question.prompts, scene.best_views(question), strict=True):
+        shown.setdefault(view, []).append(prompt)
+    told = ["; ".join(prompt.text for prompt in prompts) for prompts in shown.values()]
+    for (view, prompts), text, slug in zip(shown.items(), told, slugs(told), strict=True):
+        matches, picture = scene.matches(scene.ask(prompts), view), out.with_name(f"{out.stem}.{slug}.png")
         if len(matches) == 1:
             matches[0].save(picture)
         else:
             save_picture(together(matches), picture)
-        say(f"{'; '.join(prompt.text for prompt in shown)}: {picture}")
+        say(f"{text}, in the view of {view}: {picture}")
     for prompt, doubt in zip(question.prompts, question.doubts, strict=True):
         if advice := doubtful(prompt.text, doubt):
             say(f"  {advice}")

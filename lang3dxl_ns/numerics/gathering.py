@@ -72,7 +72,7 @@ def _gathering(scene: Callable[[], Maps]) -> Problem:
     def compute(given: Maps) -> Maps:
         fixed = {name: value.detach() for name, value in given.items()}
         values, foreground = fixed["pixels"][..., :-1], fixed["pixels"][..., -1]
-        views = [(partial(_drawn, fixed), Pixels([values], foreground))]
+        views = [(partial(_drawn, fixed), Pixels([values], foreground, torch.zeros_like(foreground)))]
         features, mass = gather(COUNT, views, CHANNELS, fixed["means"])
         return {"features": features, "mass": mass}
 

@@ -14,9 +14,10 @@ def describe_scene(datamanager: Lang3DXLDataManager) -> SceneFile:
     """The scene description kept in a run's folder."""
     outputs, clip = datamanager.train_dataparser_outputs, datamanager.config.clip
     known = None if clip == "none" else find_model(clip, CLIP_OPTION)
-    local = Path(clip).expanduser()
+    local, trained = Path(clip).expanduser(), _photos(datamanager, "train")
+    names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are held out
     return SceneFile(
-        photos=[*_photos(datamanager, "train"), *_photos(datamanager, "eval")],
+        photos=[*trained, *(photo for photo in _photos(datamanager, "eval") if photo.name not in names)],
         clip=None if known is None else str(local.absolute()) if local.is_dir() else clip,
         clip_identity=None if known is None else known.identity,
         scale=float(outputs.dataparser_scale),

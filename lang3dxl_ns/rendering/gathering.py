@@ -21,7 +21,7 @@ MEMORY = 5e8
 
 @dataclass(frozen=True)
 class Pixels:
-    """A view's values at every pixel, and a last channel of 1 on the foreground; all are 0 elsewhere.
+    """A view's values on the foreground, 0 elsewhere, and channels of 1 on the foreground and outside of it.
 
     They are computed a few channels at a time: all channels of a large photo would take gigabytes.
     """
@@ -29,7 +29,9 @@ class Pixels:
     maps: Sequence[Float[Tensor, "hd wd c"]]
     """Maps of any size, which are stretched over the view and follow each other."""
     foreground: Float[Tensor, "h w"]
-    """1 on the foreground, 0 elsewhere."""
+    """1 on the foreground where all values are known, 0 elsewhere."""
+    outside: Float[Tensor, "h w"]
+    """1 outside the foreground, 0 elsewhere."""
 
     @classmethod
     def of(
@@ -40,20 +42,23 @@ class Pixels:
         foreground = maps[0].new_ones(size)
         if mask is not None:
             foreground *= resize(mask[..., None].to(foreground), size)[..., 0] >= 0.5
+        outside = 1 - foreground
         finite = [each.isfinite().all(-1, keepdim=True) for each in maps]
         for each in finite:
             foreground *= resize(each.to(foreground), size)[..., 0] > 1 - 1e-4
-        return cls([torch.where(*pair, 0.0) for pair in zip(finite, maps, strict=True)], foreground)
+        return cls([torch.where(*pair, 0.0) for pair in zip(finite, maps, strict=True)], foreground, outside)
 
     def channels(self, start: int, stop: int) -> Float[Tensor, "h w part"]:
         """A range of the channels."""
-        size, found, first = self.foreground.shape, [], 0
-        for each in (*self.maps, self.foreground[..., None]):
+        size, found, first, inside = self.foreground.shape, [], 0, self.foreground[..., None]
+        weighted = [(each, inside) for each in self.maps]
+        whole = torch.ones_like(inside)
+        for each, weight in (*weighted, (inside, whole), (self.outside[..., None], whole)):
             part = each[..., max(start - first, 0) : max(stop - first, 0)]
             if part.shape[-1]:
-                found.append(resize(part, (size[0], size[1])))
+                found.append(resize(part, (size[0], size[1])) * weight)
             first += each.shape[-1]
-        return torch.cat(found, dim=-1).mul_(self.foreground[..., None])
+        return torch.cat(found, dim=-1)
 
 
 def gather(
@@ -64,7 +69,8 @@ def gather(
     memory: float | None = None,
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
     """Mean over all pixels p of all views, weighted by a Gaussian's contribution, Σ w(g, p) F(p) / Σ w(g, p),
-    and its mass Σ w(g, p) in pixels. Gaussians never visible have mass and mean 0.
+    and its mass Σ w(g, p) in pixels. Gaussians never visible have mass and mean 0. So have those with
+    more mass outside the foreground: the sky would take what it has from the edges of towers.
 
     Compositing is linear in the values composited, map(p) = Σ_g w(g, p) f(g), so the sums are its derivative
     in the direction of F: one backward pass per view, exact.
@@ -72,23 +78,23 @@ def gather(
     Args:
         count: number of Gaussians, n.
         views: for each, a function that composites values of the Gaussians, and the pixels' values F.
-        width: channels of F without the last one.
+        width: channels of the maps of F.
         like: gives number type and device.
         memory: bytes to work in (default `MEMORY`), beside the result, which is on the CPU if it is larger.
     """
     memory = memory or MEMORY
-    place = like.device if 4 * count * (width + 1) <= memory else torch.device("cpu")
-    sums = torch.zeros(count, width + 1, dtype=like.dtype, device=place)
+    place = like.device if 4 * count * (width + 2) <= memory else torch.device("cpu")
+    sums = torch.zeros(count, width + 2, dtype=like.dtype, device=place)
     for composite, pixels in views:
         numbers = 2 * (count + pixels.foreground.numel())  # per channel
         channels = max(int(memory / 4 / numbers), 1)
-        for start in range(0, width + 1, channels):
+        for start in range(0, width + 2, channels):
             part = pixels.channels(start, start + channels).to(like)
             with torch.enable_grad():
                 probe = nn.Parameter(like.new_zeros(count, part.shape[-1]))
                 (gradient,) = torch.autograd.grad(composite(probe), probe, part)
             sums[:, start : start + channels] += gradient.to(place)
-    features, mass = sums[:, :-1], sums[:, -1].clone()
+    features, mass = sums[:, :width], torch.where(sums[:, -1] > sums[:, -2], 0, sums[:, -2])
     features /= torch.where(mass > 0, mass, torch.inf)[:, None]
     return features, mass
 

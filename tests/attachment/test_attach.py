@@ -10,6 +10,7 @@ from scenes import write_scene
 
 from lang3dxl_ns.attachment.attach import AttachConfig, attach
 from lang3dxl_ns.attachment.known_frames import known_frames
+from lang3dxl_ns.commands.attach import _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -77,6 +78,13 @@ def test_written_over_a_scene_it_keeps_the_words_that_were_taught(place):
     write_scene_file(path, scene.teach("gizmo", photo))
     attach(place / "box.ply", place / "photos", path, SETTINGS)
     assert len(read_scene(path).words["gizmo"].examples) == 1
+
+
+@pytest.mark.slow
+def test_pictures_are_named_after_the_texts_that_they_show(place, tmp_path):
+    _show(read_scene(place / "box.scene"), ["windows", "towers"], tmp_path / "box.scene")
+    found = {path.name for path in tmp_path.iterdir()}
+    assert found in ({"box.windows.png", "box.towers.png"}, {"box.windows-towers.png"})
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from box_splat import box_splat
 from scenes import write_scene
 from scipy.spatial.transform import Rotation
 
+from lang3dxl_ns.attachment import frames
 from lang3dxl_ns.attachment.frames import camera_in, find_frame
 from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames
 from lang3dxl_ns.preparation.photo_collection import read_collection
@@ -80,6 +81,35 @@ def test_a_frame_that_is_close_is_refined(collection, tmp_path):
     assert misplacement(fit.similarity, wanted) < 0.03
 
 
+def test_of_frames_that_fit_only_the_best_is_refined(collection, tmp_path, monkeypatch):
+    """Refining is what takes minutes with a million Gaussians."""
+    monkeypatch.setattr(frames, "_CLOSE", 1.1)
+    refined = []
+
+    def stand_in(comparison, splats, start, steps, advance):
+        refined.append(start)
+        return start
+
+    monkeypatch.setattr(frames._Comparison, "refined", stand_in)
+    assert find_frame(box_splat(), collection, tmp_path / "a.ply").fits
+    assert len({start.tobytes() for start in refined}) == 1
+
+
+def test_of_many_gaussians_some_are_enough_to_refine_a_frame(collection, tmp_path, monkeypatch):
+    monkeypatch.setattr(frames, "_MOST", len(box_splat()) // 2)
+    counted, loss = set(), frames._Comparison._loss
+
+    def watched(comparison, splats, *rest):
+        counted.add(len(splats))
+        return loss(comparison, splats, *rest)
+
+    monkeypatch.setattr(frames._Comparison, "_loss", watched)
+    wanted = similarity((0.02, -0.03, 0.02), 1.02, (0.05, -0.04, 0.03))
+    fit = find_frame(moved(wanted), collection, tmp_path / "a.ply")
+    assert max(counted) <= len(box_splat()) // 2 + 1
+    assert misplacement(fit.similarity, wanted) < 0.6 * misplacement(np.eye(4), wanted)
+
+
 def test_a_run_tells_its_frame(collection, tmp_path):
     wanted = similarity()
     content = {"transform": (wanted[:3] / 0.4).tolist(), "scale": 0.4}
@@ -97,16 +127,16 @@ def test_photos_of_something_else_fit_nowhere(collection, tmp_path):
 
 
 def test_a_transforms_json_is_read_like_the_colmap_model(collection, tmp_path):
-    frames = []
+    written = []
     for photo in collection.photos:
         tracked = collection.reconstruction.photos[photo.name]
         pose = np.linalg.inv(np.vstack([tracked.camera_from_world, [0, 0, 0, 1]]))
         pose[:3, 1:3] *= -1
         (tmp_path / photo.name).write_bytes(photo.path.read_bytes())
         lens = photo.lens
-        frames.append({"file_path": f"./{photo.name}", "transform_matrix": pose.tolist()})
+        written.append({"file_path": f"./{photo.name}", "transform_matrix": pose.tolist()})
     shared = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": 120, "h": 90}
-    (tmp_path / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
+    (tmp_path / "transforms.json").write_text(json.dumps({**shared, "frames": written}))
     found = read_collection(tmp_path)
     assert [photo.name for photo in found.photos] == [photo.name for photo in collection.photos]
     assert [photo.lens for photo in found.photos] == [photo.lens for photo in collection.photos]

@@ -20,7 +20,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.language import open_scorer
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
-from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words
+from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words, read_scene
 from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
@@ -259,3 +259,11 @@ def test_a_run_of_a_version_without_some_settings_can_be_asked(trainer, tmp_path
         "".join(line for line in lines if not line.strip().startswith(("code_rate:", "unseen:")))
     )
     assert lang3dxl_ns.load_scene(config).query("dome").relevancy.any()
+
+
+def test_a_run_that_trains_on_all_photos_leaves_a_scene_that_opens(train, scene_photos):
+    """The same photos are held out, then; the file lists each once."""
+    trained = train(scene_photos, iterations=2, pipeline__datamanager__dataparser__eval_mode="all")
+    (path,) = trained.base_dir.glob("*.scene")
+    photos = read_scene(path).photos
+    assert len(photos) == 6 and {photo.split for photo in photos} == {"train"}

@@ -36,8 +36,8 @@ def cameras() -> list[Camera]:
 
 
 def whole(values: torch.Tensor) -> Pixels:
-    """Of values at every pixel, whose last channel is the foreground."""
-    return Pixels([values[..., :-1]], values[..., -1])
+    """Of values at every pixel, whose last channel tells where they are known; all is foreground."""
+    return Pixels([values[..., :-1]], values[..., -1], torch.zeros_like(values[..., -1]))
 
 
 def composite(camera: Camera, carried: torch.Tensor) -> torch.Tensor:
@@ -78,9 +78,9 @@ def test_the_memory_given_changes_nothing():
     views = [
         (
             lambda carried, camera=camera: composite(camera, carried),
-            Pixels(
+            Pixels.of(
                 [torch.rand(SIZE, SIZE, k, generator=generator, dtype=torch.float64) for k in (2, 5)],
-                torch.ones(SIZE, SIZE).double(),
+                (SIZE, SIZE),
             ),
         )
         for camera in cameras()
@@ -95,8 +95,8 @@ def test_the_memory_given_changes_nothing():
 
     watching = [(partial(watched, work=work), pixels) for work, pixels in views]
     numbers = 2 * (5 + SIZE * SIZE)
-    found = gather(5, watching, 7, like, memory=3 * 4 * numbers)
-    assert widths == [3, 3, 2] * len(views)
+    found = gather(5, watching, 7, like, memory=4 * 4 * numbers)
+    assert widths == [4, 4, 1] * len(views)
     for mine, other in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, other)
 
@@ -120,12 +120,12 @@ def test_pixels_have_the_targets_at_their_places_and_nothing_off_the_mask():
     mask = torch.zeros(12, 16, dtype=torch.bool)
     mask[:, 8:] = True
     pixels = Pixels.of([ramp, torch.full((3, 3, 2), 5.0)], (12, 16), mask).channels(0, 9)
-    assert pixels.shape == (12, 16, 4)
-    assert (pixels[:, :8] == 0).all()
+    assert pixels.shape == (12, 16, 5)
+    assert (pixels[:, :8, :4] == 0).all() and torch.equal(pixels[..., 4] == 1, ~mask)
     torch.testing.assert_close(pixels[:, 8:15, 0], ((torch.arange(16) + 0.5) / 16)[8:15].expand(12, 7))
     assert (pixels[:, 8:, 1:3] == 5).all() and (pixels[:, 8:, 3] == 1).all()
     everywhere = Pixels.of([ramp], (12, 16)).channels(0, 9)
-    assert (everywhere[..., -1] == 1).all() and everywhere.shape == (12, 16, 2)
+    assert (everywhere[..., 1] == 1).all() and everywhere.shape == (12, 16, 3)
 
 
 @pytest.mark.parametrize("step", [1, 2, 3, 5])
@@ -133,8 +133,8 @@ def test_channels_a_few_at_a_time_are_all_channels(step):
     draw = torch.Generator().manual_seed(5)
     maps = [torch.rand(4, 5, 3, generator=draw), torch.rand(6, 6, 2, generator=draw)]
     pixels = Pixels.of(maps, (9, 11), torch.rand(9, 11, generator=draw) > 0.3)
-    parts = [pixels.channels(first, first + step) for first in range(0, 6, step)]
-    torch.testing.assert_close(torch.cat(parts, dim=-1), pixels.channels(0, 6), rtol=0, atol=0)
+    parts = [pixels.channels(first, first + step) for first in range(0, 7, step)]
+    torch.testing.assert_close(torch.cat(parts, dim=-1), pixels.channels(0, 7), rtol=0, atol=0)
 
 
 def test_the_order_of_photos_does_not_matter_and_a_photo_that_counts_nowhere_adds_nothing():
@@ -175,7 +175,23 @@ def test_pixels_that_are_not_finite_do_not_count():
     target = torch.ones(4, 4, 2)
     target[0, 0, 1] = torch.nan
     pixels = Pixels.of([target], (4, 4)).channels(0, 3)
-    assert pixels.isfinite().all() and (pixels[0, 0] == 0).all() and pixels[..., -1].sum() == 15
+    assert pixels.isfinite().all() and (pixels[0, 0] == 0).all() and pixels[..., 2].sum() == 15
+
+
+def test_what_is_mostly_outside_the_foreground_takes_nothing_from_its_edge():
+    """The sky behind a tower is no tower; and a pixel without features is not outside of the foreground."""
+    weights = torch.tensor([[[1.0, 0.4]], [[0.0, 0.6]]])  # two pixels, one above the other, two Gaussians
+    mask = torch.tensor([[True], [False]])
+
+    def gathered(*pixels):
+        return gather(2, [(lambda carried: weights @ carried, each) for each in pixels], 1, weights)
+
+    features, mass = gathered(Pixels.of([torch.full((2, 1, 1), 3.0)], (2, 1), mask))
+    assert features[:, 0].tolist() == [3.0, 0.0] and mass.tolist() == [1.0, 0.0]
+    other = Pixels.of([torch.full((2, 1, 1), 3.0)], (2, 1), ~mask)  # a photo that has it in its foreground
+    assert gathered(Pixels.of([torch.full((2, 1, 1), 3.0)], (2, 1), mask), other)[1][1] == 1.0
+    torn = torch.tensor([[[3.0]], [[torch.nan]]])
+    assert gathered(Pixels.of([torn], (2, 1)))[1].tolist() == pytest.approx([1.0, 0.4])
 
 
 def test_pixels_that_a_gaussian_fills_are_its_weights():
