@@ -30,61 +30,30 @@ distance about 1."""
 
 def _optimizers() -> dict[str, dict]:
     """Groups of the paper with schedules in fractions of the run, and rates for short runs beside them."""
-    learned = partial(RunScheduleConfig, start=0.1, warm=0.05, end=0.01, power=2.0)
-    return {
-        "means": {
-            "optimizer": RunAdamConfig(lr=1.6e-4, short_lr=6.4e-4),
-            "scheduler": RunScheduleConfig(shape="log-linear", end=0.01),
-        },
-        "features_dc": {
-            "optimizer": RunAdamConfig(lr=2.5e-3, short_lr=7.5e-3),
-            "scheduler": RunScheduleConfig(end=0.1, power=2.0),
-        },
-        "features_rest": {
-            "optimizer": RunAdamConfig(lr=2.5e-3 / 20),
-            "scheduler": RunScheduleConfig(end=0.1, power=2.0),
-        },
-        "opacities": {"optimizer": RunAdamConfig(lr=0.05), "scheduler": None},
-        "scales": {"optimizer": RunAdamConfig(lr=5e-3, short_lr=1.5e-2), "scheduler": None},
-        "quats": {"optimizer": RunAdamConfig(lr=1e-3, short_lr=5e-3), "scheduler": None},
-        "sky": {
-            "optimizer": RunAdamConfig(lr=1e-3, short_lr=5e-3),
-            "scheduler": RunScheduleConfig(end=0.1),
-        },
-        "codes": {
-            "optimizer": RunAdamConfig(lr=1e-3, short_lr=3e-2),
-            "scheduler": RunScheduleConfig(end=0.05),
-        },
-        "field_encoding": {
-            "optimizer": RunAdamConfig(lr=5e-4, short_lr=1e-2),
-            "scheduler": learned(),
-        },
-        "field_decoder": {
-            "optimizer": RunAdamConfig(lr=5e-4, short_lr=1e-2, weight_decay=1e-5),
-            "scheduler": learned(),
-        },
+    adam, schedule = RunAdamConfig, RunScheduleConfig
+    learned = partial(schedule, start=0.1, warm=0.05, end=0.01, power=2.0)
+    groups = {
+        "means": (adam(lr=1.6e-4, short_lr=6.4e-4), schedule(shape="log-linear", end=0.01)),
+        "features_dc": (adam(lr=2.5e-3, short_lr=7.5e-3), schedule(end=0.1, power=2.0)),
+        "features_rest": (adam(lr=2.5e-3 / 20), schedule(end=0.1, power=2.0)),
+        "opacities": (adam(lr=0.05), None),
+        "scales": (adam(lr=5e-3, short_lr=1.5e-2), None),
+        "quats": (adam(lr=1e-3, short_lr=5e-3), None),
+        "sky": (adam(lr=1e-3, short_lr=5e-3), schedule(end=0.1)),
+        "codes": (adam(lr=1e-3, short_lr=3e-2), schedule(end=0.05)),
+        "field_encoding": (adam(lr=5e-4, short_lr=1e-2), learned()),
+        "field_decoder": (adam(lr=5e-4, short_lr=1e-2, weight_decay=1e-5), learned()),
         # As published for long runs.
-        "feature3dgs_decoder": {
-            "optimizer": RunAdamConfig(lr=1e-4, short_lr=1e-2),
-            "scheduler": learned(),
-        },
-        "downsampler": {
-            "optimizer": RunAdamConfig(lr=5e-4, short_lr=5e-3, weight_decay=1e-5),
-            "scheduler": learned(),
-        },
-        "appearance": {
-            "optimizer": RunAdamConfig(lr=5e-4, short_lr=5e-3),
-            "scheduler": RunScheduleConfig(start=0.1, warm=0.05, end=0.1),
-        },
-        "appearance_vectors": {
-            "optimizer": RunAdamConfig(lr=1e-3, short_lr=5e-3),
-            "scheduler": RunScheduleConfig(end=0.1),
-        },
-        "camera_opt": {
-            "optimizer": AdamOptimizerConfig(lr=1e-4, eps=1e-15),
-            "scheduler": RunScheduleConfig(shape="log-linear", end=5e-3),
-        },
+        "feature3dgs_decoder": (adam(lr=1e-4, short_lr=1e-2), learned()),
+        "downsampler": (adam(lr=5e-4, short_lr=5e-3, weight_decay=1e-5), learned()),
+        "appearance": (adam(lr=5e-4, short_lr=5e-3), schedule(start=0.1, warm=0.05, end=0.1)),
+        "appearance_vectors": (adam(lr=1e-3, short_lr=5e-3), schedule(end=0.1)),
+        "camera_opt": (
+            AdamOptimizerConfig(lr=1e-4, eps=1e-15),
+            schedule(shape="log-linear", end=5e-3),
+        ),
     }
+    return {name: {"optimizer": rates, "scheduler": decay} for name, (rates, decay) in groups.items()}
 
 
 def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:

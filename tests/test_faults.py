@@ -313,13 +313,12 @@ def test_decoding_takes_smaller_chunks_when_memory_runs_out():
 
 def test_encoding_takes_smaller_batches_when_memory_runs_out():
     photo = torch.rand(64, 80, 3)
-    arguments = ([16, 32], [0.2, 0.4])
 
     def encode(crops):
         return crops.flatten(1)[:, :6]
 
-    expected = build_clip_target(photo, *arguments, encode, 8, 64).features
-    found = build_clip_target(photo, *arguments, short_of_memory(5, encode), 8, 64).features
+    expected = build_clip_target(photo, [16, 32], encode, 8, 64).features
+    found = build_clip_target(photo, [16, 32], short_of_memory(5, encode), 8, 64).features
     torch.testing.assert_close(found, expected)
 
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numerics.physical_scale import in_world
 from scenes import write_scene
 
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
-from lang3dxl_ns.numerics.physical_scale import in_world
 from lang3dxl_ns.numerics.rasterizer import Scene
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.preparation.physical_scale import (
@@ -91,7 +91,7 @@ def test_the_crops_are_the_same_in_every_world_with_the_range_scaled_along(recon
         # Meters from cameras that are 1e5 · 4.6 away: ten digits, in a world of 1e-3 seven.
         assert after[name] == pytest.approx(scale * before[name], rel=1e-14 * max(1e2, 1e2 * offset / scale))
         crops = [
-            crop_sides(physical_scales(0.2 * unit, 2.0 * unit), sizes[name], photo.width)[0]
+            crop_sides(physical_scales(0.2 * unit, 2.0 * unit), sizes[name], photo.width)
             for unit, sizes in ((1.0, before), (scale, after))
         ]
         assert crops[0] == crops[1]

@@ -25,6 +25,7 @@ from lab.benchmarks.dense_rasterizer import (
     count_pairs,
     render_dense,
 )
+from lab.benchmarks.peak_memory import MEBIBYTE, peak_memory
 from lab.benchmarks.rasterizer_scenes import (
     CHANNELS,
     COLORS,
@@ -37,12 +38,10 @@ from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.reports import (
-    MEBIBYTE,
     command_line,
     describe_machine,
     interleaved_times,
     markdown_table,
-    peak_memory,
     progress_bar,
     write_report,
 )

@@ -69,7 +69,6 @@ def _relevancy_maps(
     target = build_clip_target(
         encoder.in_known_light(photo),
         sides,
-        [float(s) for s in sides],
         encoder.encode_images,
         encoder.crop_size,
         256,

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
 from lang3dxl_ns.baselines.rows import BOUNDS, FULL, Row
 from lang3dxl_ns.benchmarks.scored_runs import Run
-from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_atomically, write_report
+from lang3dxl_ns.common.reports import (
+    as_png,
+    describe_machine,
+    markdown_table,
+    write_atomically,
+    write_report,
+)
 
 FIGURES = {
     "test_map": ("mAP, test views", ".3f"),
@@ -110,13 +116,7 @@ def markdown(data: Mapping[str, Any]) -> str:
     """The report in markdown."""
     parts = []
     for steps, rows in data["lengths"].items():
-        tables = (
-            _table(rows),
-            _scene_table(rows, data),
-            _family_table(rows, data),
-            _category_table(rows, data),
-        )
-        parts += [f"## {steps} iterations", *filter(None, tables)]
+        parts += [f"## {steps} iterations", _table(rows), *_means(rows, data["scenes"], data["quality"])]
     reasons = [(r["label"], why) for rows in data["lengths"].values() for r in rows for why in r["not_run"]]
     notes = "\n".join(f"- {label}: {why}" for label, why in dict.fromkeys(reasons))
     return f"""# Ablation
@@ -168,50 +168,35 @@ def _cell(value: Mapping[str, float] | None, form: str) -> str | None:
     return f"{value['mean']:{form}}{deviation}"
 
 
-def _scene_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> str:
-    scenes, quality = data["scenes"], data["quality"]
-    return markdown_table(
-        ["mAP", *scenes],
-        [[row["label"], *(_cell(row["scenes"][s].get(quality), ".3f") for s in scenes)] for row in rows],
-    )
+def _means(rows: Sequence[Mapping[str, Any]], scenes: Sequence[str], quality: str) -> Iterator[str]:
+    """Tables of precision by scene; by family of scenes (cathedral-700, -701 …), if one has several, with the
+    deviation between them; and by category, over the scenes that have it."""
+    yield _mean_table("mAP", rows, {scene: [(scene, quality)] for scene in scenes})
+    families: dict[str, list[tuple[str, str]]] = {}
+    for scene in scenes:
+        families.setdefault(scene.rpartition("-")[0] or "other", []).append((scene, quality))
+    if max(map(len, families.values())) > 1:
+        yield _mean_table("mAP by family", rows, families)
+    start = quality.removesuffix("map") + "ap_"
+    found = [name for row in rows for figures in row["scenes"].values() for name in figures]
+    names = [n for n in dict.fromkeys(found) if n.startswith(start) and not n.endswith("_photos")]
+    categories = {name.removeprefix(start): [(scene, name) for scene in scenes] for name in names}
+    yield _mean_table("AP", rows, categories)
 
 
-def _family_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> str | None:
-    """Means over the scenes of one family (cathedral-700, -701 …), and the deviation between them."""
-    families: dict[str, list[str]] = {}
-    for scene in data["scenes"]:
-        families.setdefault(scene.rpartition("-")[0], []).append(scene)
-    if max(map(len, families.values())) < 2:
-        return None
-    quality = data["quality"]
-    values = {
-        row["label"]: [
-            spread([row["scenes"][s][quality]["mean"] for s in scenes if quality in row["scenes"][s]])
-            for scenes in families.values()
-        ]
-        for row in rows
-    }
-    return markdown_table(
-        ["mAP by family", *(name or "other" for name in families)],
-        [[label, *(_cell(value, ".3f") for value in found)] for label, found in values.items()],
-    )
-
-
-def _category_table(rows: Sequence[Mapping[str, Any]], data: Mapping[str, Any]) -> str:
-    """Means over the scenes that have each category."""
-    start = data["quality"].removesuffix("map") + "ap_"
-    found = [figures for row in rows for figures in row["scenes"].values()]
-    names = [name for figures in found for name in figures if name.startswith(start)]
-    names = [name for name in dict.fromkeys(names) if not name.endswith("_photos")]
-
-    def over_scenes(row: Mapping[str, Any], name: str) -> str | None:
-        values = [figures[name]["mean"] for figures in row["scenes"].values() if name in figures]
-        return f"{mean(values):.3f}" if values else None
-
-    return markdown_table(
-        ["AP", *(name.removeprefix(start) for name in names)],
-        [[row["label"], *(over_scenes(row, name) for name in names)] for row in rows],
-    )
+def _mean_table(
+    title: str, rows: Sequence[Mapping[str, Any]], columns: Mapping[str, Sequence[tuple[str, str]]]
+) -> str:
+    """A line per row; of each column's figures in its scenes the mean, or the only one with its deviation."""
+    lines = []
+    for row in rows:
+        cells = []
+        for wanted in columns.values():
+            found = [row["scenes"][scene][name] for scene, name in wanted if name in row["scenes"][scene]]
+            value = found[0] if len(wanted) == 1 and found else spread([one["mean"] for one in found])
+            cells.append(_cell(value, ".3f"))
+        lines.append([row["label"], *cells])
+    return markdown_table([title, *columns], lines)
 
 
 def table_of_runs(figures: Figures) -> str:
@@ -248,6 +233,4 @@ def plot(lengths: Mapping[int, Sequence[Mapping[str, Any]]], quality: str) -> by
     axes.set(xscale="log", xlabel="training, s of one core", ylabel="mAP")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=7)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=150)
-    return file.getvalue()
+    return as_png(figure)

@@ -36,18 +36,17 @@ from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import Camera
 
-STEPS = 30_000
-"""Of the run whose time is estimated."""
 CLIP = 512
 """Channels of the features whose cost is measured."""
-_WORDS = {
-    "gather a photo (ms)": "gather",
-    "compress (s)": "compress",
-    "centered cosine": "cosine",
-    "ask a text (ms)": "ask",
-    "memory (GB)": "memory",
+_TABLES = {
+    "step": "Training step, milliseconds: colors alone; `paper` also decodes codes, `looks` a photo's look",
+    "words": f"Words, from a CLIP of {CLIP} channels",
+    "encoder": "Crops that a CLIP encodes per second",
+    "reading": "Photos of 12 MP that one reader decodes per second",
+    "frame": "Frame with heat maps of some prompts, milliseconds",
+    "parity": "Difference of gsplat from torch",
 }
-_PARTS = ("render", "loss", "backward", "optimizer")
+"""Headings of the parts, by the beginning of their names."""
 
 
 @dataclass
@@ -141,7 +140,7 @@ def numerics(quick: bool) -> dict[str, Any]:
 
     cases = list(losses.cases(True, "cuda"))[:2] + list(decoder.cases(True, "cuda"))[:1]
     rows = measure_all(cases if quick else list(all_cases(True, "cuda")), quick, "cuda")
-    missed = [f"{row.component}, {row.case}, {row.mode}" for row in rows if row.misses]
+    missed = [row.name for row in rows if row.misses]
     return {"rows": len(rows), "missed": missed}
 
 
@@ -182,9 +181,8 @@ def step(count: int, size: tuple[int, int], paper: bool = False, looks: bool = F
     work = {"render": render, "loss": loss, "backward": lambda: state["loss"].backward()}
     torch.cuda.reset_peak_memory_stats()
     seconds = times_of_parts({**work, "optimizer": lambda: optimizer.step()})
-    return {name: 1e3 * value for name, value in seconds.items()} | {
-        "memory": torch.cuda.max_memory_allocated() / 1e9
-    }
+    found = {name: 1e3 * value for name, value in seconds.items()}
+    return found | {"step": sum(found.values()), "memory (GB)": torch.cuda.max_memory_allocated() / 1e9}
 
 
 def words(count: int, size: tuple[int, int], steps: int) -> dict[str, float]:
@@ -216,11 +214,11 @@ def words(count: int, size: tuple[int, int], steps: int) -> dict[str, float]:
     ask = lambda: rows.rows.float() @ (text if rows.head is None else rows.head @ text)  # noqa: E731
     seconds["ask"] = median(interleaved_times({"ask": ask}, repeats=20)["ask"])
     return {
-        "gather": 1e3 * seconds["gather"],
-        "compress": seconds["compress"],
-        "cosine": cosine,
-        "ask": 1e3 * seconds["ask"],
-        "memory": torch.cuda.max_memory_allocated() / 1e9,
+        "gather a photo (ms)": 1e3 * seconds["gather"],
+        "compress (s)": seconds["compress"],
+        "centered cosine": cosine,
+        "ask a text (ms)": 1e3 * seconds["ask"],
+        "memory (GB)": torch.cuda.max_memory_allocated() / 1e9,
     }
 
 
@@ -283,62 +281,19 @@ def still(count: int, size: tuple[int, int], prompts: int) -> dict[str, float]:
     gaussians, colors = _gaussians(raw), raw["colors"].sigmoid()
     frame = lambda: rasterize(gaussians, camera, colors, features=heat, render_depth=True)  # noqa: E731
     seconds = median(interleaved_times({"frame": frame}, repeats=20)["frame"])
-    return {"frame": 1e3 * seconds, "memory": torch.cuda.max_memory_allocated() / 1e9}
+    return {"frame": 1e3 * seconds, "memory (GB)": torch.cuda.max_memory_allocated() / 1e9}
 
 
 def _markdown(results: dict[str, Any], machine: str, command: str) -> str:
-    steps = {name.removeprefix("step-"): value for name, value in results.items() if name.startswith("step-")}
-    rows, total = [], 0.0
-    for count, found in steps.items():
-        own = sum(found[part] for part in _PARTS)
-        total = own if count.isdigit() else total
-        figures = [*(f"{found[part]:.2f}" for part in _PARTS), f"{own:.2f}", f"{found['memory']:.2f}"]
-        rows.append([f"{int(count):,}" if count.isdigit() else f"the first, {count}", *figures])
-    frames = [
-        [name.removeprefix("frame-"), f"{found['frame']:.2f}", f"{found['memory']:.2f}"]
-        for name, found in results.items()
-        if name.startswith("frame-")
-    ]
-    learned = [
-        [f"{int(name.removeprefix('words-')):,}", *(f"{found[key]:.2f}" for key in _WORDS.values())]
-        for name, found in results.items()
-        if name.startswith("words-")
-    ]
+    sections = []
+    for kind, title in _TABLES.items():
+        own = {
+            name.removeprefix(f"{kind}-"): found for name, found in results.items() if name.startswith(kind)
+        }
+        columns = next(iter(own.values()))
+        rows = [[name, *(f"{value:.4g}" for value in found.values())] for name, found in own.items()]
+        sections.append(f"## {title}\n\n{markdown_table(['', *columns], rows)}")
     measured, missed = results["numerics"]["rows"], results["numerics"]["missed"]
-    return f"""# On a GPU
-
-`{command}`
-{machine}.
-
-## Training step, milliseconds
-
-Colors of random Gaussians; `paper` also decodes codes, `looks` also computes a photo's look.
-30,000 steps at the largest size: {STEPS * total / 6e4:.0f} minutes.
-
-{markdown_table(["Gaussians", *_PARTS, "step", "memory (GB)"], rows)}
-
-## Words
-
-CLIP of {CLIP} channels, {CompressedField.gathered_channels} of them gathered.
-
-{markdown_table(["Gaussians", *_WORDS], learned)}
-
-## Preparation
-
-{markdown_table(["CLIP", "crops per second"], [[k, f"{v:.0f}"] for k, v in results["encoder"].items()])}
-
-One reader decodes {results["reading"]["photos"]:.1f} photos of 12 MP per second.
-
-## Frame, milliseconds
-
-{markdown_table(["prompts", "frame", "memory (GB)"], frames)}
-
-## gsplat against torch
-
-{markdown_table(["difference", ""], [[k, f"{v:.2e}"] for k, v in results["parity"].items()])}
-
-## Numerics
-
-{measured - len(missed)} of {measured} hard cases are within their bounds.
-{"".join(f"{chr(10)}- {name}" for name in missed)}
-"""
+    fine = f"{measured - len(missed)} of {measured} hard cases are within their bounds."
+    numerics = "\n".join(["## Numerics", "", fine, *(f"- {name}" for name in missed)])
+    return "\n\n".join(["# On a GPU", f"`{command}`\n{machine}.", *sections, numerics])

@@ -123,35 +123,26 @@ def _time_parts(trainer: Any) -> None:
 
 
 def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:
-    """The report of both runs, in markdown."""
-    joint, rgb = results["joint"], results["rgb only"]
-    names = [name for name in joint["metrics"] if name not in ("num_rays_per_sec", "fps")]
-    quality = markdown_table(
-        ["held-out photos", "joint", "rgb only"],
-        [[name, *(_figure(r["metrics"].get(name)) for r in (joint, rgb))] for name in names],
-    )
-    cost = markdown_table(
-        ["", "joint", "rgb only"],
-        [
-            [f"{p} (ms)", *(_figure(_milliseconds(r["split_seconds"].get(p))) for r in (joint, rgb))]
-            for p in PARTS
-        ]
-        + [
-            ["median step (ms)", *(_figure(_milliseconds(r["seconds_per_step"])) for r in (joint, rgb))],
-            ["whole training (s)", *(_figure(r["training_seconds"]) for r in (joint, rgb))],
-            ["peak memory (MB)", *(_figure(r["peak_memory_mb"]) for r in (joint, rgb))],
-            ["Gaussians at the end", *(r["gaussians"] for r in (joint, rgb))],
-        ],
-    )
+    """The report of all runs, in markdown."""
+    runs, machine = results.values(), results["joint"]["machine"]
+    names = [n for n in results["joint"]["metrics"] if n not in ("num_rays_per_sec", "fps")]
+    quality = [[name, *(_figure(run["metrics"].get(name)) for run in runs)] for name in names]
+    cost = [
+        *([f"{p} (ms)", *(_milliseconds(run["split_seconds"].get(p)) for run in runs)] for p in PARTS),
+        ["median step (ms)", *(_milliseconds(run["seconds_per_step"]) for run in runs)],
+        ["whole training (s)", *(_figure(run["training_seconds"]) for run in runs)],
+        ["peak memory (MB)", *(_figure(run["peak_memory_mb"]) for run in runs)],
+        ["Gaussians at the end", *(run["gaussians"] for run in runs)],
+    ]
     return f"""# Training on `{settings.data.name}`: with and without semantics
 
     {command_line("lang3dxl benchmark training", settings)}
 
-{settings.iterations} iterations, photos at {settings.scale} of their size. {joint["machine"]}
+{settings.iterations} iterations, photos at {settings.scale} of their size. {machine}
 
 ## Quality
 
-{quality}
+{markdown_table(["held-out photos", *results], quality)}
 
 `*_of_mean` is the same figure for predicting the mean feature of the training photos everywhere.
 
@@ -159,29 +150,12 @@ def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:
 
 Mean milliseconds by part, with appearance inside `render`; and the median step.
 
-{cost}
-{_by_threads(results)}"""
-
-
-def _by_threads(results: dict[str, dict]) -> str:
-    """A table of the steps by the number of threads; empty if none was asked for."""
-    runs = {name.split()[0]: found for name, found in results.items() if name.endswith("threads")}
-    if not runs:
-        return ""
-    seconds = {"median step": [run["seconds_per_step"] for run in runs.values()]}
-    seconds |= {p: [run["split_seconds"].get(p) for run in runs.values()] for p in PARTS}
-    rows = [[name, *(_figure(_milliseconds(value)) for value in row)] for name, row in seconds.items()]
-    return f"""
-## By threads
-
-Colors alone, milliseconds.
-
-{markdown_table(["threads", *runs], rows)}
+{markdown_table(["", *results], cost)}
 """
 
 
-def _milliseconds(seconds: float | None) -> float | None:
-    return None if seconds is None else 1000 * seconds
+def _milliseconds(seconds: float | None) -> str | None:
+    return None if seconds is None else _figure(1000 * seconds)
 
 
 def _figure(value: float | None) -> str | None:

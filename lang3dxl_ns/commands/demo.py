@@ -25,7 +25,6 @@ from lang3dxl_ns.common.reports import (
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
-from lang3dxl_ns.demo.landmark.labels import CATEGORIES
 
 if TYPE_CHECKING:
     from lang3dxl_ns.demo.picture import PictureRow
@@ -187,28 +186,21 @@ class Demo:
     def _report(self, splits: dict[str, list[EvaluatedPhoto]], trainer: Lang3DXLTrainer) -> dict[str, Any]:
         from lang3dxl_ns.evaluation.aggregate import average
 
-        report: dict[str, Any] = {
+        return {
             "command": command_line("lang3dxl demo", self),
             "machine": describe_machine(trainer.device),
             "gaussians": trainer.pipeline.model.num_points,
-            "splits": {},
+            "splits": {
+                name: average([photo.metrics for photo in photos]) | {"protocol": {"photos": len(photos)}}
+                for name, photos in splits.items()
+            },
         }
-        for split, photos in splits.items():
-            means = average([photo.metrics for photo in photos])
-            found: dict[str, Any] = {"photos": len(photos)}
-            found["colors"] = {name: means[name] for name in COLORS if name in means}
-            for who, prefix in WHO.items():
-                precision = {c: means[f"{prefix}ap_{c}"] for c in CATEGORIES if f"{prefix}ap_{c}" in means}
-                if precision:
-                    found[who] = {"mAP": means[f"{prefix}map"], "AP": precision}
-            found["shown"] = {c: means[f"ap_{c}_photos"] for c in CATEGORIES if f"ap_{c}" in means}
-            features = {n: v for n, v in means.items() if n.startswith(("clip_", "dense_"))}
-            report["splits"][split] = found | ({"features": features} if features else {})
-        return report
 
     def markdown(self, report: dict[str, Any]) -> str:
         """The report in markdown."""
-        splits = "".join(f"## {name}\n\n{_split(found)}\n\n" for name, found in report["splits"].items())
+        from lang3dxl_ns.evaluation.report import scene_table
+
+        splits = "\n".join(f"#{scene_table(*split)}" for split in report["splits"].items())
         cost = [
             [stage, f"{seconds:.0f}", f"{report['peak_mb'][stage]:.0f}"]
             for stage, seconds in report["seconds"].items()
@@ -222,57 +214,18 @@ class Demo:
 
 Average precision of words, by prompt. The teacher is the crop pyramid's relevancy in the very picture that is
 scored, which the field has never seen; the limit is the exact labels, lifted to the Gaussians and
-rendered back; chance is a map without information. Maps of field and teacher are blurred by 2.5 pixels at
-half the photo's size, as published, and not masked. Test views are novel cameras in plain light, no people.
+rendered back; chance is a map without information. Blurred maps are blurred by 2.5 pixels at half the photo's
+size, as published. Test views are novel cameras in plain light, no people. PSNR is in dB; of features,
+"of mean" is the same figure for the mean feature instead.
 
-{splits}## Cost
+{splits}
+## Cost
 
 {markdown_table(["stage", "seconds", "peak memory (MB)"], cost)}
 """
 
 
 _BOUNDS = {"seed": (0, 2**63), "photos": (4, 9999), "steps": (1, 1e9), "test_views": (0, 9999)}
-
-WHO = {"field": "", "teacher": "teacher_", "limit": "limit_", "chance": "chance_"}
-"""Sources of the reported average precision, and the prefix of their figures."""
-COLORS = {
-    "half_psnr": "PSNR of right halves, looks fitted on the left ones (dB)",
-    "half_ssim": "SSIM of right halves",
-    "psnr": "PSNR (dB)",
-    "cc_psnr": "PSNR with matched colors (dB)",
-    "ssim": "SSIM",
-}
-FEATURES = {
-    "clip_l1": "CLIP feature, L1",
-    "clip_psnr": "CLIP feature, PSNR (dB)",
-    "clip_cosine": "CLIP feature, cosine",
-    "dense_l1": "dense feature, L1",
-    "dense_cosine": "dense feature, cosine",
-}
-
-
-def _split(found: dict[str, Any]) -> str:
-    """The tables of a split."""
-    words = "Colors only: no semantics were trained."
-    who = [name for name in WHO if name in found]
-    if who:
-        rows = [
-            [prompt, count, *(f"{found[name]['AP'][prompt]:.3f}" for name in who)]
-            for prompt, count in found["shown"].items()
-        ]
-        rows.append(["**mean (mAP)**", "", *(f"**{found[name]['mAP']:.3f}**" for name in who)])
-        words = markdown_table(
-            ["prompt", f"of {found['photos']}", "3-D field", "2-D teacher", *who[2:]], rows
-        )
-    features = found.get("features", {})
-    quality = [[COLORS[name], f"{value:.4g}", ""] for name, value in found["colors"].items()]
-    quality += [
-        [label, f"{features[name]:.4g}", f"{features[f'{name}_of_mean']:.4g}"]
-        for name, label in FEATURES.items()
-        if name in features
-    ]
-    return f"{words}\n\n{markdown_table(['', 'rendered', 'mean feature instead'], quality)}"
-
 
 SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluate": 0.28}
 """The demo's stages, and their usual shares of its time on a CPU."""

@@ -35,6 +35,12 @@ def is_coordinate(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < FARTHEST
 
 
+def expect(holds: bool, otherwise: str) -> None:
+    """Raises ValueError with a reason unless a condition on a file's content holds."""
+    if not holds:
+        raise ValueError(otherwise)
+
+
 def check_address(host: str, port: int | None) -> None:
     """Raises UserError for an address that nothing can be served at: a port that is taken or none at all, a
     host that is not a name or address of this machine. port: None: any."""

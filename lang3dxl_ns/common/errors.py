@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 import unicodedata
+
+DAMAGE = (
+    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
+    *(MemoryError, AssertionError, struct.error),
+)
+"""Exceptions raised on reading values that a damaged file doesn't have."""
 
 
 class UserError(Exception):
@@ -19,6 +26,11 @@ def printable(text: str) -> str:
     """The text with control characters and lone surrogates escaped: a file's name may hold commands for the
     terminal. Line breaks and tabs stay."""
     return "".join(c if c in "\n\t" or not _commands(c) else repr(c)[1:-1] for c in text)
+
+
+def in_a_line(error: BaseException, most: int = 200) -> str:
+    """The beginning of another library's error, or its kind if it says nothing."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
 
 
 def is_plain(text: str) -> bool:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from PIL import Image
+
+from lang3dxl_ns.common.errors import DAMAGE
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "AVIF")
 """Formats accepted, whatever the file's name. Pillow knows forty more, some of which start other programs
@@ -31,10 +32,7 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
     except Image.UnidentifiedImageError as error:
         raise NoPictureError(f"not a picture in one of the formats {', '.join(FORMATS)}") from error
     # Exceptions of Pillow's decoders for damaged files.
-    except (
-        *(OSError, SyntaxError, ValueError, LookupError, TypeError, AttributeError, RuntimeError),
-        *(EOFError, ArithmeticError, MemoryError, struct.error, Image.DecompressionBombError),
-    ) as error:
+    except (*DAMAGE, SyntaxError, Image.DecompressionBombError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # the disk's, not the decoder's
             raise
         raise NoPictureError(str(error) or type(error).__name__) from error

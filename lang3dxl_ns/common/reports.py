@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
+import io
 import json
 import math
 import os
@@ -25,8 +25,8 @@ from lang3dxl_ns.common.files import write_atomically
 
 if TYPE_CHECKING:  # imported where it is used: a command's help comes without it
     import torch
+    from matplotlib.figure import Figure
 
-MEBIBYTE = 2**20
 Result = TypeVar("Result")
 
 
@@ -151,31 +151,6 @@ def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence
         return pool.submit(work, *args).result()
 
 
-def peak_memory(setup: Callable[..., Callable[[], object]], *args: Any) -> int:
-    """Bytes that `setup(*args)()` allocates at its peak, beyond what was held just before the last call.
-
-    Measured in a fresh process, so earlier work can't distort it: host memory, or the GPU's if `setup` uses
-    one. `setup` and `args` must be picklable. Accurate to a few MiB; Linux and macOS.
-    """
-    # sympy, because torch would otherwise import it at the first gradient.
-    return in_own_process(_measure_peak, setup, args, preload=("torch", "sympy", setup.__module__))
-
-
-def _measure_peak(setup: Callable[..., Callable[[], object]], args: Sequence[Any]) -> int:
-    import torch
-
-    work = setup(*args)
-    gc.collect()
-    if torch.cuda.is_initialized():
-        torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_allocated()
-        work()
-        return torch.cuda.max_memory_allocated() - before
-    before = host_peak(reset=True)
-    work()
-    return host_peak() - before
-
-
 def host_peak(reset: bool = False) -> int:
     """Peak memory of this process, bytes; `reset` first lowers the recorded peak to what is held now."""
     if sys.platform == "linux":
@@ -214,6 +189,13 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> s
     """A markdown table; None becomes a dash."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join("–" if c is None else str(c) for c in line) + " |" for line in lines)
+
+
+def as_png(figure: Figure) -> bytes:
+    """A matplotlib figure as the bytes of a PNG."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=150)
+    return file.getvalue()
 
 
 def write_report(folder: Path, name: str, markdown: str, data: Mapping[str, Any]) -> None:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.common.reports import host_peak
 
@@ -109,7 +110,7 @@ def _spent(path: Path) -> dict[str, dict[str, float]]:
     try:
         found = read_json(path)
         return {n: {kind: float(f[kind]) for kind in ("seconds", "peak_mb")} for n, f in found.items()}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError):
+    except DAMAGE:
         return {}
 
 

@@ -93,36 +93,10 @@ class Gathered:
         return Gathered(self.features[rows], self.mass[rows], self.basis)
 
 
-def compress(
-    features: Float[Tensor, "n c"],
-    mass: Float[Tensor, " n"],
-    field: SemanticField,
-    config: CompressionConfig | None = None,
-    generator: torch.Generator | None = None,
-    advance: Callable[[], None] = lambda: None,
-    basis: PrincipalBasis | None = None,
-) -> Float[Tensor, "n code"]:
-    """Codes that the field, trained along with them, decodes to these features; on the field's device.
-
-    Gaussians without mass, visible in no photo, get NaN codes: unknown.
-
-    Args:
-        features: CLIP features of each Gaussian, of any length, or their coordinates in `basis`; they and
-            `mass` may lie on the CPU, whatever the field's device is.
-        mass: pixels that each Gaussian fills, weighted; not negative.
-        field: a field without dense features, in its initial state; trained in place.
-        generator: source of the sample and the batches, on the CPU.
-        advance: called after each step.
-    """
-    config = (config or CompressionConfig()).grown(len(features))
-    sample = _seen(features, mass, basis).sample(config.sample, generator)
-    codes = fit(sample, field, config, generator, advance)
-    return assign(features, mass, field, codes, basis)
-
-
-def _seen(
+def seen_by_photos(
     features: Float[Tensor, "n c"], mass: Float[Tensor, " n"], basis: PrincipalBasis | None
 ) -> Gathered:
+    """The Gaussians with mass, which some photo shows."""
     seen = mass > 0
     return Gathered(features, mass, basis) if seen.all() else Gathered(features[seen], mass[seen], basis)
 
@@ -300,7 +274,7 @@ class CompressedField(SemanticField):
         """Codes of three numbers; of more if those lose too much and the settings leave it open."""
         generator = torch.Generator().manual_seed(0)
         config, steps = self.compression.grown(len(features)), count(1)
-        sample = _seen(features, mass, basis).sample(config.sample, generator)
+        sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
 
         def step() -> None:
             """The bar has as many steps whatever the number of Gaussians."""
@@ -323,7 +297,7 @@ class CompressedField(SemanticField):
         self.take(fresh)
         codes = assign(features, mass, self, found, basis)
         known = (mass > 0).to(codes.device)
-        cosine = centered_cosine(_seen(features, mass, basis).features, self, codes[known], basis)
+        cosine = centered_cosine(seen_by_photos(features, mass, basis).features, self, codes[known], basis)
         self.learned = (
             f"features compressed to {self.code_dim} numbers per Gaussian: centered cosine {cosine:.3f}{lost}"
         )

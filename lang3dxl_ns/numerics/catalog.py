@@ -6,17 +6,12 @@ from collections.abc import Iterator
 
 from lang3dxl_ns.numerics import (
     appearance,
-    compression,
     decoder,
     downsampler,
-    gathering,
     hash_grid,
     losses,
-    physical_scale,
-    principal_basis,
     rasterizer,
     relevancy,
-    sharpening,
 )
 from lang3dxl_ns.numerics.measure import Case
 
@@ -27,12 +22,7 @@ GROUPS = (
     decoder,
     downsampler,
     losses,
-    physical_scale,
     relevancy,
-    principal_basis,
-    gathering,
-    sharpening,
-    compression,
 )
 
 

@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-import io
-import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.common.reports import (
-    command_line,
-    describe_machine,
-    markdown_table,
-    progress_bar,
-    write_report,
-)
+from lang3dxl_ns.common.reports import as_png, command_line, describe_machine, markdown_table, progress_bar
 from lang3dxl_ns.numerics.catalog import all_cases
 from lang3dxl_ns.numerics.measure import Case, Row, measure
 from lang3dxl_ns.numerics.optimization import Run, runs
 
-HEADER = (
-    "case", "mode", "output max / rms", "gradient max / rms", "flipped", "finite", "ms", "bound", "verdict"
-)  # fmt: skip
-OPTIMIZATION_HEADER = (
-    "rates", "steps", "loss by fifths", "largest code by fifths", "finite", "s", "verdict"
-)  # fmt: skip
+HEADER = "component", "case", "mode", "output", "gradient", "bounds", "flipped", "ms", "verdict"
 SMALLEST = 1e-18
 """Errors below are drawn here."""
 
@@ -40,7 +26,7 @@ class Numerics:
     """Measure the error and time of every component on stiff and extreme cases; exit 1 on any miss."""
 
     out: Path
-    """Folder for numerics.md, numerics.json and numerics.png."""
+    """Folder for numerics.md and numerics.png."""
     quick: bool = False
     """Smaller cases in single precision only, about a minute: for continuous integration."""
     device: str = "auto"
@@ -48,31 +34,24 @@ class Numerics:
 
     def main(self) -> None:
         """Measure, write the report, and exit with an error if a case missed its bound."""
-        device = self.device
-        if device == "auto":
-            device = best_device()
+        device = best_device() if self.device == "auto" else self.device
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # the timer measures processor time
         try:
             rows = measure_all(list(all_cases(self.quick, device)), self.quick, device)
             optimizations = runs(self.quick)
-            machine = describe_machine(device)
+            heading = f"`{command_line('lang3dxl numerics', self)}`\n{describe_machine(device)}."
         finally:
             torch.set_num_threads(threads)
-        lines = [
-            f"{row.component}, {row.case}, {row.mode}: {'; '.join(row.misses)}" for row in rows if row.misses
-        ]
-        lines += [f"optimization, {run.name}: {'; '.join(run.misses)}" for run in optimizations if run.misses]
-        command = command_line("lang3dxl numerics", self)
-        data = {"command": command, "machine": machine, "rows": [_plain(row) for row in rows]}
-        data["optimizations"] = [_plain(run) for run in optimizations]
-        write_report(self.out, "numerics", _markdown(rows, optimizations, command, machine), data)
+        all_rows: list[Row | Run] = [*rows, *optimizations]
+        misses = [f"{row.name}: {'; '.join(row.misses)}" for row in all_rows if row.misses]
+        verdict = f"{len(all_rows) - len(misses)} of {len(all_rows)} rows pass"
+        write_atomically(self.out / "numerics.md", _markdown(rows, optimizations, heading, verdict))
         write_atomically(self.out / "numerics.png", _plot(rows))
-        for line in lines:
-            print(f"MISS {line}")
-        total = len(rows) + len(optimizations)
-        print(f"{total - len(lines)} of {total} rows pass; report: {self.out}")
-        if lines:
+        for miss in misses:
+            print(f"MISS {miss}")
+        print(f"{verdict}; report: {self.out}")
+        if misses:
             sys.exit(1)
 
 
@@ -84,109 +63,83 @@ def measure_all(cases: Sequence[Case], quick: bool, device: str) -> list[Row]:
         for mode in case.bounds
         if not (quick and mode == "float64" and len(case.bounds) > 1)
     ]
-    rows = []
     with progress_bar() as bar:
-        task = bar.add_task("numerics", total=len(pairs))
-        for case, mode in pairs:
-            rows.append(measure(case, mode, device, repeats=1 if quick else 3))
-            bar.advance(task)
-    return rows
+        return [
+            measure(case, mode, device, repeats=1 if quick else 3)
+            for case, mode in bar.track(pairs, description="numerics")
+        ]
 
 
-def _plain(row: Row | Run) -> dict[str, Any]:
-    """JSON has no NaN: NaN and infinity become null."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {name: plain(inner) for name, inner in value.items()}
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return plain(asdict(row)) | {"misses": row.misses}
-
-
-def _markdown(rows: list[Row], optimizations: list[Run], command: str, machine: str) -> str:
-    passed = sum(not row.misses for row in rows) + sum(not run.misses for run in optimizations)
-    components = dict.fromkeys(row.component for row in rows)
-    tables = "\n\n".join(_section([row for row in rows if row.component == name]) for name in components)
+def _markdown(rows: Sequence[Row], optimizations: Sequence[Run], heading: str, verdict: str) -> str:
+    notes = dict.fromkeys(f"- {row.component}, {row.case}: {row.note}" for row in rows if row.note)
+    table = markdown_table(HEADER, [*map(_cells, rows), *map(_optimization, optimizations)])
     return f"""# Numerics: error against run time on stiff and extreme cases
 
-`{command}`
-{machine}.
+{heading}
 
-**{passed} of {len(rows) + len(optimizations)} rows pass.** Every component runs on its hard cases. The same
-inputs, rounded as the component sees them, go through a float64 reference written for clarity. Errors are
-relative to the reference's largest value (max) and root mean square (rms), the worst of all outputs and of
-the gradients of all inputs for a random upstream gradient. Where the reference is not finite (a NaN input's
-own row), the component may be anything; everywhere else "finite" means that output and gradient are.
-flipped: share of pixels in which rounding moved a pair across the rasterizer's thresholds of 1/255 and 1e-4;
-these count in the output's error, not in the gradient's. bf16, fp16: mixed precision (autocast). ms: one
-forward and backward. Bounds are in the order of the error columns.
+**{verdict}.** Every component runs on its hard cases, and the same inputs, rounded as the component sees
+them, go through a float64 reference written for clarity. Errors of outputs and gradients (for a random
+upstream gradient) are the largest and the root mean square, relative to the reference's, the worst of all
+tensors; so are their bounds. Where the reference is not finite, the component may be anything. flipped: share
+of pixels in which rounding moved a pair across the rasterizer's thresholds; they don't count in the
+gradient's error. bf16, fp16: mixed precision. ms: one forward and backward. An optimization must stay finite,
+and its loss must not rise again.
 
 ![Error against time](numerics.png)
 
-{tables}
+{table}
 
-## Optimization of the field alone
-
-Adam with epsilon 1e-15 at constant rates, on noisy targets. Parameters and moments must stay finite; at the
-usual rates the loss must not rise again, and no code may pass 25 (at 17 the sigmoid's slope is 0 in float32).
-
-{markdown_table(OPTIMIZATION_HEADER, map(_optimization, optimizations))}
+{chr(10).join(notes)}
 """
-
-
-def _section(rows: list[Row]) -> str:
-    notes = dict.fromkeys(f"\n- {row.case}: {row.note}." for row in rows if row.note)
-    name = rows[0].component
-    table = markdown_table(HEADER, map(_cells, rows))
-    return f"## {name[0].upper()}{name[1:]}\n\n{table}\n" + "".join(notes)
 
 
 def _cells(row: Row) -> list[str | None]:
     b = row.bounds
-    bound, slopes = f"{b.output_max:.0e} / {b.output_rms:.0e}", None
+    slopes, bounds = None, f"{b.output_max:.0e} / {b.output_rms:.0e}"
     if row.gradient_max is not None:
-        bound += f" · {b.gradient_max:.0e} / {b.gradient_rms:.0e}"
         slopes = f"{row.gradient_max:.0e} / {row.gradient_rms:.0e}"
+        bounds += f" · {b.gradient_max:.0e} / {b.gradient_rms:.0e}"
+    output, flipped = f"{row.output_max:.0e} / {row.output_rms:.0e}", f"{row.flipped:.1%}"
     return [
-        row.case, row.mode, f"{row.output_max:.0e} / {row.output_rms:.0e}", slopes,
-        f"{row.flipped:.1%}" if row.flipped else None, "yes" if row.finite else "**no**", f"{row.ms:.2g}",
-        bound, _verdict(row),
+        row.component,
+        row.case,
+        row.mode,
+        output,
+        slopes,
+        bounds,
+        flipped,
+        f"{row.ms:.2g}",
+        _verdict(row),
+    ]
+
+
+def _optimization(run: Run) -> list[str | None]:
+    ms = f"{1e3 * run.seconds:.0f}"
+    return [
+        "optimization", f"{run.case}, {run.steps:,} steps", "float32", *[None] * 4, ms, _verdict(run)
     ]  # fmt: skip
-
-
-def _optimization(run: Run) -> list[str]:
-    fifths = (" ".join(f"{value:.3g}" for value in values[1::2]) for values in (run.losses, run.codes))
-    finite = "yes" if run.finite else "**no**"
-    return [run.name, f"{run.steps:,}", *fifths, finite, f"{run.seconds:.0f}", _verdict(run)]
 
 
 def _verdict(row: Row | Run) -> str:
     return f"**miss**: {'; '.join(row.misses)}" if row.misses else "pass"
 
 
-def _plot(rows: list[Row]) -> bytes:
+def _plot(rows: Sequence[Row]) -> bytes:
     """PNG: error against time, for outputs and gradients; a color per component."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 5), layout="constrained")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    components = list(dict.fromkeys(row.component for row in rows))
+    for number, component in enumerate(dict.fromkeys(row.component for row in rows)):
+        own = [row for row in rows if row.component == component]
+        style = {"s": 14, "color": colormaps["tab20"](number), "label": component}
+        panels[0].scatter([row.ms for row in own], [max(row.output_rms, SMALLEST) for row in own], **style)
+        slopes = [(row.ms, max(row.gradient_rms, SMALLEST)) for row in own if row.gradient_rms is not None]
+        panels[1].scatter([ms for ms, _ in slopes], [error for _, error in slopes], **style)
     for panel, title in zip(panels, ("output", "gradient"), strict=True):
-        for number, component in enumerate(components):
-            own = [(r.ms, getattr(r, f"{title}_rms")) for r in rows if r.component == component]
-            drawn = [(ms, max(error, SMALLEST)) for ms, error in own if error is not None]
-            panel.scatter(
-                *zip(*drawn, strict=True) if drawn else ((), ()),
-                s=14,
-                color=colormaps["tab20"](number),
-                label=component,
-            )
         panel.set(xscale="log", yscale="log", xlabel="forward + backward, ms", title=title)
         panel.grid(alpha=0.25)
     panels[0].set_ylabel(f"relative RMS error (0 drawn at {SMALLEST:.0e})")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=130)
-    return file.getvalue()
+    return as_png(figure)

@@ -43,10 +43,7 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
         "−∞ in whole windows": lambda size: torch.where(_half_mask(size) > 0, _normal(1.0)(size), -math.inf),
     }  # fmt: skip
     for name, values in logits.items():
-        smooth = "±200" in name
-        yield Case(
-            "downsampler", f"{name}, free", partial(_problem, values, bound=None, smooth=smooth), BOUNDS
-        )
+        yield Case("downsampler", f"{name}, free", partial(_problem, values, bound=None), BOUNDS)
         yield Case("downsampler", f"{name}, bound 10", partial(_problem, values, bound=10.0), BOUNDS)
     yield Case(
         "downsampler",
@@ -96,7 +93,6 @@ def _problem(
     sides: tuple[float, ...] = SIDES,
     mask: Callable[[tuple[int, int]], Tensor] | None = None,
     narrow: bool = False,
-    smooth: bool = False,
 ) -> Problem:
     config = DownsamplerConfig(kernel="pyramid", logit_bound=bound)
     module = AttenuatedDownsampler(config, CHANNELS, generator=torch.Generator().manual_seed(0))
@@ -118,7 +114,7 @@ def _problem(
         return downsample_reference(values, weights, used.to(values.device), grid, sides)
 
     # With one pixel in a window, or one that outweighs all, the gradient by the logits nearly vanishes.
-    return Problem(leaves, compute, reference, smooth=smooth, gradient_scale=0.1)
+    return Problem(leaves, compute, reference, gradient_scale=0.1)
 
 
 def downsample_reference(

@@ -182,8 +182,7 @@ def _region_cases(quick: bool) -> Iterator[Case]:
         "labels of 10^12": torch.arange(600).view(20, 30) // 50 * 10**12,
     }
     for name, label in labels.items():
-        smooth = name == "usual"
-        yield Case("loss: regions", name, _region(features, label, smooth), BOUNDS)
+        yield Case("loss: regions", name, _region(features, label), BOUNDS)
         canceling = {"float32": Bounds(1e-5, 1e-5, 1e-4, 1e-5), "float64": Bounds(1e-8, 1e-8, 1e-6, 1e-6)}
         yield Case("loss: regions", f"{name}, mean 1e4, deviation 1e-3", _region(shifted, label), canceling)
     large = torch.arange(side * side).view(side, side) * many // side**2
@@ -192,9 +191,7 @@ def _region_cases(quick: bool) -> Iterator[Case]:
     yield Case("loss: regions", "mixed precision, sum above 65504", mixed, HALF, HALF_NOTE)
 
 
-def _region(
-    features: Tensor, labels: Tensor, smooth: bool = False, narrow: bool = False
-) -> Callable[[], Problem]:
+def _region(features: Tensor, labels: Tensor, narrow: bool = False) -> Callable[[], Problem]:
     def compute(leaves: Maps) -> Maps:
         values = narrowed(leaves["features"]) if narrow else leaves["features"]
         return {"loss": region_variance_loss(values, labels.to(values.device))}
@@ -212,4 +209,4 @@ def _region(
         deviations = values - (sums / count[:, None])[region]
         return {"loss": deviations.square().sum() / valid.sum()}
 
-    return lambda: Problem({"features": features.clone()}, compute, reference, smooth=smooth)
+    return lambda: Problem({"features": features.clone()}, compute, reference)

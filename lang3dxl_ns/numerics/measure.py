@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,7 +21,6 @@ AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
 """Mixed-precision modes: inputs in float32, the component under autocast."""
 FLIP = 1e-4
 """A pixel off by more than this share of the largest value has a pair across a threshold."""
-_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,6 @@ class Problem:
     """The same in float64, written for clarity. Not finite where the component need not be."""
     thresholds: bool = False
     """Count pixels that flip across a threshold separately, and exclude them from the gradient."""
-    smooth: bool = False
-    """Also check the reference's gradient by finite differences."""
     constants: frozenset[str] = frozenset()
     """Leaves without a gradient."""
     output_scale: float = 0.0
@@ -90,12 +87,16 @@ class Row:
     output_rms: float
     gradient_max: float | None
     gradient_rms: float | None
-    finite_difference: float | None
     flipped: float
     finite: bool
     ms: float
     bounds: Bounds
     note: str
+
+    @property
+    def name(self) -> str:
+        """The component, the case and the mode."""
+        return f"{self.component}, {self.case}, {self.mode}"
 
     @property
     def misses(self) -> list[str]:
@@ -105,8 +106,6 @@ class Row:
             value = getattr(self, name)
             if value is not None and not value <= bound:
                 found.append(f"{name.replace('_', ' ')} {value:.1e} > {bound:.0e}")
-        if self.finite_difference is not None and not self.finite_difference < 1e-4:
-            found.append(f"finite difference {self.finite_difference:.1e} > 1e-4")
         return found
 
 
@@ -144,7 +143,6 @@ def measure(case: Case, mode: str, device: torch.device | str = "cpu", repeats: 
         output_rms=_worst(error.rms for error in outputs),
         gradient_max=_worst(error.max for error in slopes) if slopes else None,
         gradient_rms=_worst(error.rms for error in slopes) if slopes else None,
-        finite_difference=_finite_difference(problem, exact, upstream, exact_gradients),
         flipped=1 - _share(settled),
         finite=all(error.finite for error in (*outputs, *slopes)),
         ms=1e3 * sorted(seconds)[len(seconds) // 2],
@@ -246,25 +244,6 @@ def _gradients(outputs: Mapping[str, Tensor], leaves: Maps, upstream: Maps) -> M
     }
 
 
-def _finite_difference(problem: Problem, leaves: Maps, upstream: Maps, gradients: Maps) -> float | None:
-    """Relative difference of the reference's gradient from central differences, along a random direction."""
-    if not problem.smooth:
-        return None
-    generator = torch.Generator().manual_seed(1)
-    along = {}
-    for name in gradients:
-        direction = torch.randn(leaves[name].shape, generator=generator, dtype=torch.float64)
-        along[name] = direction.to(leaves[name].device)
-
-    def value(step: float) -> float:
-        moved = {name: leaf.detach() + step * along.get(name, 0.0) for name, leaf in leaves.items()}
-        outputs = problem.reference(moved)
-        return float(sum((outputs[name] * upstream[name]).sum() for name in outputs))
-
-    slope = float(sum((gradients[name] * direction).sum() for name, direction in along.items()))
-    return abs((value(_STEP) - value(-_STEP)) / (2 * _STEP) - slope) / max(abs(slope), 1e-12)
-
-
 def narrowed(values: Tensor) -> Tensor:
     """Rounded to autocast's number type, like the output of a layer; unchanged outside autocast."""
     device = values.device.type
@@ -278,12 +257,12 @@ def _precision(mode: str, device: torch.device | str) -> AbstractContextManager[
     return _tf32() if mode == "tf32" else nullcontext()
 
 
-class _tf32:
+@contextmanager
+def _tf32() -> Iterator[None]:
     """TF32 matrix products, on GPUs that have them."""
-
-    def __enter__(self) -> None:
-        self._before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision("high")
-
-    def __exit__(self, *_: object) -> None:
-        torch.set_float32_matmul_precision(self._before)
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)

@@ -26,7 +26,7 @@ DRIFT = 1.05
 class Run:
     """An optimization, in tenths of its steps."""
 
-    name: str
+    case: str
     steps: int
     converges: bool
     """Whether its loss must converge; its numbers must be finite in any case."""
@@ -37,6 +37,10 @@ class Run:
     """Largest code at the part's end."""
     finite: bool = True
     """Whether all parameters and moments are finite at the end of every part."""
+
+    @property
+    def name(self) -> str:
+        return f"optimization, {self.case}"
 
     @property
     def misses(self) -> list[str]:
@@ -61,7 +65,7 @@ def runs(quick: bool) -> list[Run]:
 
 
 def optimize(
-    name: str, steps: int, code_rate: float, grid_rate: float, decoder_rate: float, converges: bool = True
+    case: str, steps: int, code_rate: float, grid_rate: float, decoder_rate: float, converges: bool = True
 ) -> Run:
     """Adam as in training (epsilon 1e-15) at constant rates, on pixels of a few kinds of things."""
     generator = torch.Generator().manual_seed(0)
@@ -88,7 +92,7 @@ def optimize(
         adam.step()
         return loss.item()
 
-    run, start = Run(name, steps, converges), time.process_time()
+    run, start = Run(case, steps, converges), time.process_time()
     for _ in range(PARTS):
         losses = [step() for _ in range(steps // PARTS)]
         run.losses.append(math.fsum(losses) / len(losses))

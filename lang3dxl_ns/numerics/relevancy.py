@@ -33,7 +33,7 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
     }
     for name, (vectors, note) in features.items():
         bounds = FAR if name == "equal to a canonical phrase" else BOUNDS
-        yield Case("relevancy", name, partial(_problem, vectors, smooth=name == "usual"), bounds, note)
+        yield Case("relevancy", name, partial(_problem, vectors), bounds, note)
     note = "0.5; a cosine to nothing has no gradient"
     yield Case("relevancy", "zero vectors", partial(_problem, _with_zeros, outputs_only=True), BOUNDS, note)
     note = "NaN in its own pixel, nowhere else"
@@ -82,9 +82,7 @@ def _with_nan() -> Maps:
     return vectors
 
 
-def _problem(
-    vectors: Callable[[], Maps], temperature: float = 10.0, smooth: bool = False, outputs_only: bool = False
-) -> Problem:
+def _problem(vectors: Callable[[], Maps], temperature: float = 10.0, outputs_only: bool = False) -> Problem:
     leaves = vectors()
 
     def compute(given: Maps) -> Maps:
@@ -97,7 +95,7 @@ def _problem(
 
     constants = frozenset(leaves) if outputs_only else frozenset[str]()
     # A feature parallel to a phrase has zero slope towards it.
-    return Problem(leaves, compute, reference, smooth=smooth, constants=constants, gradient_scale=0.01)
+    return Problem(leaves, compute, reference, constants=constants, gradient_scale=0.01)
 
 
 def relevancy_reference(features: Tensor, queries: Tensor, canonical: Tensor, temperature: float) -> Tensor:

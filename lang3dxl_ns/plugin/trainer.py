@@ -40,11 +40,7 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.preparation.needs import write_needs
 from lang3dxl_ns.query.kept_words import with_words_of
-from lang3dxl_ns.query.run_checkpoint import (
-    NOT_A_CHECKPOINT,
-    check_checkpoint,
-    read_checkpoint,
-)
+from lang3dxl_ns.query.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
 
@@ -175,7 +171,7 @@ class Lang3DXLTrainer(Trainer):
                 self.optimizers.load_schedulers(state["schedulers"])
             if state["scalers"]:  # empty in a run without a loss scale
                 self.grad_scaler.load_state_dict(state["scalers"])
-        except (*NOT_A_CHECKPOINT, AssertionError) as error:
+        except NOT_A_CHECKPOINT as error:
             raise UserError(
                 f"{path} is not a checkpoint of lang3dxl ({error}): give --load-dir the "
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"

@@ -28,8 +28,6 @@ class Crops:
 
     sides: list[int]
     """Pixels, ascending."""
-    sizes: list[float]
-    """Sides in world units, or in photo widths."""
     steps: int
     """Crops per side of the smallest; others have two."""
 
@@ -67,16 +65,16 @@ def choose_crops(
     least = 0.0 if quality == "fine" else _LEAST_SHARE * input_side
     smallest = float(SMALLEST_CROP)
     while True:
-        sides, sizes = crop_sides(scales, pixel_size, width, smallest)
+        sides = crop_sides(scales, pixel_size, width, smallest)
         if is_fine:
-            sides, sizes = fine_crops(sides[0], sizes[0])
+            sides = fine_crops(sides[0])
         if sides[0] >= min(least, width):
             for steps in (THIRD, HALF) if is_fine else (HALF,):
-                crops = Crops(sides, sizes, steps)
+                crops = Crops(sides, steps)
                 if crops.count(height, width) <= most or smallest >= width:
                     return crops
         if smallest >= width:
-            return Crops(sides, sizes, HALF)
+            return Crops(sides, HALF)
         smallest = max(smallest, sides[-1] if is_fine else sides[0]) * _GROWTH
 
 

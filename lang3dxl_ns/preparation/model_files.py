@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, in_a_line
 from lang3dxl_ns.common.files import check_regular, expanded
 
 CLIP_OPTION = "--pipeline.datamanager.clip"
@@ -156,8 +156,7 @@ def whole(problem: str, remedy: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        reason = " ".join(str(error).split())[:300] or type(error).__name__
-        raise UserError(f"{problem} ({reason}): {remedy}") from error
+        raise UserError(f"{problem} ({in_a_line(error, 300)}): {remedy}") from error
 
 
 def _download(name: str, option: str) -> Path:

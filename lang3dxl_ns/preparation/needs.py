@@ -98,7 +98,7 @@ def _pyramid_levels(photos: Sequence[Photo], crops: CropPlan) -> Need:
     """Levels are clipped to 32 pixels and to the photo; duplicates are never made."""
     measured = f"distinct pyramid levels per photo, mean over the photos, of {len(crops.scales)}"
     sizes = {p.name: 1 / p.width for p in photos} if crops.pixel_sizes is None else crops.pixel_sizes
-    value = float(np.mean([len(crop_sides(crops.scales, sizes[p.name], p.width)[0]) for p in photos]))
+    value = float(np.mean([len(crop_sides(crops.scales, sizes[p.name], p.width)) for p in photos]))
     return Need("pyramid levels", value > 1, measured, value, 1.0)
 
 

@@ -113,24 +113,19 @@ def relative_scales(
 
 def crop_sides(
     scales: Sequence[float], pixel_size: float, width: int, smallest: float = SMALLEST_CROP
-) -> tuple[list[int], list[float]]:
-    """Crop sides in pixels of a photo of `width` pixels, and their sizes in world units after clipping.
+) -> list[int]:
+    """Crop sides in pixels of a photo of `width` pixels, ascending.
 
     Sides are clipped to `smallest` … `width` pixels; duplicates are dropped, so that a photo can have fewer
     crops than there are scales. For relative scales the pixel size is 1 / width.
     """
-    sizes: dict[int, float] = {}
-    for scale in sorted(scales):
-        side = min(max(scale / pixel_size, smallest), width)
-        sizes.setdefault(math.floor(side + 1e-6), side * pixel_size)  # 0.47 / 0.01 is 46.99…
-    return list(sizes), list(sizes.values())
+    sides = (min(max(scale / pixel_size, smallest), width) for scale in sorted(scales))
+    return list(dict.fromkeys(math.floor(side + 1e-6) for side in sides))  # 0.47 / 0.01 is 46.99…
 
 
-def fine_crops(side: int, size: float) -> tuple[list[int], list[float]]:
-    """Sides in pixels and sizes in world units of fine crops, as from `crop_sides`: the smallest of a photo's
-    pyramid, and smaller ones."""
-    fine = max(round(FINE_SHARE * side), 2)
-    return [fine, side], [size * fine / side, size]
+def fine_crops(side: int) -> list[int]:
+    """Sides in pixels of fine crops: the smallest of a photo's pyramid, and smaller ones."""
+    return [max(round(FINE_SHARE * side), 2), side]
 
 
 def propose_scale_range(reconstruction: Reconstruction, pixel_sizes: dict[str, float]) -> ScaleRange:

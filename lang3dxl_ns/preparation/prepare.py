@@ -301,7 +301,6 @@ def _encode(
         target = build_clip_target(
             clip.in_known_light(image),
             task.crops.sides,
-            task.crops.sizes,
             clip.encode_images,
             clip.crop_size,
             crop_batch,

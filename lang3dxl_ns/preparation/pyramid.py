@@ -24,15 +24,6 @@ class ClipTarget:
     """Mean embedding, float32, as output by the encoder (not normalized)."""
     valid: Float[Tensor, "hd wd"]
     """Mean share of the crops' area inside the photo, 0..1; the rest of a crop is black."""
-    crop_sides: list[int]
-    """Side of each scale's crops in pixels."""
-    scales: list[float]
-    """Side of each scale's crops in world units (or as a fraction of the width)."""
-
-    @property
-    def range_factor(self) -> float:
-        """Ratio of the largest to the smallest scale."""
-        return max(self.scales) / min(self.scales)
 
 
 HALF, THIRD = 2, 3
@@ -80,7 +71,6 @@ def iterate_crops(
 def build_clip_target(
     photo: Float[Tensor, "h w 3"],
     crop_sides: Sequence[int],
-    scales: Sequence[float],
     encode: Callable[[Float[Tensor, "n 3 s s"]], Float[Tensor, "n c"]],
     crop_size: int,
     batch_size: int,
@@ -88,21 +78,18 @@ def build_clip_target(
 ) -> ClipTarget:
     """Encode the crops of every scale and average the scales on the finest scale's grid.
 
-    `photo` holds RGB in 0..1; `crop_sides` (pixels) and `scales` (world units) correspond, as returned by
-    `crop_sides()` of physical_scale; `encode` takes crops of `crop_size` pixels in 0..1; `steps`: of the
-    finest scale's crops per side, others have two. All scales have equal weight. Raises ValueError if the two
-    lists differ in length. Method: Lang3D-XL, average over scales.
+    `photo` holds RGB in 0..1; `crop_sides` are pixels, a side per scale; `encode` takes crops of `crop_size`
+    pixels in 0..1; `steps`: of the finest scale's crops per side, others have two. All scales have equal
+    weight. Method: Lang3D-XL, average over scales.
     """
-    if len(crop_sides) != len(scales) or not scales:
-        raise ValueError(f"one scale per crop side is needed: {len(crop_sides)} sides, {len(scales)} scales")
     finest = valid_fractions(photo.shape[0], photo.shape[1], min(crop_sides), steps).shape
     total = torch.zeros(())
     for side in crop_sides:
         own_steps = steps if side == min(crop_sides) else HALF
         grid = _encode_scale(photo, side, encode, crop_size, batch_size, own_steps)
         total = total + F.interpolate(grid[None], finest, mode="bilinear", align_corners=False)[0]
-    mean = (total / len(scales)).permute(1, 2, 0)
-    return ClipTarget(mean[..., :-1].contiguous(), mean[..., -1].contiguous(), list(crop_sides), list(scales))
+    mean = (total / len(crop_sides)).permute(1, 2, 0)
+    return ClipTarget(mean[..., :-1].contiguous(), mean[..., -1].contiguous())
 
 
 def _encode_scale(

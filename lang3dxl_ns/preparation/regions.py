@@ -11,11 +11,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.image import fitted_size, resize
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.model_files import ModelFiles
 from lang3dxl_ns.preparation.sam3 import Sam3
@@ -100,11 +100,8 @@ class SamRegions:
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
         """As `RegionSource.labels`."""
-        small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
-        masks = [_nearest(mask, label_size(*mask.shape)) for mask in self._sam.masks(small)]
-        if not masks:
-            return torch.full(label_size(*small.shape[:2]), -1)
-        return label_map(torch.stack(masks), self._level)
+        small = _bytes(_shrunk(image, _SAM_SIDE))
+        return _combined(self._sam.masks(small), small, self._level)
 
     @cached_property
     def _sam(self) -> AutomaticSam:
@@ -131,13 +128,9 @@ class TextRegions:
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
         """As `RegionSource.labels`."""
-        small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
-        masks = torch.cat([masks for masks, _ in self._sam.instances(small, self._prompts)])
-        if not len(masks):
-            return torch.full(label_size(*small.shape[:2]), -1)
-        return label_map(
-            torch.stack([_nearest(mask, label_size(*mask.shape)) for mask in masks]), self._level
-        )
+        small = _bytes(_shrunk(image, _SAM_SIDE))
+        found = self._sam.instances(small, self._prompts)
+        return _combined([mask for masks, _ in found for mask in masks], small, self._level)
 
     @cached_property
     def _sam(self) -> Sam3:
@@ -163,6 +156,15 @@ class FolderRegions:
         path = companion(self._folder, photo.name, LABEL_SUFFIXES)
         assert path is not None, "settings() found it"
         return photo.undistort_labels(_numbered(_read_labels(path, photo.name)))
+
+
+def _combined(
+    masks: Sequence[Bool[Tensor, "h w"]], image: UInt8[Tensor, "h w 3"], level: RegionLevel
+) -> Int[Tensor, "hl wl"]:
+    """Labels of an image at the stored size, from its masks."""
+    size = label_size(*image.shape[:2])
+    small = [_nearest(mask, size) for mask in masks]
+    return label_map(torch.stack(small), level) if small else torch.full(size, -1)
 
 
 def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "h w"]:
@@ -225,10 +227,8 @@ def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
 
 def _shrunk(image: Float[Tensor, "h w 3"], longer_side: int) -> Float[Tensor, "hs ws 3"]:
     """The image on the CPU, averaged down to at most `longer_side` pixels."""
-    height, width = image.shape[:2]
-    shrink = longer_side / max(height, width)
-    if shrink >= 1:
-        return image.cpu()
-    size = max(round(height * shrink), 1), max(round(width * shrink), 1)
-    planes = F.interpolate(image.permute(2, 0, 1)[None], size, mode="bilinear", antialias=True)
-    return planes[0].permute(1, 2, 0).contiguous().clamp(0, 1).cpu()
+    return resize(image, fitted_size(image, longer_side)).contiguous().clamp(0, 1).cpu()
+
+
+def _bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
+    return (image * 255).round().to(torch.uint8)

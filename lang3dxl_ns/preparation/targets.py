@@ -29,11 +29,6 @@ class StoredClipTarget:
     crop_fractions: list[float]
     """Crop sides as fractions of the photo's width, ascending."""
 
-    @property
-    def range_factor(self) -> float:
-        """Ratio of the largest to the smallest crop."""
-        return self.crop_fractions[-1] / self.crop_fractions[0]
-
 
 @dataclass
 class ChannelStatistics:

@@ -21,7 +21,7 @@ from jaxtyping import Float, Float32, Shaped
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.rendering.splats import Splats, harmonics_of
@@ -31,11 +31,6 @@ _IN_FOLDERS = ("*.ckpt", "nerfstudio_models/*.ckpt", "ckpts/*.pt", "point_cloud/
 """Where programs leave splats in the folder of a run."""
 _MOST_DAMAGE = 0.5
 """Share of Gaussians with NaN or infinite values above which a file is refused."""
-_DAMAGE = (
-    *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    *(MemoryError, struct.error, AssertionError),
-)
-"""Exceptions raised on reading values that a splat file doesn't have."""
 _HEADER = 1 << 16
 """Most bytes of a PLY's header."""
 _ALL_BANDS = 16
@@ -84,8 +79,8 @@ def read_splats(path: str | Path) -> Splats:
         raise UserError(f"{path} is not a splat: {error}") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    except _DAMAGE as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+    except DAMAGE as error:
+        reason = in_a_line(error)
         raise UserError(f"{path} is damaged or incomplete ({reason}): copy or export it again") from error
     return _finite(splats, path)
 

@@ -211,15 +211,11 @@ def cosines_of_codes(
 def relevancy_of_codes(
     decode: Decode,
     codes: Float[Tensor, "... code"],
-    queries: Float[Tensor, "q c"] | Queries,
-    canonical: Float[Tensor, "p c"] | None = None,
+    queries: Queries,
     temperature: float = TEMPERATURE,
     max_mb: float = 256.0,
 ) -> Float[Tensor, "q ..."]:
-    """Exact relevancy of rendered codes to `Queries`, or to plain vectors against `canonical` ones."""
-    if not isinstance(queries, Queries):
-        assert canonical is not None, "plain query vectors need canonical ones to compete with"
-        queries = Queries.of(queries[:, None].unbind(), canonical)
+    """Exact relevancy of rendered codes."""
     flat = codes.reshape(-1, codes.shape[-1])
     cosines = cosines_of_codes(decode, flat, queries, max_mb)
     return queries.relevancy_of_cosines(cosines, temperature).reshape(len(queries), *codes.shape[:-1])

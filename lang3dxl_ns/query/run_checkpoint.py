@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import struct
 import zipfile
 import zlib
 from pathlib import Path
@@ -12,14 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import check_regular
 
-NOT_A_CHECKPOINT = (
-    *(OSError, EOFError, RuntimeError, pickle.UnpicklingError),
-    *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError),
-    *(MemoryError, struct.error),
-)
+NOT_A_CHECKPOINT = (*DAMAGE, pickle.UnpicklingError)
 """Exceptions raised on reading a file that is not a checkpoint."""
 
 

@@ -22,8 +22,8 @@ from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
 
-from lang3dxl_ns.common.checks import is_coordinate
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.checks import expect, is_coordinate
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
@@ -133,7 +133,7 @@ class SceneFile:
             if content.pop("version") != _VERSION:
                 raise ValueError("another version wrote it")
             return scene_from_json(content)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except DAMAGE as error:
             raise UserError(f"{path} can't be read ({error}): restore it, or train anew") from error
 
     def photo(self, name: str) -> ScenePhoto:
@@ -168,31 +168,26 @@ def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
 
 def _checked(scene: SceneFile) -> SceneFile:
     """The scene, after validating all its values. Raises ValueError."""
-    _expect(scene.photos != [], "it lists no photo")
+    expect(scene.photos != [], "it lists no photo")
     for photo in scene.photos:
-        _expect(is_name(photo.name), f"a photo is called {photo.name!r}")
-        _expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
-        _expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
-        _expect(len(photo.camera_to_world) == 3, f"{photo.name} has no pose")
+        expect(is_name(photo.name), f"a photo is called {photo.name!r}")
+        expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
+        expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
+        expect(len(photo.camera_to_world) == 3, f"{photo.name} has no pose")
         check_pose(photo.camera_to_world)
         photo.lens.check()
         if photo.size is not None:
-            _expect(len(photo.size) == 2, f"{photo.name} has the size {photo.size}")
+            expect(len(photo.size) == 2, f"{photo.name} has the size {photo.size}")
             replace(photo.lens, width=photo.size[0], height=photo.size[1]).check()
-    _expect(len({photo.name for photo in scene.photos}) == len(scene.photos), "a photo is listed twice")
+    expect(len({photo.name for photo in scene.photos}) == len(scene.photos), "a photo is listed twice")
     for text in (scene.clip, scene.clip_identity):
-        _expect(isinstance(text, str | None), f"its CLIP is {text!r}")
-    _expect(isinstance(scene.data, str), f"its data are in {scene.data!r}")
-    _expect(
+        expect(isinstance(text, str | None), f"its CLIP is {text!r}")
+    expect(isinstance(scene.data, str), f"its data are in {scene.data!r}")
+    expect(
         isinstance(scene.scale, float | int) and 0 < scene.scale < math.inf, f"its scale is {scene.scale!r}"
     )
-    _expect(_is_transform(scene.transform), "it has no transform")
+    expect(_is_transform(scene.transform), "it has no transform")
     return scene
-
-
-def _expect(holds: bool, otherwise: str) -> None:
-    if not holds:
-        raise ValueError(otherwise)
 
 
 def _is_transform(rows: object) -> bool:
@@ -207,9 +202,9 @@ def read_camera_path(path: Path) -> Sequence[Camera]:
     try:
         content = read_json(path)
         width, height = int(content["render_width"]), int(content["render_height"])
-        _expect(content["camera_path"] != [], "it has no camera")
+        expect(content["camera_path"] != [], "it has no camera")
         return [_path_camera(frame, width, height) for frame in content["camera_path"]]
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, ArithmeticError, AttributeError) as error:
+    except DAMAGE as error:
         raise UserError(
             f"{path} is not a camera path ({error!r}): save one in the viewer (Render tab, Save Path)"
         ) from error
@@ -218,7 +213,7 @@ def read_camera_path(path: Path) -> Sequence[Camera]:
 def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
     pose = torch.tensor(frame["camera_to_world"], dtype=torch.float32).reshape(4, 4)
     check_pose(pose.tolist())
-    _expect(0 < frame["fov"] < 180, f"a camera has a field of view of {frame['fov']} degrees")
+    expect(0 < frame["fov"] < 180, f"a camera has a field of view of {frame['fov']} degrees")
     focal = height / 2 / math.tan(math.radians(frame["fov"]) / 2)
     lens = Lens(width, height, focal, focal, width / 2, height / 2)
     lens.check()

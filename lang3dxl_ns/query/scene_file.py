@@ -25,8 +25,9 @@ from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
+from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.device import best_device
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import Decoder
@@ -254,19 +255,12 @@ def _reported(path: Path) -> Iterator[None]:
         yield
     except _NewerError as error:
         raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
-    except (OSError, UserError, *_DAMAGE) as error:
-        raise UserError(f"{path} is not a readable scene ({_short(error)}): copy it again") from error
+    except (UserError, *DAMAGE) as error:
+        raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): copy it again") from error
 
 
 class _NewerError(Exception):
     """The file's format version is unknown."""
-
-
-_DAMAGE = (
-    *(ValueError, LookupError, TypeError, AttributeError),
-    *(ArithmeticError, RecursionError, RuntimeError, MemoryError),
-)
-"""Exceptions raised on reading values that a scene doesn't have."""
 
 
 @dataclass(frozen=True)
@@ -322,11 +316,11 @@ def _description(file: Any) -> _Description:
     if content["version"] != VERSION:
         raise _NewerError(content["version"])
     provenance = Provenance(**content["provenance"])
-    _expect(all(isinstance(text, str) for text in vars(provenance).values()), "its origin is no text")
+    expect(all(isinstance(text, str) for text in vars(provenance).values()), "its origin is no text")
     background = content["background"]
     if background is not None:
-        _expect(len(background) == 3 and all(0 <= float(x) <= 1 for x in background), "its background")
-    _expect(isinstance(content["antialiased"], bool), "antialiased")
+        expect(len(background) == 3 and all(0 <= float(x) <= 1 for x in background), "its background")
+    expect(isinstance(content["antialiased"], bool), "antialiased")
     return _Description(
         scene_from_json(content["scene"]),
         provenance,
@@ -345,21 +339,21 @@ def _sizes(file: Any) -> dict[str, list[int]]:
 
 def _splats(file: Any, sizes: Mapping[str, list[int]], antialiased: bool) -> Splats:
     count, bands = sizes["means"][0], sizes["harmonics"][1]
-    _expect(bands in (1, 4, 9, 16), f"{bands} harmonics")
+    expect(bands in (1, 4, 9, 16), f"{bands} harmonics")
     wanted = {"means": [count, 3], "quats": [count, 4], "log_scales": [count, 3]}
     wanted |= {"logits": [count], "harmonics": [count, bands, 3]}
     for name, size in wanted.items():
-        _expect(sizes[name] == size, f"{name} has the shape {sizes[name]}")
+        expect(sizes[name] == size, f"{name} has the shape {sizes[name]}")
     means, quats, scales, opacities, harmonics = (_tensor(file, name) for name in wanted)
     return Splats(means, quats, scales.exp(), opacities.sigmoid(), harmonics, antialiased)
 
 
 def _codes(file: Any, sizes: Mapping[str, list[int]], bounded: bool, count: int) -> Float[Tensor, "n d"]:
-    _expect(len(sizes["codes"]) == 2 and sizes["codes"][0] == count, "its codes")
+    expect(len(sizes["codes"]) == 2 and sizes["codes"][0] == count, "its codes")
     stored: UInt16[Array, "n d"] = file.get_tensor("codes")
     if not bounded:
         return torch.from_numpy(stored).float()
-    _expect(stored.dtype == np.uint16, "its codes")
+    expect(stored.dtype == np.uint16, "its codes")
     places = torch.from_numpy(stored.astype(np.float64))
     codes = ((places - 1) / 65534).clamp(1e-9, 1 - 1e-9).logit().float()
     return torch.where(places == _UNKNOWN_CODE, torch.nan, codes)
@@ -368,10 +362,10 @@ def _codes(file: Any, sizes: Mapping[str, list[int]], bounded: bool, count: int)
 def _decoder(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> Decoder:
     settings, clip, dense = told["settings"] or {}, told["clip_dim"], told["dense_dim"]
     for value in (clip, dense, *settings.values()):
-        _expect(isinstance(value, int | float | str), f"a decoder has the setting {value!r}")
-        _expect(isinstance(value, str) or 0 <= value <= _MOST_SETTING, f"a decoder has the setting {value}")
+        expect(isinstance(value, int | float | str), f"a decoder has the setting {value!r}")
+        expect(isinstance(value, str) or 0 <= value <= _MOST_SETTING, f"a decoder has the setting {value}")
     stored = sum(prod(size) for name, size in sizes.items() if name.startswith("decoder."))
-    _expect(
+    expect(
         _parameters(settings, clip + dense) <= 4 * stored + 10_000_000, "its decoder is larger than the file"
     )
     decoder = make_decoder(
@@ -388,7 +382,7 @@ def _parameters(settings: Mapping[str, Any], channels: int) -> int:
     if not settings:
         return 1000 * channels + channels**2
     depth, width = settings["hidden_layers"], settings["hidden_width"]
-    _expect(
+    expect(
         max(settings["log2_table_size"], settings["levels"], depth) <= 64, "its decoder has too many layers"
     )
     table = settings["levels"] * 2 ** int(settings["log2_table_size"]) * settings["features_per_level"]
@@ -397,15 +391,15 @@ def _parameters(settings: Mapping[str, Any], channels: int) -> int:
 
 
 def _vectors(file: Any, sizes: Mapping[str, list[int]], words: list[str]) -> dict[str, Float[Tensor, " c"]]:
-    _expect(isinstance(words, list) and all(isinstance(word, str) for word in words), "its words")
-    _expect(len(sizes["words"]) == 2 and sizes["words"][0] == len(words), "its words")
+    expect(isinstance(words, list) and all(isinstance(word, str) for word in words), "its words")
+    expect(len(sizes["words"]) == 2 and sizes["words"][0] == len(words), "its words")
     return dict(zip(words, F.normalize(_tensor(file, "words"), dim=1), strict=True))
 
 
 def _looks(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> AppearanceField:
     names, config = told["names"], AppearanceConfig(**told["config"])
-    _expect(isinstance(names, list) and all(isinstance(name, str) for name in names), "its looks' photos")
-    _expect(sizes["looks.vectors"] == [len(names), config.vector_dim], "its looks")
+    expect(isinstance(names, list) and all(isinstance(name, str) for name in names), "its looks' photos")
+    expect(sizes["looks.vectors"] == [len(names), config.vector_dim], "its looks")
     field = AppearanceField(config, names, torch.zeros(3), 1.0)
     return _loaded(file, sizes, "looks", field, {"_extra_state": names})
 
@@ -421,7 +415,7 @@ def _loaded(
     tensors = {}
     for key, value in module.state_dict().items():
         if isinstance(value, Tensor):
-            _expect(sizes.get(f"{name}.{key}") == list(value.shape), f"{name}.{key} has the wrong shape")
+            expect(sizes.get(f"{name}.{key}") == list(value.shape), f"{name}.{key} has the wrong shape")
             tensors[key] = torch.from_numpy(file.get_tensor(f"{name}.{key}"))
     module.load_state_dict({**tensors, **(state or {})})
     return module.eval().requires_grad_(False)
@@ -430,18 +424,9 @@ def _loaded(
 def _checked_mask(stored: Shaped[Array, " b"]) -> bytes:
     content = stored.astype(np.uint8).tobytes()
     with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
-        _expect(image.width * image.height <= MOST_PIXELS, "a mask is too large")
+        expect(image.width * image.height <= MOST_PIXELS, "a mask is too large")
     return content
 
 
 def _tensor(file: Any, name: str) -> Float[Tensor, "n ..."]:
     return torch.from_numpy(file.get_tensor(name)).float()
-
-
-def _expect(holds: bool, otherwise: str) -> None:
-    if not holds:
-        raise ValueError(otherwise)
-
-
-def _short(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import TrackedPhoto
@@ -48,7 +48,7 @@ def read_novel_views(scene: Path) -> NovelViews | None:
         content = read_json(path)
         cameras = [_tracked(view) for view in content["views"]]
         return NovelViews(path.parent, cameras, bool(content["same_light"]))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
+    except DAMAGE as error:
         raise UserError(f"{path} is damaged ({error!r}): make the scene again, or remove the file") from error
 
 

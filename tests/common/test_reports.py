@@ -1,4 +1,4 @@
-"""Benchmark reports: machine line, interleaved times, peak memory, atomic writes."""
+"""Benchmark reports: machine line, interleaved times, atomic writes."""
 
 import json
 import os
@@ -10,12 +10,10 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.reports import (
-    MEBIBYTE,
     command_line,
     describe_machine,
     interleaved_times,
     markdown_table,
-    peak_memory,
     write_report,
 )
 
@@ -58,21 +56,6 @@ def test_a_candidate_over_its_budget_stops_and_keeps_what_it_has():
     candidates = {"quick": taking(1), "slow": taking(4), "slower": taking(30)}
     times = interleaved_times(candidates, repeats=5, budget_seconds=10, clock=lambda: now[0])
     assert times == {"quick": [1] * 5, "slow": [4, 4, 4], "slower": [30]}
-
-
-def hold_megabytes(megabytes):
-    """Work that holds two tensors, after a set-up that held (and freed) eight times as much."""
-    torch.ones(16 * megabytes * MEBIBYTE // 4).sum()
-
-    def work():
-        first = torch.ones(megabytes * MEBIBYTE // 4)
-        return first + 1
-
-    return work
-
-
-def test_peak_memory_counts_what_the_work_holds_and_not_its_setup():
-    assert peak_memory(hold_megabytes, 50) / MEBIBYTE == pytest.approx(100, abs=10)
 
 
 def test_table_has_a_line_for_each_row_and_a_dash_for_what_is_missing():

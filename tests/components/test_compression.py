@@ -5,6 +5,7 @@ from functools import partial
 import pytest
 import torch
 import torch.nn.functional as F
+from numerics.compression import compress
 
 from lang3dxl_ns.components import compression
 from lang3dxl_ns.components.compression import (
@@ -12,7 +13,6 @@ from lang3dxl_ns.components.compression import (
     CompressionConfig,
     Gathered,
     centered_cosine,
-    compress,
 )
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig

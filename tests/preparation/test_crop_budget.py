@@ -48,16 +48,10 @@ def test_a_quality_bounds_the_pixels_that_an_encoder_sees(size, is_fine, input_p
 def test_the_small_encoder_sees_the_demos_photos_as_without_a_budget(size, scale):
     side = input_side(PACKAGED_CLIP)
     fine = chosen(size, True, side, "normal", [scale, 2 * scale])
-    sides, sizes = crop_sides([scale, 2 * scale], 1 / size[0], size[0])
-    assert (fine.sides, fine.sizes) == fine_crops(sides[0], sizes[0]) and fine.steps == THIRD
+    sides = crop_sides([scale, 2 * scale], 1 / size[0], size[0])
+    assert fine.sides == fine_crops(sides[0]) and fine.steps == THIRD
     pyramid = chosen(size, False, side, "normal", [scale, 2 * scale])
-    assert (pyramid.sides, pyramid.sizes) == (sides, sizes)
-
-
-def test_larger_sides_keep_their_sizes_in_the_world():
-    crops = chosen((1600, 1200))
-    for side, size in zip(crops.sides, crops.sizes, strict=True):
-        assert size == pytest.approx(side / 1600, abs=1 / 1600)
+    assert pyramid.sides == sides
 
 
 def test_the_input_of_an_encoder_is_in_its_configuration(tmp_path):

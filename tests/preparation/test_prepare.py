@@ -100,8 +100,8 @@ def test_fine_crops_are_the_smallest_and_smaller_ones_on_a_finer_grid(photos, co
     pyramid = run(photos, config, store).reader.clip("north/b.png")
     reader = prepare(photos, None, config, SCALES, store, "cpu", fine=["north/b.png"]).reader
     clip = load_image_text_encoder(models["clip"], "cpu")
-    crops = [28, 40], [0.28, 0.4]  # 0.7 of 40 pixels and of 0.4 photo widths, and these
-    expected = build_clip_target(photos[1].read(), *crops, clip.encode_images, clip.crop_size, 64, steps=3)
+    crops = [28, 40]  # 0.7 of 40 pixels, and these
+    expected = build_clip_target(photos[1].read(), crops, clip.encode_images, clip.crop_size, 64, steps=3)
     found = reader.clip("north/b.png")
     torch.testing.assert_close(found.features, expected.features.half(), atol=2e-3, rtol=2e-3)
     assert found.crop_fractions == [0.28, 0.4]
@@ -112,12 +112,11 @@ def test_fine_crops_are_the_smallest_and_smaller_ones_on_a_finer_grid(photos, co
 def test_the_reader_gives_what_the_encoders_made(photos, config, store, models):
     targets = run(photos, config, store)
     clip = load_image_text_encoder(models["clip"], "cpu")
-    expected = build_clip_target(photos[1].read(), [40, 80], SCALES, clip.encode_images, clip.crop_size, 64)
+    expected = build_clip_target(photos[1].read(), [40, 80], clip.encode_images, clip.crop_size, 64)
     found = targets.reader.clip("north/b.png")
     torch.testing.assert_close(found.features, expected.features.half(), atol=2e-3, rtol=2e-3)
     torch.testing.assert_close(found.valid, expected.valid.half())
     assert found.crop_fractions == [0.4, 0.8]
-    assert found.range_factor == 2
     assert targets.reader.names == NAMES
     assert targets.encoded == 3
     assert targets.left_out == {}

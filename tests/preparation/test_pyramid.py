@@ -153,7 +153,7 @@ def slow_target(photo, sides, encode, size):
 @pytest.mark.parametrize("sides", [[32, 60, 110], [110, 33]])
 def test_the_target_equals_the_slow_loop(sides):
     photo = random_photo(70, 110)
-    target = build_clip_target(photo, sides, [float(side) for side in sides], mean_color, 24, batch_size=5)
+    target = build_clip_target(photo, sides, mean_color, 24, batch_size=5)
     expected = slow_target(photo, sides, mean_color, 24)
     assert target.features.dtype == torch.float32
     assert torch.allclose(target.features, expected[..., :3], atol=1e-5)
@@ -162,7 +162,7 @@ def test_the_target_equals_the_slow_loop(sides):
 
 def test_a_constant_photo_differs_only_where_crops_leave_it():
     photo = torch.full((200, 300, 3), 0.6)
-    target = build_clip_target(photo, [32, 64], [1.0, 2.0], mean_color, 32, batch_size=16)
+    target = build_clip_target(photo, [32, 64], mean_color, 32, batch_size=16)
     inside = target.valid > 1 - 1e-6
     assert 0.3 < inside.float().mean() < 1
     assert torch.allclose(target.features[inside], torch.tensor(0.6), atol=1e-5)
@@ -174,19 +174,17 @@ def test_every_scale_counts_the_same():
     target = build_clip_target(
         random_photo(128, 128),
         [32, 64, 128],
-        [0.5, 1.0, 2.0],
         lambda crops: torch.full((len(crops), 2), next(scale_of_call)),
         32,
         batch_size=10_000,
     )
     assert torch.allclose(target.features, torch.tensor(37.0))
-    assert (target.crop_sides, target.scales, target.range_factor) == ([32, 64, 128], [0.5, 1.0, 2.0], 4.0)
 
 
 def test_cells_lie_where_the_grid_says():
     height, width = 256, 384
     ramp = ((torch.arange(width) + 0.5) / width).expand(height, width)[..., None].expand(-1, -1, 3)
-    target = build_clip_target(ramp, [32, 64], [1.0, 2.0], mean_color, 32, batch_size=64)
+    target = build_clip_target(ramp, [32, 64], mean_color, 32, batch_size=64)
     rows, columns = target.features.shape[:2]
     expected = (torch.arange(columns) + 0.5) / columns
     middle = target.features[rows // 2, 4:-4, 0]
@@ -197,7 +195,7 @@ def test_a_finer_grid_has_the_coarse_ones_crops_between_its_own():
     """The same picture of a ramp, four times as many cells, each at its place."""
     height, width = 128, 192
     ramp = ((torch.arange(width) + 0.5) / width).expand(height, width)[..., None].expand(-1, -1, 3)
-    target = build_clip_target(ramp, [32], [1.0], mean_color, 32, batch_size=64, steps=4)
+    target = build_clip_target(ramp, [32], mean_color, 32, batch_size=64, steps=4)
     rows, columns = target.features.shape[:2]
     assert (rows, columns) == (16, 24)
     expected = (torch.arange(columns) + 0.5) / columns
@@ -212,11 +210,6 @@ def test_the_encoder_never_sees_more_than_a_batch_and_needs_no_gradient():
         return mean_color(crops)
 
     photo = random_photo(100, 100).requires_grad_()
-    target = build_clip_target(photo, [32, 50], [1.0, 1.5], encode, 16, batch_size=9)
+    target = build_clip_target(photo, [32, 50], encode, 16, batch_size=9)
     assert max(seen) == 9
     assert not target.features.requires_grad
-
-
-def test_sides_and_scales_must_go_together():
-    with pytest.raises(ValueError, match="2 sides, 1 scales"):
-        build_clip_target(random_photo(64, 64), [32, 40], [1.0], mean_color, 16, 4)

@@ -61,7 +61,8 @@ def test_chunks_change_nothing(vectors, max_mb):
     codes = torch.randn(7, 11, 3, generator=torch.Generator().manual_seed(1))
     _, queries, canonical = vectors
     expected = relevancy(field.decode_clip(codes).detach(), queries, canonical)
-    chunked = relevancy_of_codes(field.decode_clip, codes, queries, canonical, max_mb=max_mb)
+    prompts = Queries.of(queries[:, None].unbind(), canonical)
+    chunked = relevancy_of_codes(field.decode_clip, codes, prompts, max_mb=max_mb)
     torch.testing.assert_close(chunked, expected)
 
 

@@ -14,7 +14,7 @@ import torch
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.rendering import gsplat_build
-from lang3dxl_ns.rendering.gsplat_build import Extension, Need, Toolkit, build, find_toolkit
+from lang3dxl_ns.rendering.gsplat_build import Extension, Need, build, find_toolkit
 
 SOURCE = """
 #include <Python.h>
@@ -45,7 +45,7 @@ def tiny(tmp_path) -> Extension:
 @pytest.fixture
 def fake_compiler(monkeypatch):
     """Replaces the compiler by Python code that is given the build's folder as sys.argv[1]."""
-    monkeypatch.setattr(gsplat_build, "find_toolkit", lambda _: Toolkit(Path("/nowhere"), "13.2", False))
+    monkeypatch.setattr(gsplat_build, "find_toolkit", lambda _: Path("/nowhere"))
     monkeypatch.setattr(gsplat_build, "needs", lambda _=None: [])
 
     def install(code: str) -> None:
@@ -76,11 +76,11 @@ def test_the_environments_compiler_comes_before_the_systems(tmp_path, monkeypatc
 
     pip, system = toolkit(tmp_path / "pip", "13.2"), toolkit(tmp_path / "system", "13.0")
     old = toolkit(tmp_path / "old", "12.4")
-    monkeypatch.setattr(gsplat_build, "_toolkit_places", lambda _: [(pip, True), (system, False)])
-    assert find_toolkit("13.2") == Toolkit(pip, "13.2", True)
+    monkeypatch.setattr(gsplat_build, "_toolkit_places", lambda _: [pip, system])
+    assert find_toolkit("13.2") == pip
     shutil.rmtree(pip / "include")
-    assert find_toolkit("13.2") == Toolkit(system, "13.0", False)
-    monkeypatch.setattr(gsplat_build, "_toolkit_places", lambda _: [(old, False)])
+    assert find_toolkit("13.2") == system
+    monkeypatch.setattr(gsplat_build, "_toolkit_places", lambda _: [old])
     assert find_toolkit("13.2") is None
 
 
@@ -150,16 +150,20 @@ def test_two_builds_at_once_share_one(tiny, tmp_path, fake_compiler):
 def test_ctrl_c_ends_the_compilers_too(tiny, tmp_path, fake_compiler, monkeypatch):
     fake_compiler("import os, time; (f / 'pid').write_text(str(os.getpid())); time.sleep(60)")
 
-    def interrupted(process, folder, sources):
-        while not (folder / "pid").is_file() or not (folder / "pid").read_text():
+    wait = subprocess.Popen.wait
+    pid = tmp_path / "build" / "pid"
+
+    def interrupted(process, timeout=None):
+        monkeypatch.setattr(subprocess.Popen, "wait", wait)
+        while not pid.is_file() or not pid.read_text():
             time.sleep(0.01)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(gsplat_build, "_watch", interrupted)
+    monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt):
         build(tiny, tmp_path / "build", "8.6")
     with pytest.raises(ProcessLookupError):
-        os.kill(int((tmp_path / "build" / "pid").read_text()), 0)
+        os.kill(int(pid.read_text()), 0)
 
 
 def test_a_folder_that_cannot_be_written_is_named(tiny, tmp_path, fake_compiler):
@@ -214,7 +218,7 @@ def test_a_toolkit_with_the_whole_chain_of_links_is_linked(tmp_path):
     (tmp_path / "lib").mkdir()
     for name in ("libcudart.so.13", "libcudart.so.13.2.51"):
         (tmp_path / "lib" / name).touch()
-    tree = gsplat_build._link_tree(Toolkit(tmp_path, "13.2", True), tmp_path / "tree")
+    tree = gsplat_build._link_tree(tmp_path, tmp_path / "tree")
     assert (tree / "lib64" / "libcudart.so").resolve().parent == tmp_path / "lib"
 
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
 from lang3dxl_ns.demo.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
@@ -140,9 +140,10 @@ def _taken(orders: list[_Order], workers: int | None) -> Iterator[TakenPhoto]:
     workers = min(workers or os.cpu_count() or 1, len(orders))
     # Spawned processes: forked ones would inherit this one's threads and loaded libraries.
     context = multiprocessing.get_context("spawn")
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns) as bar, ProcessPoolExecutor(workers, mp_context=context) as pool:
-        yield from bar.track(pool.map(_take, orders), total=len(orders), description="taking photos")
+    with progress("taking photos", len(orders)) as advance, ProcessPoolExecutor(workers, context) as pool:
+        for photo in pool.map(_take, orders):
+            yield photo
+            advance()
 
 
 @lru_cache(maxsize=1)

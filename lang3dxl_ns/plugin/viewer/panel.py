@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import viser
 import viser.theme
@@ -115,7 +115,7 @@ class AskPanel(ViewerControl):
             watch=self._say,
         )
         self._asker, self._finder = Worker("ask"), Worker("find")
-        self._pipeline.model.answers = _Answers(self)
+        self._pipeline.model.answers = self
         if self._pipeline.query:
             self._question.value = self._pipeline.query
 
@@ -175,8 +175,17 @@ class AskPanel(ViewerControl):
 
     # ── showing ─────────────────────────────────────────────────────────────────────────────────────
 
-    def answer(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """Called by the render thread, which holds the lock."""
+    @property
+    def shows_bottleneck(self) -> bool:
+        """See `Answers`, which the panel is for the model."""
+        return self.conversation.shows_bottleneck
+
+    def channels(self) -> Tensor | None:
+        """See `Answers`."""
+        return self.conversation.channels()
+
+    def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
+        """See `Answers`. Called by the render thread, which holds the lock."""
         found = self.conversation.outputs(rendering, seconds)
         self._status.content = self.conversation.status()
         if self._first_frame:
@@ -226,20 +235,3 @@ def _place_camera(client: viser.ClientHandle, camera: Camera, target: tuple[floa
     with client.atomic():
         client.camera.position, client.camera.look_at = stand.position * SCALE, stand.look_at * SCALE
         client.camera.fov = stand.fov
-
-
-class _Answers:
-    """The panel's answers to renderings."""
-
-    def __init__(self, panel: AskPanel) -> None:
-        self._panel = panel
-
-    @property
-    def shows_bottleneck(self) -> bool:
-        return self._panel.conversation.shows_bottleneck
-
-    def channels(self) -> Tensor | None:
-        return self._panel.conversation.channels()
-
-    def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Any]:
-        return self._panel.answer(rendering, seconds)

@@ -8,7 +8,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.components.compression import CompressionConfig, compress
+from lang3dxl_ns.components.compression import CompressionConfig, assign, fit, seen_by_photos
+from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 from lang3dxl_ns.numerics.measure import Bounds, Case, Maps, Problem
 
@@ -35,6 +36,20 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
         note = "Gaussians of a millionth of a pixel are hardly ever drawn, and keep their first guess"
         faint = {"float32": Bounds(1.0, 0.4)}
         yield Case("compression", "masses from 1e-6 to 1e6", partial(_problem, masses=6.0), faint, note)
+
+
+def compress(
+    features: Tensor,
+    mass: Tensor,
+    field: SemanticField,
+    config: CompressionConfig,
+    generator: torch.Generator,
+    basis: PrincipalBasis | None = None,
+) -> Tensor:
+    """Codes of a field that is given, as `CompressedField` learns them for its own."""
+    config = config.grown(len(features))
+    sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
+    return assign(features, mass, field, fit(sample, field, config, generator), basis)
 
 
 def _problem(kinds: int = KINDS, size: float = 1.0, masses: float = 0.0, unseen: float = 0.0) -> Problem:

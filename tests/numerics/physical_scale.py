@@ -151,7 +151,7 @@ def _crops() -> Problem:
     """Scale lists by their definition, and crop sides for extreme pixel sizes."""
 
     def computed() -> list[float]:
-        sides = [crop_sides([0.3, 1.0], size, 640)[0] for size in (1e-300, 1e-9, 1e-3, 1e9, 1e300)]
+        sides = [crop_sides([0.3, 1.0], size, 640) for size in (1e-300, 1e-9, 1e-3, 1e9, 1e300)]
         return physical_scales(0.2, 3.0) + [float(side) for group in sides for side in group]
 
     scales = [float(LONG(0.2) * LONG(15) ** (LONG(i) / 7)) for i in range(8)]
