@@ -124,7 +124,7 @@ def _with_one(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d1"]:
 def _crops(photo: Photo, clip: ImageTextEncoder) -> Float[Tensor, "h w c"]:
     sides = [round(share * photo.shape[1]) for share in SIDES]
     lit = clip.in_known_light(photo)
-    target = build_clip_target(lit, sides, SIDES, clip.encode_images, clip.crop_size, 512, THIRD)
+    target = build_clip_target(lit, sides, clip.encode_images, clip.crop_size, 512, THIRD)
     return target.features.float()
 
 
