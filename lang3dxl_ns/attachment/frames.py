@@ -212,7 +212,8 @@ def _gray(splats: Splats, camera: Camera) -> tuple[Float[Tensor, "h w"], Bool[Te
     """The brightness of a rendering, and where there is one: what is behind the splat is not in it."""
     pose = camera.view_matrix.detach()
     colors = splats.colors(-pose[:3, :3].T @ pose[:3, 3]).mean(1, keepdim=True)
-    raster = rasterize(splats.gaussians, camera, colors, antialiased=splats.antialiased)
+    gaussians = splats.gaussians.seen_from(camera)
+    raster = rasterize(gaussians, camera, colors, antialiased=splats.antialiased)
     alpha = raster.alpha[..., 0].detach()
     return raster.image[..., 0], -F.max_pool2d(-alpha[None], 3, 1, 1)[0] > 0.8  # without the edges
 

@@ -111,7 +111,7 @@ class HalfImageProtocol:
         with torch.enable_grad():
             for _ in range(steps):
                 lit, shown = self.field(gaussians, colors, vector, everything)
-                image = rasterize(shown, view, lit, self.background, **settings).image
+                image = rasterize(shown.seen_from(view), view, lit, self.background, **settings).image
                 loss = rgb_loss(image.clamp(0.0, 1.0), left, mask, self.ssim_weight)
                 # Of the vector alone: the field's parameters get no gradient.
                 (vector.grad,) = torch.autograd.grad(loss, [vector])

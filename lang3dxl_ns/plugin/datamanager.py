@@ -156,7 +156,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def create_train_dataset(self) -> PhotoDataset:
         dataset = self._dataset(self.train_dataparser_outputs)
-        SceneFacts([photo.name for photo in dataset.photos]).into(dataset.metadata)
+        positions = dataset.cameras.camera_to_worlds[..., 3]
+        SceneFacts([photo.name for photo in dataset.photos], positions).into(dataset.metadata)
         return dataset
 
     def create_eval_dataset(self) -> PhotoDataset:

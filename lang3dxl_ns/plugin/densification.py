@@ -8,7 +8,10 @@ from typing import Any
 import torch
 from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import remove
+from jaxtyping import Float
 from torch import Tensor
+
+from lang3dxl_ns.components.bounds import near_cameras
 
 _BEYOND = 1.1
 """Growth may exceed the cap by this factor before the least opaque Gaussians make room."""
@@ -24,6 +27,10 @@ class Densification(DefaultStrategy):
     """Number of Gaussians not to exceed; 0: no limit."""
     still: int = 0
     """The first Gaussians, the sky's, which neither grow nor go."""
+    cameras: Float[Tensor, "p 3"] | None = None
+    """Positions of the training cameras, around which Gaussians are pruned."""
+    free: float = 0.0
+    """How far around them, world units."""
     loss_scale: float = 1.0
     """Factor in the latest step's gradients, under mixed precision."""
 
@@ -69,14 +76,17 @@ class Densification(DefaultStrategy):
             self.grow_grad2d = usual
 
     def _prune_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> int:
-        """Beyond the cap the least opaque go."""
+        """Those at a camera go and, beyond the cap, the least opaque."""
         pruned = super()._prune_gs(params, optimizers, state, step)
-        excess = len(params["means"]) - max(self.most, self.still)
-        if not self.most or excess <= 0:
-            return pruned
-        opacities = params["opacities"].detach().flatten().clone()
-        opacities[: self.still] = float("inf")
-        least = opacities.topk(excess, largest=False).indices
-        gone = torch.zeros(len(params["means"]), dtype=torch.bool, device=least.device)
-        remove(params=params, optimizers=optimizers, state=state, mask=gone.index_fill_(0, least, True))
-        return pruned + excess
+        means, opacities = params["means"].detach(), params["opacities"].detach().flatten()
+        gone = torch.zeros_like(opacities, dtype=torch.bool)
+        if self.cameras is not None:
+            gone = near_cameras(means, self.cameras, self.free)
+        gone[: self.still] = False
+        excess = len(means) - int(gone.sum()) - max(self.most, self.still)
+        if self.most and excess > 0:
+            opacities = opacities.masked_fill(gone, float("inf"))
+            opacities[: self.still] = float("inf")
+            gone[opacities.topk(excess, largest=False).indices] = True
+        remove(params=params, optimizers=optimizers, state=state, mask=gone)
+        return pruned + int(gone.sum())

@@ -22,6 +22,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
+from lang3dxl_ns.components.bounds import FREE, keep_in_bounds
 from lang3dxl_ns.components.initialization import color_parameters, initial_gaussians, seed_positions
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
@@ -58,6 +59,7 @@ class Lang3DXLModel(RenderingModel):
         first = initial_gaussians(means, colors, c.sky_gaussians, c.sh_degree)
         self.gauss_params = nn.ParameterDict(first)
         self.strategy = make_strategy(self.config)
+        self.strategy.cameras, self.strategy.free = self.facts.positions, FREE * self.extent[1]
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
         for component in COMPONENTS:
             if component.wanted(self.config, self.facts):
@@ -83,7 +85,7 @@ class Lang3DXLModel(RenderingModel):
 
     def step_post_backward(self, step: int) -> None:
         """After an iteration: densify and prune (except at step 0, where the strategy would reset opacities,
-        and after a skipped step); write the sky's colors."""
+        and after a skipped step); keep Gaussians in bounds; write the sky's colors."""
         if step > 0 and self.step_is_sound:
             before = self.num_points
             self.strategy.step_post_backward(
@@ -91,6 +93,7 @@ class Lang3DXLModel(RenderingModel):
             )
             if self.num_points != before:
                 CONSOLE.log(f"Step {step}: {before} → {self.num_points} Gaussians")
+        keep_in_bounds(self.gauss_params, *self.extent, self.strategy.still, self.config.sh_degree)
         if self.sky is not None:
             with torch.no_grad():
                 colors = color_parameters(self.sky.colors, self.config.sh_degree)

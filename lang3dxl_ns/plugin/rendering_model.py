@@ -293,11 +293,11 @@ class RenderingModel(SplatfactoModel):
         moves = self.config.feature_gradient_to_geometry and features is not None
         if in_photo is gaussians and not moves:
             raster = rasterize(
-                gaussians, view, colors, background,
+                gaussians.seen_from(view), view, colors, background,
                 features=features, render_depth=depth, absgrad=absgrad, **settings,
             )  # fmt: skip
             return raster, background
-        photo = rasterize(in_photo, view, colors, background, absgrad=absgrad, **settings)
+        photo = rasterize(in_photo.seen_from(view), view, colors, background, absgrad=absgrad, **settings)
         if features is None and not depth:
             return photo, background
         # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
@@ -306,7 +306,7 @@ class RenderingModel(SplatfactoModel):
             gaussians = replace(gaussians, opacities=gaussians.opacities.detach())
         else:
             gaussians, view = gaussians.detach(), view.detach()
-        scene = rasterize(gaussians, view, carried, render_depth=depth, **settings)
+        scene = rasterize(gaussians.seen_from(view), view, carried, render_depth=depth, **settings)
         image = None if features is None else scene.image
         return replace(photo, features=image, alpha=scene.alpha, depth=scene.depth), background
 

@@ -42,6 +42,8 @@ class SceneFacts:
 
     names: list[str] = field(default_factory=list)
     """Training photos, in the order of their cameras."""
+    positions: Float[Tensor, "p 3"] | None = None
+    """Of these cameras, in the model's frame; None for a model that is loaded."""
     needs: Mapping[str, bool] = field(default_factory=dict)
     """Whether the scene needs an optional component; empty if that wasn't measured."""
     statistics: FeatureStatistics | None = None

@@ -34,6 +34,7 @@ from lang3dxl_ns.preparation.encoders import (
     patch_reading,
     spoken,
 )
+from lang3dxl_ns.preparation.model_files import BUILTIN
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
@@ -49,6 +50,8 @@ _READERS = 2
 """Threads that read photos while others are encoded."""
 _ANNOUNCED_CROPS = 5_000
 """Fewer are encoded in seconds: no duration is measured."""
+_REPEATS = 8
+"""Times that a batch of noise is encoded, to announce a duration."""
 _PATCHES_PER_CROP = 32
 """Windows of patch features are encoded this many times fewer at once than crops: they hold more."""
 _LONG_S = 1800.0
@@ -355,25 +358,34 @@ def _announce_duration(
     hint = "" if faster > 0.9 * takes else f"; {quality} fast: {_duration(faster)}"
     say(f"{len(tasks):,} photos, {crops:,} crops with {config.clip}: about {_duration(takes)}{hint}")
     if device.type == "cpu" and takes > _LONG_S:
+        remedies = ["a GPU (some hundred times)", "fewer photos"]
+        if config.clip != BUILTIN:
+            remedies.insert(1, f"{spoken(CLIP_OPTION)} builtin if its words suffice")
+        if hint:
+            remedies.insert(1, f"{quality} fast")
         say(
-            f"That is long, since this runs on the CPU. What shortens it: a GPU (some hundred times), "
-            f"{quality} fast, {spoken(CLIP_OPTION)} builtin if its words suffice, or fewer photos. It can be "
+            f"That is long, since this runs on the CPU. What shortens it: {', '.join(remedies)}. It can be "
             "stopped at any time and goes on where it was"
         )
 
 
 def _seconds(work: Callable[[], Tensor]) -> float:
-    """Seconds that some work takes, once it is warm."""
-    for _ in range(2):
+    """Seconds that some work takes once it is warm: the least of several times, since other programs and
+    waiting threads can make a short one a hundred times longer."""
+    times: list[float] = []
+    while len(times) < 2 or (len(times) < _REPEATS and sum(times) < 1.0):
         start = time.perf_counter()
         work().cpu()  # waits for a GPU
-    return time.perf_counter() - start
+        times.append(time.perf_counter() - start)
+    return min(times)
 
 
 def _duration(seconds: float) -> str:
     """A duration to two digits at most."""
+    if seconds < 1.5:
+        return "a second"
     if seconds < 90:
-        return f"{max(round(seconds), 1)} seconds"
+        return f"{round(seconds)} seconds"
     return f"{round(seconds / 60)} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"
 
 

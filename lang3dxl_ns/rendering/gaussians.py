@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.scene.camera import Camera
+
 MAX_LOG_SCALE = 60.0
 """Clamp log scales to this before `exp`: an infinite scale has the gradient 0 · ∞ = NaN."""
+CLOSEST = 1.5
+"""Gaussians show from this depth on, in standard deviations of their longest axis; from twice that, fully."""
 
 
 @dataclass
@@ -30,6 +35,18 @@ class Gaussians:
         return Gaussians(
             self.means.detach(), self.quats.detach(), self.scales.detach(), self.opacities.detach()
         )
+
+    def seen_from(self, camera: Camera) -> Gaussians:
+        """The same Gaussians, transparent where the camera is hardly farther from them than they are long.
+
+        A splat is affine, right only where a Gaussian is small for its depth: at a camera that stands at
+        a wall, one of a finger's breadth beside the picture would cover it.
+        """
+        with torch.no_grad():
+            moved, place = camera.at_origin(self.means)
+            depth = (self.means - place) @ moved.view_matrix[2, :3] + moved.view_matrix[2, 3]
+            shown = (depth / (CLOSEST * self.scales.amax(1)).clamp_min(1e-30) - 1).clamp(0.0, 1.0)
+        return replace(self, opacities=self.opacities * shown)
 
     def moved(self, by: Float[Tensor, "3"]) -> Gaussians:
         """The same Gaussians with shifted centers."""

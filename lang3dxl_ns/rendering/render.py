@@ -50,7 +50,7 @@ def render(
         ValueError: as `rasterize` does.
     """
     raster = rasterize(
-        splats.gaussians,
+        splats.gaussians.seen_from(camera),
         camera,
         splats.colors(camera.position),
         None if background is None else background.to(splats.means),
@@ -69,6 +69,5 @@ def composite(
     splats: Splats, camera: Camera, channels: Float[Tensor, "n d"], backend: Backend = "auto"
 ) -> Float[Tensor, "h w d"]:
     """Values of the Gaussians composited over black, without their colors; differentiable in the values."""
-    return rasterize(
-        splats.gaussians, camera, channels, antialiased=splats.antialiased, backend=backend
-    ).image
+    gaussians = splats.gaussians.seen_from(camera)
+    return rasterize(gaussians, camera, channels, antialiased=splats.antialiased, backend=backend).image

@@ -240,6 +240,29 @@ def test_the_announced_size_is_that_of_the_stored_numbers(photos, config, store,
     assert f"preparing 3 photos (0 of 3 are ready): {needed[0]} bytes" in capsys.readouterr().out
 
 
+def test_an_announced_duration_is_not_that_of_a_stall_and_names_remedies_that_help(
+    photos, config, store, capsys, monkeypatch
+):
+    """A batch of noise that waits for another program must not announce hours."""
+    clock, calls, stalled = [0.0], [0], 100.0
+    encode = ImageTextEncoder.encode_images
+
+    def encode_images(self, crops):
+        clock[0] += stalled if calls[0] % 3 == 1 else 0.004
+        calls[0] += 1
+        return encode(self, crops)
+
+    monkeypatch.setattr(ImageTextEncoder, "encode_images", encode_images)
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(module, "_ANNOUNCED_CROPS", 0)
+    monkeypatch.setattr(module, "_LONG_S", 0.0)
+    run(photos, replace(config, dense="none"), store)
+    told = capsys.readouterr().out.replace("\n", " ")
+    assert "about a second" in told
+    assert "clip builtin if its words suffice" in told
+    assert "quality fast" not in told
+
+
 def test_a_disk_that_is_too_small_is_found_before_the_work(photos, config, store, calls, monkeypatch):
     usage = shutil.disk_usage(".")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
