@@ -31,10 +31,7 @@ BENCHMARKS = {
     "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
-    "teaching": (
-        "benchmarks.teaching:TeachingBenchmark",
-        "Words taught by example, beside the text alone.",
-    ),
+    "teaching": ("benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text alone."),
     "attach": ("benchmarks.attach:AttachBenchmark", "Words attached to a splat, scored beside its run's."),
     "ablation": (
         "benchmarks.ablation:Ablation",
@@ -46,10 +43,7 @@ COMMANDS = {
         "commands.demo:Demo",
         "The full workflow in minutes, on a landmark that comes with the package.",
     ),
-    "reconstruct": (
-        "commands.reconstruct:Reconstruct",
-        "COLMAP model from photos, or a video.",
-    ),
+    "reconstruct": ("commands.reconstruct:Reconstruct", "COLMAP model from photos, or a video."),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
     "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),

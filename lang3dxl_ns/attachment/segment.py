@@ -27,11 +27,7 @@ _LEAST, _MOST = 1e-3, 0.9
 
 
 def segmented(
-    scene: Scene,
-    word: str,
-    segmenter: TextSegmenter,
-    photos: Sequence[Photo],
-    cameras: Mapping[str, Camera],
+    scene: Scene, word: str, segmenter: TextSegmenter, photos: Sequence[Photo], cameras: Mapping[str, Camera]
 ) -> Scene:
     """A scene that was taught a word by a segmenter; the same scene, with a message, if that finds nothing.
 

@@ -16,12 +16,7 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, read_json
-from lang3dxl_ns.common.reports import (
-    command_line,
-    describe_machine,
-    markdown_table,
-    write_report,
-)
+from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene

@@ -11,12 +11,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import linear
 
-from lang3dxl_ns.components.appearance import (
-    FIRST_LOGIT,
-    TEMPERATURE,
-    AppearanceConfig,
-    AppearanceField,
-)
+from lang3dxl_ns.components.appearance import FIRST_LOGIT, TEMPERATURE, AppearanceConfig, AppearanceField
 from lang3dxl_ns.numerics.hash_grid import interpolate_reference
 from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.rendering import Gaussians
@@ -126,7 +121,4 @@ def appearance_reference(field: AppearanceField, given: Maps, rows: Tensor) -> M
     noise = torch.logit(noise, eps=1e-6).to(rows.device)[rows]  # as sampled, in float32
     drop = torch.sigmoid((shift[:, 3] + FIRST_LOGIT + noise) / TEMPERATURE)
     before = given["opacities"]
-    return {
-        "colors": colors,
-        "opacities": before.index_copy(0, rows, (before[rows] - drop).clamp(0, 1)),
-    }
+    return {"colors": colors, "opacities": before.index_copy(0, rows, (before[rows] - drop).clamp(0, 1))}

@@ -4,26 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from lang3dxl_ns.numerics import (
-    appearance,
-    decoder,
-    downsampler,
-    hash_grid,
-    losses,
-    rasterizer,
-    relevancy,
-)
+from lang3dxl_ns.numerics import appearance, decoder, downsampler, hash_grid, losses, rasterizer, relevancy
 from lang3dxl_ns.numerics.measure import Case
 
-GROUPS = (
-    rasterizer,
-    appearance,
-    hash_grid,
-    decoder,
-    downsampler,
-    losses,
-    relevancy,
-)
+GROUPS = (rasterizer, appearance, hash_grid, decoder, downsampler, losses, relevancy)
 
 
 def all_cases(quick: bool, device: str) -> Iterator[Case]:

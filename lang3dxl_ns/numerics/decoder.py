@@ -60,11 +60,7 @@ def _held_codes() -> Tensor:
     return (64 * _codes()).round() / 64
 
 
-def _problem(
-    codes: Callable[[], Tensor],
-    config: SemanticFieldConfig,
-    outputs_only: bool = False,
-) -> Problem:
+def _problem(codes: Callable[[], Tensor], config: SemanticFieldConfig, outputs_only: bool = False) -> Problem:
     generator = torch.Generator().manual_seed(0)
     field = SemanticField(config, CLIP, DENSE, generator=generator)
     channels = CLIP + DENSE

@@ -137,11 +137,7 @@ def trace(shapes: Sequence[Shape], camera: Camera, weather: Weather, width: int,
 
 
 def light(
-    traced: Traced,
-    materials: Sequence[Material],
-    camera: Camera,
-    weather: Weather,
-    shadows: ShadowMap,
+    traced: Traced, materials: Sequence[Material], camera: Camera, weather: Weather, shadows: ShadowMap
 ) -> Float[Array, "h w 3"]:
     """Linear colors of the hits."""
     height, width = traced.depth.shape
