@@ -23,7 +23,7 @@ from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.regions import _read_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.colmap import read_reconstruction
-from lang3dxl_ns.scene.companions import inside
+from lang3dxl_ns.scene.companions import companion, inside
 from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras
 from lang3dxl_ns.scene.video import extract_frames
 
@@ -320,6 +320,13 @@ def test_damaged_masks_are_named_all_at_once_and_left_out_where_asked(folder):
     names, said = masked(photos, folder, skip_damaged_masks=True)
     assert names == {"photo_001.jpg", "photo_003.jpg"}
     assert "2 masks can't be read" in said and "photo_002.jpg" in said
+
+
+def test_masks_and_label_maps_that_are_pipes_are_refused(tmp_path):
+    for suffix in (".png", ".npy"):
+        os.mkfifo(tmp_path / f"a.jpg{suffix}")
+        with pytest.raises(UserError, match="not a regular file"):
+            companion(tmp_path, "a.jpg", [suffix])
 
 
 def test_masks_that_are_all_black_are_said_to_be(folder):

@@ -36,6 +36,11 @@ def datamanager(data, **changes):
     return config.setup(device="cpu", test_mode="val")
 
 
+def test_photos_that_are_held_out_are_told(tmp_path, capsys):
+    datamanager(write_scene(tmp_path / "scene", photos=3))
+    assert "1 of 3 photos are held out of training" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_flat_folder_of_photos_is_all_that_training_needs(walk, tmp_path):
     data = shutil.copytree(walk, tmp_path / "data")
     before = {path.name: path.stat().st_mtime_ns for path in data.iterdir()}

@@ -512,12 +512,12 @@ def test_lightings_are_files_of_a_page_or_answers_of_a_server(monkeypatch):
 
 
 TWO_LIGHTINGS = """async () => {
-  const look = document.getElementById("look"), names = [...look.options].map((one) => one.value).filter(Boolean);
+  const look = document.getElementById("look"), names = [...look.options].map((one) => one.value);
   const { fetch } = window, wait = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds));
   let delay = 1, shown = 0;
   window.fetch = async (file) => (await wait(delay--), fetch(file));
   lang3dxl.view.light = () => shown++;
-  for (const name of names.slice(0, 2)) {
+  for (const name of names.filter(Boolean).slice(0, 2)) {
     look.value = name;
     look.dispatchEvent(new Event("change"));
   }

@@ -248,6 +248,17 @@ def test_a_scene_can_be_asked_while_it_is_trained(scene, viewer, tiny_clip, tiny
     viewer.viser_server.stop()
 
 
+def test_questions_leave_no_messages_behind(panel, viewer):
+    """viser keeps the latest of each kind for pages that open later."""
+    kept = viewer.viser_server._websock_server._broadcast_buffer.message_from_id
+    counts = []
+    for i in range(4):
+        type_in(panel, f"dome {i}")
+        frame(viewer)
+        counts.append(len(kept))
+    assert counts[1] == counts[-1]
+
+
 @pytest.mark.parametrize(("aspect", "size"), [(16 / 9, (180, 320)), (1.0, (320, 320)), (3.0, (180, 540))])
 def test_frames_while_moving_are_recognizable(aspect, size):
     assert least_size(30, int(30 * aspect), aspect, most=1024) == size
