@@ -50,8 +50,8 @@ _READERS = 2
 """Threads that read photos while others are encoded."""
 _ANNOUNCED_CROPS = 5_000
 """Fewer are encoded in seconds: no duration is measured."""
-_REPEATS = 8
-"""Times that a batch of noise is encoded, to announce a duration."""
+_MEASURED_S = 3.0
+"""Seconds in which noise is encoded, to announce a duration."""
 _PATCHES_PER_CROP = 32
 """Windows of patch features are encoded this many times fewer at once than crops: they hold more."""
 _LONG_S = 1800.0
@@ -344,14 +344,15 @@ def _announce_duration(
     crops = sum(task.crops.count(task.photo.height, task.photo.width) for task in tasks)
     if crops < _ANNOUNCED_CROPS:
         return
-    batch = 4 if device.type == "cpu" else config.crop_batch
-    noise = torch.rand(batch, 3, clip.crop_size, clip.crop_size, device=device)
-    of_crop = _seconds(lambda: clip.encode_images(noise)) / batch
+    noise = torch.rand(3, clip.crop_size, clip.crop_size, device=device)
+    of_crop = _seconds_each(
+        lambda batch: clip.encode_images(noise.expand(batch, -1, -1, -1)), config.crop_batch
+    )
     rest = 0.0
     if dense is not None:
-        encoder = dense
-        rest = sum(task.dense is not None for task in tasks) * _seconds(
-            lambda: encoder.encode(noise[0].permute(1, 2, 0))
+        encoder, photo = dense, noise.permute(1, 2, 0)
+        rest = sum(task.dense is not None for task in tasks) * _seconds_each(
+            lambda _: encoder.encode(photo), 1
         )
     takes, faster = ((n * of_crop + rest) / config.workers for n in (crops, sum(task.fast for task in tasks)))
     quality = spoken("--pipeline.datamanager.quality")
@@ -369,15 +370,20 @@ def _announce_duration(
         )
 
 
-def _seconds(work: Callable[[], Tensor]) -> float:
-    """Seconds that some work takes once it is warm: the least of several times, since other programs and
-    waiting threads can make a short one a hundred times longer."""
-    times: list[float] = []
-    while len(times) < 2 or (len(times) < _REPEATS and sum(times) < 1.0):
+def _seconds_each(work: Callable[[int], Tensor], most: int) -> float:
+    """Seconds that one of a batch takes, once all is warm. Batches grow up to `most` while that is quick: on
+    a busy machine threads wait for each other in every layer, which costs a small batch as much as a large
+    one."""
+    size, taken = 1, 0.0
+    work(size).cpu()  # waits for a GPU
+    while True:
         start = time.perf_counter()
-        work().cpu()  # waits for a GPU
-        times.append(time.perf_counter() - start)
-    return min(times)
+        work(size).cpu()
+        seconds = time.perf_counter() - start
+        taken += seconds
+        if size == most or taken > _MEASURED_S:
+            return seconds / size
+        size = min(4 * size, most)
 
 
 def _duration(seconds: float) -> str:
