@@ -18,10 +18,7 @@ from lang3dxl_ns.rendering.reference import rasterize_reference
 from lang3dxl_ns.scene.camera import Camera
 
 NEAR = 0.01
-MODES = {
-    "float32": Bounds(8e-3, 3e-4, 1e-3, 1e-3, flipped=0.02),
-    "float64": Bounds(1e-8, 1e-8, 1e-6, 1e-6),
-}
+MODES = {"float32": Bounds(8e-3, 3e-4, 1e-3, 1e-3, flipped=0.02), "float64": Bounds(1e-8, 1e-8, 1e-6, 1e-6)}
 """One pair that flips across 1/255 changes a pixel by up to 1/255; the stop at 1e-4 adds a little."""
 GSPLAT = {"float32": Bounds(0.1, 1e-2, 0.5, 0.1, flipped=1.0)}
 """gsplat cuts a Gaussian at three standard deviations, where alpha may still be 0.011."""

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lang3dxl_ns.demo.landmark.labels import (
-    SMALLEST_POSITIVE,
-    category_masks,
-)
+from lang3dxl_ns.demo.landmark.labels import SMALLEST_POSITIVE, category_masks
 from lang3dxl_ns.demo.landmark.landmark import Landmark
 from lang3dxl_ns.demo.landmark.photography import plain_view, random_camera
 from lang3dxl_ns.demo.landmark.raycast import Camera
