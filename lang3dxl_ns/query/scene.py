@@ -337,19 +337,12 @@ class Scene(ViewedScene):
         Raises:
             UserError: the pixel lies outside the view.
         """
-        camera = self.camera(place, size)
-        if not (0 <= x < camera.width and 0 <= y < camera.height):
-            raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
-        pixel = torch.zeros(camera.height, camera.width, device=self.device)
-        pixel[int(y), int(x)] = 1.0
-        share = self._fill(camera, pixel)
-        rows = share.nonzero().squeeze(1)
-        features = self.engine.features(rows)
-        if float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
+        feature = self._feature_at(self.camera(place, size), x, y)
+        if feature is None:
             return []
         queries = self.text.plain_queries(words).to(self.device)
-        cosines = queries.cosines(share[rows] @ features)
+        cosines = queries.cosines(feature)
         scores = queries.relevancy_of_cosines(cosines, self.engine.temperature)
         negatives = self.text.config.negatives
         clear = any(score > CLEAR for word, score in zip(words, scores, strict=True) if word != "sky")
@@ -357,6 +350,18 @@ class Scene(ViewedScene):
             return []
         best = scores.topk(max(min(most, len(words)), 0))
         return [(words[int(i)], float(score)) for score, i in zip(best.values, best.indices, strict=True)]
+
+    def _feature_at(self, camera: Camera, x: float, y: float) -> Float[Tensor, " c"] | None:
+        """What a pixel shows, in CLIP's space, of any length; None where too little of it has a meaning."""
+        if not (0 <= x < camera.width and 0 <= y < camera.height):
+            raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
+        pixel = torch.zeros(camera.height, camera.width, device=self.device)
+        pixel[int(y), int(x)] = 1.0
+        share = self._fill(camera, pixel)
+        rows = share.nonzero().squeeze(1)
+        features = self.engine.features(rows)
+        meant = float(share[rows] @ (features != 0).any(1).float())
+        return None if meant < self.config.min_alpha else share[rows] @ features
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 
