@@ -8,19 +8,26 @@ from pathlib import Path
 import tyro
 
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
 
 
 @dataclass(kw_only=True)
 class Info:
     """Tell what a scene file holds and where it comes from."""
 
-    scene: tyro.conf.Positional[Path]
-    """The .scene file."""
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
 
     def main(self) -> None:
+        from lang3dxl_ns.open_scene import find_scene_file
         from lang3dxl_ns.query.scene_file import describe_scene_file
 
-        told = describe_scene_file(self.scene)
+        file = find_scene_file(self.scene)
+        if file is None:
+            raise UserError(
+                "the run has no scene file: `lang3dxl export RUN --scene-file NAME.scene` writes one"
+            )
+        told = describe_scene_file(file)
         origin = told["provenance"]
         decoder, count = told["decoder"], told["gaussians"]
         words = "none: colors alone" if decoder is None else f"CLIP {told['clip']}, decoder {decoder['name']}"

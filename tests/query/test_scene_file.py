@@ -20,6 +20,7 @@ from painted_scene import (
 from PIL import Image
 
 from lang3dxl_ns.baselines.decoders import NAMES, DecoderConfig, make_decoder
+from lang3dxl_ns.commands.info import Info
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.scene import Scene
@@ -123,6 +124,15 @@ def test_the_file_tells_what_it_is_without_paths_of_its_machine(written, tmp_pat
     scene = painted_scene(file=file, decoder=scene.decoder, codes=scene.codes)
     write_scene(path, scene)
     assert b"/home" not in path.read_bytes() and b"somewhere" not in path.read_bytes()
+
+
+def test_info_takes_a_file_or_the_folder_that_holds_it(written, capsys):
+    _, path = written
+    told = []
+    for place in (path, path.parent):
+        Info(scene=place).main()
+        told.append(capsys.readouterr().out)
+    assert told[0] == told[1] and "5,185" in told[0] and "Painters" in told[0]
 
 
 def test_foregrounds_travel_with_the_scene(tmp_path):
