@@ -16,6 +16,8 @@ LONGEST = 1.0
 """Longest standard deviation, relative to the scene's radius or, outside, to the distance from its center."""
 NEEDLE = 0.25
 """The same for Gaussians more than twice as long as wide; ground and distant hills are wide."""
+EVERY = 10
+"""Training steps from one correction to the next: with harmonics it takes a fifth of a short step."""
 FREE = 0.02
 """Radius of the space around every training camera that stays empty, relative to the scene's radius."""
 _STEEPEST = 0.5

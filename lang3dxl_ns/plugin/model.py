@@ -22,7 +22,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
-from lang3dxl_ns.components.bounds import FREE, keep_in_bounds
+from lang3dxl_ns.components.bounds import EVERY, FREE, keep_in_bounds
 from lang3dxl_ns.components.initialization import color_parameters, initial_gaussians, seed_positions
 from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
 from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
@@ -93,7 +93,8 @@ class Lang3DXLModel(RenderingModel):
             )
             if self.num_points != before:
                 CONSOLE.log(f"Step {step}: {before} → {self.num_points} Gaussians")
-        keep_in_bounds(self.gauss_params, *self.extent, self.strategy.still, self.config.sh_degree)
+        if step % EVERY == 0 or step + 1 == self.config.total_steps:
+            keep_in_bounds(self.gauss_params, *self.extent, self.strategy.still, self.config.sh_degree)
         if self.sky is not None:
             with torch.no_grad():
                 colors = color_parameters(self.sky.colors, self.config.sh_degree)
