@@ -50,13 +50,14 @@ class Pixels:
 
     def channels(self, start: int, stop: int) -> Float[Tensor, "h w part"]:
         """A range of the channels."""
-        size, found, first, inside = self.foreground.shape, [], 0, self.foreground[..., None]
-        weighted = [(each, inside) for each in self.maps]
-        whole = torch.ones_like(inside)
-        for each, weight in (*weighted, (inside, whole), (self.outside[..., None], whole)):
+        height, width = self.foreground.shape
+        inside, outside = self.foreground[..., None], self.outside[..., None]
+        found, first = [], 0
+        for each in (*self.maps, inside, outside):
             part = each[..., max(start - first, 0) : max(stop - first, 0)]
             if part.shape[-1]:
-                found.append(resize(part, (size[0], size[1])) * weight)
+                part = resize(part, (height, width))
+                found.append(part if each is outside else part * inside)
             first += each.shape[-1]
         return torch.cat(found, dim=-1)
 
