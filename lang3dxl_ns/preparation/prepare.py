@@ -359,11 +359,10 @@ def _announce_duration(
     hint = "" if faster > 0.9 * takes else f"; {quality} fast: {_duration(faster)}"
     say(f"{len(tasks):,} photos, {crops:,} crops with {config.clip}: about {_duration(takes)}{hint}")
     if device.type == "cpu" and takes > _LONG_S:
-        remedies = ["a GPU (some hundred times)", "fewer photos"]
+        remedies = ["a GPU (some hundred times)", *([f"{quality} fast"] if hint else [])]
         if config.clip != BUILTIN:
-            remedies.insert(1, f"{spoken(CLIP_OPTION)} builtin if its words suffice")
-        if hint:
-            remedies.insert(1, f"{quality} fast")
+            remedies.append(f"{spoken(CLIP_OPTION)} builtin if its words suffice")
+        remedies.append("fewer photos")
         say(
             f"That is long, since this runs on the CPU. What shortens it: {', '.join(remedies)}. It can be "
             "stopped at any time and goes on where it was"
