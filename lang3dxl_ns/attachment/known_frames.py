@@ -10,6 +10,7 @@ from numpy import ndarray as Array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.scene.colmap import Reconstruction
 
@@ -54,7 +55,7 @@ def _of_run(splat: Path) -> dict[str, Similarity]:
         try:
             content = read_json(folder / RUN_TRANSFORM)
             rows = np.array(content["transform"], np.float64).reshape(3, 4) * float(content["scale"])
-        except (OSError, ValueError, LookupError, TypeError):
+        except DAMAGE:
             continue
         own = np.vstack([rows, [0, 0, 0, 1]])
         # A transforms.json of ns-process-data has turned the axes already.

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.cache import fingerprint
@@ -186,7 +186,7 @@ def _kept(folder: Path, stamp: str) -> list[Camera] | None:
         return [
             LENS.camera(torch.tensor(view, dtype=torch.float32).reshape(4, 4)) for view in content["views"]
         ]
-    except (OSError, ValueError, LookupError, TypeError):
+    except DAMAGE:
         return None
 
 

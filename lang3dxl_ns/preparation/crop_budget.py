@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.preparation.physical_scale import SMALLEST_CROP, crop_sides, fine_crops
 from lang3dxl_ns.preparation.pyramid import HALF, THIRD, crop_count
 from lang3dxl_ns.preparation.settings import Quality
@@ -83,7 +84,7 @@ def input_side(folder: Path) -> int:
     try:
         side = json.loads((folder / "config.json").read_text())["vision_config"]["image_size"]
         return side if isinstance(side, int) and side > 0 else _USUAL_INPUT
-    except (OSError, ValueError, LookupError, TypeError):
+    except DAMAGE:
         return _USUAL_INPUT
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.preparation.collection import SCALE_RATIO, CropPlan
@@ -165,7 +165,7 @@ def read_needs(folder: Path) -> dict[str, bool]:
     try:
         found = read_json(path)
         return {component: bool(need["needed"]) for component, need in found.items()}
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except DAMAGE as error:
         raise UserError(f"{path} can't be read ({error!r}): copy it again, or remove it") from error
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import expanded, read_json
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.preparation.foreground import find_mask
@@ -152,7 +152,7 @@ def read_transforms(path: Path) -> _Read:
                 photos[photo.path] = photo
             except UserError as reason:
                 left_out[name] = reason
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except DAMAGE as error:
         raise UserError(f"{path} can't be used ({error!r}): correct it, or make it again") from error
     photos = dict(sorted(photos.items(), key=lambda item: item[1].name))
     nothing = np.zeros((0, 3))

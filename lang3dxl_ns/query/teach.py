@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.query.coco import mask_of, run_lengths
 from lang3dxl_ns.query.relevancy import TEMPERATURE
@@ -303,7 +303,7 @@ def load_words(path: Path) -> list[TaughtWord]:
         if told["version"] != _VERSION:
             raise UserError(f"{path} has format {told['version']}: update lang3dxl-ns to read it")
         return words_from_json(told["words"])
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except DAMAGE as error:
         raise UserError(f"{path} is not a file of taught words ({error}): save it again") from error
 
 
