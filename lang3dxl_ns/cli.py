@@ -63,7 +63,7 @@ COMMANDS = {
     ),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),
     "preset": ("commands.preset:Preset", "Print the flags that train a benchmark's scene as in the paper."),
-    "numerics": ("numerics.command:Numerics", "Error and time of every component on stiff cases."),
+    "numerics": ("numerics.command:Numerics", "Error and time of components on stiff cases."),
     "benchmark": (BENCHMARKS, "Measure: time, memory and error, side by side."),
 }
 """Each command's settings class, which has a method `main`, and its summary in the list of commands."""

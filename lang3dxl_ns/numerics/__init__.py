@@ -1,1 +1,1 @@
-"""Numerical stability: every component measured on a catalog of extreme cases."""
+"""Numerical stability: components measured on a catalog of extreme cases."""

@@ -11,6 +11,6 @@ GROUPS = (rasterizer, appearance, hash_grid, decoder, downsampler, losses, relev
 
 
 def all_cases(quick: bool, device: str) -> Iterator[Case]:
-    """Every component's cases; `quick` shrinks those where size is not the point."""
+    """All cases; `quick` shrinks those where size is not the point."""
     for group in GROUPS:
         yield from group.cases(quick, device)

@@ -1,4 +1,4 @@
-"""`lang3dxl numerics`: error and run time of every component on hard cases, with pass or miss."""
+"""`lang3dxl numerics`: error and run time of components on hard cases, with pass or miss."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ SMALLEST = 1e-18
 
 @dataclass(kw_only=True)
 class Numerics:
-    """Measure the error and time of every component on stiff and extreme cases; exit 1 on any miss."""
+    """Measure error and time on stiff and extreme cases of rendering, training and answering.
+
+    Exits 1 if a case misses its bound.
+    """
 
     out: Path
     """Folder for numerics.md and numerics.png."""
@@ -77,7 +80,7 @@ def _markdown(rows: Sequence[Row], optimizations: Sequence[Run], heading: str, v
 
 {heading}
 
-**{verdict}.** Every component runs on its hard cases, and the same inputs, rounded as the component sees
+**{verdict}.** Components run on their hard cases, and the same inputs, rounded as the component sees
 them, go through a float64 reference written for clarity. Errors of outputs and gradients (for a random
 upstream gradient) are the largest and the root mean square, relative to the reference's, the worst of all
 tensors; so are their bounds. Where the reference is not finite, the component may be anything. flipped: share
