@@ -15,7 +15,6 @@ from difflib import get_close_matches
 from functools import reduce
 from importlib import import_module
 from importlib.metadata import version
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -23,6 +22,7 @@ import tyro
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.laboratory import has_laboratory
 from lang3dxl_ns.common.settings_help import asked_for_all
 
 BENCHMARKS = {
@@ -162,7 +162,7 @@ def settings_of(place: str) -> Any:
     module, _, name = place.partition(":")
     if not module.startswith("lab."):
         module = f"lang3dxl_ns.{module}"
-    elif not (Path(__file__).parents[1] / "lab").is_dir():
+    elif not has_laboratory():
         raise UserError(
             "this benchmark comes with a checkout of the repository, not with the package: clone it, "
             "and install the clone with pip install -e"

@@ -383,7 +383,7 @@ def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monk
 
 
 def test_numerics(gpu):
-    from lang3dxl_ns.numerics import losses
+    from lab.numerics import losses
     from lang3dxl_ns.numerics.command import measure_all
 
     with gpu():
