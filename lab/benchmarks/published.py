@@ -38,7 +38,7 @@ class BenchmarkScene:
     truth: Path
 
 
-@showing("data", "out", "scenes", "iterations")
+@showing("data", "out", "scenes")
 @dataclass(kw_only=True)
 class _Benchmark:
     data: Path
