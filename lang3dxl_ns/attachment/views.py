@@ -33,7 +33,7 @@ from lang3dxl_ns.scene.photo import Photo
 
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
 LENS = Lens(480, 360, 384.0, 384.0, 240.0, 180.0)
-"""Of the views: 64 degrees wide, as a phone's."""
+"""Lens of the views: 64 degrees wide, as a phone's."""
 BACKGROUND = (0.75, 0.8, 0.85)
 """Behind the splat: a pale sky."""
 _RULE = 3

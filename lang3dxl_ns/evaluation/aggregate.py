@@ -31,7 +31,7 @@ TOTALS = {
 }
 """Measures whose total is the mean over all pairs of a photo and a category, as for LERF-OVS and PT-OVS."""
 Figures = Mapping[str, float]
-"""Of one photo: psnr etc., and `{prefix}{measure}_{category}`."""
+"""Figures of one photo: psnr etc., and `{prefix}{measure}_{category}`."""
 
 
 def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str, Any]:

@@ -104,7 +104,7 @@ def smooth_mask(score: Float[Array, "h w"], mean: Float[Array, "h w"]) -> Bool[A
 
 
 def strongest_level(levels: Float[Array, "l h w"]) -> Float[Array, "h w"]:
-    """Of maps at several levels (LangSplat has three), the one with the highest smoothed peak."""
+    """The map with the highest smoothed peak among maps at several levels (LangSplat has three)."""
     peaks = [uniform_filter(level.astype(np.float64), SMOOTHING, mode="mirror").max() for level in levels]
     return levels[int(np.argmax(peaks))]
 

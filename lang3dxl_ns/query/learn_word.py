@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
@@ -52,11 +52,11 @@ class Weights:
     """Pixels of an example's photo that each Gaussian fills."""
 
     word: Float[Tensor, " n"]
-    """Of those marked as the word."""
+    """Pixels marked as the word."""
     other: Float[Tensor, " n"]
-    """Of those marked as something else."""
+    """Pixels marked as something else."""
     seen: Float[Tensor, " n"]
-    """Of all."""
+    """All pixels."""
 
     @classmethod
     def of(cls, example: Example, photo: ScenePhoto, splats: Splats, backend: Backend = "auto") -> Weights:
@@ -133,11 +133,11 @@ class _Photo:
 
     name: str
     word: Float[Tensor, " m"]
-    """Of what is the word; sums to 1."""
+    """Weights of what is the word; they sum to 1."""
     rest: Float[Tensor, " m"]
-    """Of what is not; sums to 1."""
+    """Weights of what is not; they sum to 1."""
     share: float
-    """Of the photo that is marked as the word."""
+    """Share of the photo that is marked as the word."""
     evidence: int
     complete: bool
 
@@ -146,22 +146,25 @@ class _Photo:
         from sklearn.metrics import average_precision_score
 
         rest = (1 - self.share) * self.rest
-        return average_precision_score(**_labeled(score, self.share * self.word, rest))
+        labels, scores, weights = _labeled(score, self.share * self.word, rest)
+        return average_precision_score(labels, scores, sample_weight=weights)
 
     def separation(self, score: Float[Tensor, " m"]) -> float:
         """Chance that the word scores above the rest; equal scores share."""
         from sklearn.metrics import roc_auc_score
 
-        return roc_auc_score(**_labeled(score, self.word, self.rest))
+        labels, scores, weights = _labeled(score, self.word, self.rest)
+        return roc_auc_score(labels, scores, sample_weight=weights)
 
 
 def _labeled(
-    score: Float[Tensor, " m"], word: Float[Tensor, " m"], rest: Float[Tensor, " m"]
-) -> dict[str, np.ndarray]:
-    """Every Gaussian twice, for scikit-learn: as the word and as the rest, by its weights."""
+    values: Float[Tensor, "m ..."], word: Float[Tensor, " m"], rest: Float[Tensor, " m"]
+) -> tuple[Float[Array, " k"], Float[Array, "k ..."], Float[Array, " k"]]:
+    """Labels, values and weights for scikit-learn: every Gaussian as the word (1), and as the rest (0)."""
     labels = torch.cat([torch.ones_like(word), torch.zeros_like(rest)])
-    parts = {"y_true": labels, "y_score": torch.cat([score, score]), "sample_weight": torch.cat([word, rest])}
-    return {name: part.cpu().numpy() for name, part in parts.items()}
+    weights = torch.cat([word, rest])
+    found = [part[weights > 0].cpu().numpy() for part in (labels, torch.cat([values, values]), weights)]
+    return found[0], found[1], found[2]
 
 
 def _sampled(
@@ -246,10 +249,9 @@ def _logistic(
     minimizes ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
     from sklearn.linear_model import LogisticRegression
 
-    inputs = places.cpu().numpy()
-    both = _labeled(word, word / 2, rest / 2)
+    labels, inputs, weights = _labeled(places, word / 2, rest / 2)
     model = LogisticRegression(C=1 / ridge, solver="newton-cholesky", tol=1e-6)
-    model.fit(np.concatenate([inputs, inputs]), both["y_true"], both["sample_weight"])
+    model.fit(inputs, labels, weights)
     return torch.from_numpy(model.coef_[0]).to(places), float(model.intercept_[0])
 
 

@@ -43,7 +43,7 @@ class ScenePhoto:
     camera_to_world: list[list[float]]
     """[3, 4], the model's frame, nerfstudio's camera axes (x right, y up, z backward)."""
     lens: Lens
-    """Of the file: masks are drawn on the distorted photo, while views are undistorted."""
+    """Lens of the file: masks are drawn on the distorted photo, while views are undistorted."""
     mask: str | bytes | None = None
     """Foreground mask of the photo: its file, or the content of a PNG of the undistorted mask."""
     size: tuple[int, int] | None = None

@@ -121,7 +121,7 @@ class TaughtWord:
 
     name: str
     vector: Float[Tensor, " c"]
-    """Of any length."""
+    """Direction of the word, of any length."""
     bias: float
     text: float
     """Weight of the text, from 0."""

@@ -39,7 +39,7 @@ from lang3dxl_ns.query.web.pack import (
 _HERE = Path(__file__).parent
 _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
-"""Of the views that the page flies to, and of the photos' lightings; of more, evenly chosen ones are kept."""
+"""Bytes of the views that the page flies to, and of the lightings; of more, evenly chosen ones are kept."""
 _TEXTS = 256
 """Texts encoded at a time."""
 MOST_TEXT = 2_000
