@@ -22,21 +22,25 @@ import tyro
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.laboratory import has_laboratory
 from lang3dxl_ns.common.settings_help import asked_for_all
 
 BENCHMARKS = {
-    "training": ("benchmarks.training:TrainingBenchmark", "A training step by its parts."),
-    "gpu": ("benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time and memory, in one file to send."),
-    "scale": ("benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
-    "holyscenes": ("benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
-    "lerf-ovs": ("benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
-    "pt-ovs": ("benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
-    "teaching": ("benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text alone."),
-    "attach": ("benchmarks.attach:AttachBenchmark", "Words attached to a splat, scored beside its run's."),
     "ablation": (
         "benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",
     ),
+    "training": ("lab.benchmarks.training:TrainingBenchmark", "A training step by its parts."),
+    "gpu": (
+        "lab.benchmarks.gpu:GpuBenchmark",
+        "A GPU: parity, numerics, time and memory, in one file to send.",
+    ),
+    "scale": ("lab.benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
+    "holyscenes": ("lab.benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
+    "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
+    "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
+    "teaching": ("lab.benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text."),
+    "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),
 }
 COMMANDS = {
     "demo": (
@@ -66,7 +70,8 @@ COMMANDS = {
     "numerics": ("numerics.command:Numerics", "Error and time of components on stiff cases."),
     "benchmark": (BENCHMARKS, "Measure: time, memory and error, side by side."),
 }
-"""Each command's settings class, which has a method `main`, and its summary in the list of commands."""
+"""Each command's settings class, which has a method `main`, and its summary in the list of commands. Those of
+`lab` come with a checkout alone."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -140,13 +145,29 @@ def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
         if called and isinstance(place, Mapping):
             kind = _choice(place, words[1:])
         elif called:
-            module, _, member = place.partition(":")
-            kind = getattr(import_module(f"lang3dxl_ns.{module}"), member)
+            kind = settings_of(place)
         else:
             kind = make_dataclass("NotCalled", [])
         described = summary if isinstance(place, Mapping) or not called else None
         kinds.append(Annotated[kind, tyro.conf.subcommand(name, description=described)])
     return reduce(operator.or_, kinds)
+
+
+def settings_of(place: str) -> Any:
+    """A command's settings class, imported from `module:class` of the package or of the laboratory beside it.
+
+    Raises:
+        UserError: it belongs to the laboratory, which is not here.
+    """
+    module, _, name = place.partition(":")
+    if not module.startswith("lab."):
+        module = f"lang3dxl_ns.{module}"
+    elif not has_laboratory():
+        raise UserError(
+            "this benchmark comes with a checkout of the repository, not with the package: clone it, "
+            "and install the clone with pip install -e"
+        )
+    return getattr(import_module(module), name)
 
 
 @contextlib.contextmanager

@@ -322,7 +322,7 @@ def test_words_on_the_gpu_are_those_on_the_cpu(default, gpu):
 @pytest.mark.cuda
 @pytest.mark.skipif(not REAL, reason="needs a GPU")
 def test_a_million_gaussians_are_trained_gathered_and_asked(tmp_path):
-    from lang3dxl_ns.benchmarks import gpu as benchmark
+    from lab.benchmarks import gpu as benchmark
 
     assert benchmark.step(1_000_000, (1000, 700))["memory"] < 8
     learned = benchmark.words(1_000_000, (1000, 700), 200)
@@ -370,7 +370,7 @@ def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, wid
 
 
 def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monkeypatch, gpu):
-    from lang3dxl_ns.benchmarks import gpu as benchmark
+    from lab.benchmarks import gpu as benchmark
 
     with gpu():
         benchmark.GpuBenchmark(tmp_path, quick=True).main()
@@ -383,7 +383,7 @@ def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monk
 
 
 def test_numerics(gpu):
-    from lang3dxl_ns.numerics import losses
+    from lab.numerics import losses
     from lang3dxl_ns.numerics.command import measure_all
 
     with gpu():

@@ -20,7 +20,7 @@ from lang3dxl_ns.common.settings_help import showing
 Found = TypeVar("Found")
 
 
-@showing("out", "landmarks", "scene", "rows", "seeds", "steps")
+@showing("out", "scene", "rows", "seeds", "steps")
 @dataclass
 class Ablation:
     """Train and score the method, the baselines, and the method without each of its parts, all else equal;

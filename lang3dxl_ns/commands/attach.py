@@ -15,7 +15,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 
 
 @showing(
-    *("splat", "data", "out", "text", "clip", "dense", "quality", "views", "up", "foreground", "segment"),
+    *("splat", "data", "out", "text", "clip", "quality", "views", "up", "foreground", "segment"),
     *("workers", "cache_dir"),
 )
 @dataclass(kw_only=True)

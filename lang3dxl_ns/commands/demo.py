@@ -33,7 +33,7 @@ RUN = Path("run", "lang3dxl", "demo")
 _STAGES = "stages.json"
 
 
-@showing("out", "quick", "photos", "steps", "seed", "family")
+@showing("out", "quick", "steps", "seed")
 @dataclass
 class Demo:
     """See the full workflow in minutes, without any data: generate a landmark that the built-in CLIP has

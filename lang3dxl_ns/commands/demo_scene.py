@@ -9,7 +9,7 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
 
 
-@showing("out", "photos", "seed", "family", "wild")
+@showing("out", "photos", "seed", "family")
 @dataclass
 class GenerateScene(DemoScene):
     """Generate a demo scene: photos of a procedural landmark."""

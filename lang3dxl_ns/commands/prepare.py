@@ -13,10 +13,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 
 
-@showing(
-    *("data", "clip", "dense", "quality", "longer_side", "foreground", "regions", "workers"),
-    *("engine", "cache_dir"),
-)
+@showing("data", "clip", "dense", "quality", "foreground", "regions", "workers", "cache_dir")
 @dataclass(kw_only=True)
 class Prepare(PreparationConfig):
     """Make the targets that training learns from: CLIP features of crops in physical scale, dense features.

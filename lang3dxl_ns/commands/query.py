@@ -38,10 +38,7 @@ from lang3dxl_ns.scene.camera import Camera
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
-@showing(
-    *("scene", "text", "not_", "out", "image", "all", "camera_path", "coco", "without_taught", "clip"),
-    "settings",
-)
+@showing("scene", "text", "not_", "out", "image", "all", "camera_path", "coco", "clip", "settings")
 @dataclass(kw_only=True)
 class Query:
     """Search a trained scene for texts: writes heat maps, masks and relevancy maps.
@@ -189,8 +186,8 @@ def _view_report(name: str, matches: list[Match]) -> dict:
 
 
 @showing(
-    *("scene", "text", "not_", "out", "web", "scene_file", "vocabulary", "title", "credit", "license", "all"),
-    *("index", "look", "clip", "settings"),
+    *("scene", "text", "not_", "out", "web", "scene_file", "title", "credit", "license", "all"),
+    *("look", "clip", "settings"),
 )
 @dataclass(kw_only=True)
 class Export:

@@ -11,8 +11,10 @@ import tyro
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.files import read_names
+from lang3dxl_ns.common.settings_help import showing
 
 
+@showing("scene", "text", "host", "port", "clip")
 @dataclass(kw_only=True)
 class View:
     """Explore and ask a scene in a browser.

@@ -6,9 +6,9 @@ import math
 import pytest
 import torch
 
+from lab.numerics.hash_grid import interpolate_reference
 from lang3dxl_ns.components import hash_grid
 from lang3dxl_ns.components.hash_grid import HASH_PRIMES, HashGrid
-from lang3dxl_ns.numerics.hash_grid import interpolate_reference
 
 pytestmark = pytest.mark.usefixtures("backend")
 PRIMES = (1, 2654435761, 805459861, 3674653429)

@@ -4,13 +4,11 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from painted_scene import CHANNELS, DOME, encode_texts, painted_file, painted_scene
 from PIL import Image
 
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
-from lang3dxl_ns.benchmarks.teaching import ways
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.query.scene_file import write_scene
 
@@ -45,15 +43,3 @@ def test_a_word_shown_once_scores_above_its_unknown_text(tmp_path, monkeypatch):
     assert rows["outline, 1 photo"]["iou"] > 0.7
     assert found["teach_seconds"] > 0
     assert "| box, 2 photos |" in (tmp_path / "teaching.md").read_text()
-
-
-@pytest.mark.parametrize("name", ways(2))
-def test_marks_lie_on_the_word(name):
-    mask = np.zeros((40, 60), bool)
-    mask[10:20, 30:50] = True
-    example = ways(2)[name]("x.jpg", mask, (120, 80))
-    for x, y in example.points:
-        assert mask[int((y + 0.5) / 2), int((x + 0.5) / 2)]
-    if example.box is not None:
-        assert example.box == (60, 20, 100, 40)
-    assert example.points or example.complete

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import linear
 
+from lab.numerics.hash_grid import interpolate_reference
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
-from lang3dxl_ns.numerics.hash_grid import interpolate_reference
 from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 
 CLIP, DENSE = 128, 32

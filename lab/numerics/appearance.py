@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import linear
 
+from lab.numerics.hash_grid import interpolate_reference
 from lang3dxl_ns.components.appearance import FIRST_LOGIT, TEMPERATURE, AppearanceConfig, AppearanceField
-from lang3dxl_ns.numerics.hash_grid import interpolate_reference
 from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.rendering import Gaussians
 

@@ -14,6 +14,7 @@ from lang3dxl_ns.attachment.frames import camera_in
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import markdown_table
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
@@ -25,6 +26,7 @@ from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.novel_views import read_novel_views
 
 
+@showing("scenes", "data", "out")
 @dataclass
 class AttachBenchmark:
     """Score words in scenes of one splat, in the test views or labeled photos of its data.

@@ -1,12 +1,9 @@
-"""Synthetic collections for the scale benchmark, and its report."""
-
-from pathlib import Path
+"""Synthetic collections for the scale benchmark."""
 
 import numpy as np
 from PIL import Image
 
-from lang3dxl_ns.benchmarks.scale import ScaleBenchmark, Stage, markdown
-from lang3dxl_ns.demo.landmark.crowd import SIZES, write_crowd
+from lab.benchmarks.crowd import SIZES, write_crowd
 from lang3dxl_ns.scene.colmap import read_reconstruction
 
 
@@ -26,13 +23,6 @@ def test_a_crowd_is_a_scene_of_mixed_sizes_with_tracks_and_depends_on_its_seed_a
             assert image.size == (photo.width, photo.height)
     first, again, other = ([p.read_bytes() for p in sorted(s.rglob("*.jpg"))] for s in scenes)
     assert first == again != other
-
-
-def test_the_report_holds_a_row_per_stage():
-    stages = [Stage("words", "20,000 Gaussians", 12.34, 9.87, "0.5 s", 2_500_000_000)]
-    report = markdown(ScaleBenchmark(out=Path("x")), stages)
-    assert "| words | 20,000 Gaussians | 12.3 | 9.9 | 0.5 s | 2.50 |" in report
-    assert "lang3dxl benchmark scale --out x" in report
 
 
 def test_zoomed_photos_have_more_pixels_and_as_many_tracks(tmp_path):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from label_sets import box_object, write_labels
 
-from lang3dxl_ns.benchmarks.kept_runs import KeptRuns
-from lang3dxl_ns.benchmarks.published import HolyScenes, LerfOvs, PtOvs
+from lab.benchmarks.kept_runs import KeptRuns
+from lab.benchmarks.published import HolyScenes, LerfOvs, PtOvs
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.common.reports import write_atomically

@@ -134,7 +134,7 @@ def parity(count: int, size: tuple[int, int]) -> dict[str, float]:
 
 def numerics(quick: bool) -> dict[str, Any]:
     """How many hard cases are within their bounds (tf32 among them), and those that are not."""
-    from lang3dxl_ns.numerics import decoder, losses
+    from lab.numerics import decoder, losses
     from lang3dxl_ns.numerics.catalog import all_cases
     from lang3dxl_ns.numerics.command import measure_all
 

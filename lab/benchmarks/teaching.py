@@ -38,7 +38,7 @@ Masks = Mapping[str, Bool[Array, "h w"]]
 """Of a word, by the scene's names of the photos."""
 
 
-@showing("scene", "out", "mark", "ground_truth")
+@showing("scene", "out", "ground_truth")
 @dataclass(kw_only=True)
 class TeachingBenchmark:
     """Teach every labeled word by clicks, boxes and outlines drawn from its labels, and score its maps in the

@@ -17,7 +17,7 @@ PARTS = ("data", "render", "appearance", "decode", "downsample", "losses", "back
 """Parts of a step; appearance is within the rendering."""
 
 
-@showing("data", "out", "clip", "iterations", "threads")
+@showing("data", "out")
 @dataclass
 class TrainingBenchmark:
     """Train with and without semantics, evaluate on held-out photos, and time every part of a step."""

@@ -128,7 +128,7 @@ def _measured(name: str, amount: str, work: Callable[[], object], each: Callable
 
 
 def _scene(out: Path, photos: int, points: int = 2_000) -> Path:
-    from lang3dxl_ns.demo.landmark.crowd import write_crowd
+    from lab.benchmarks.crowd import write_crowd
 
     folder = out / f"scene-{photos}-{points}"
     return folder if folder.is_dir() else write_crowd(folder, photos, points, zoom=_ZOOM)

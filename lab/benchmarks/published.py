@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from lab.benchmarks.kept_runs import KeptRuns
 from lang3dxl_ns.baselines.rows import FULL, choose_rows
 from lang3dxl_ns.benchmarks.ablation import make_all
-from lang3dxl_ns.benchmarks.kept_runs import KeptRuns
 from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
@@ -38,7 +38,7 @@ class BenchmarkScene:
     truth: Path
 
 
-@showing("data", "out", "scenes", "iterations")
+@showing("data", "out", "scenes")
 @dataclass(kw_only=True)
 class _Benchmark:
     data: Path

@@ -1,0 +1,100 @@
+"""Benchmarks of the laboratory: available in a checkout, and what they report. lab/tests has more."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from painted_scene import painted_scene
+from scenes import write_scene
+
+from lab.benchmarks import attach, training
+from lab.benchmarks.published import HolyScenes
+from lab.benchmarks.scale import ScaleBenchmark, Stage, markdown
+from lab.benchmarks.teaching import ways
+from lang3dxl_ns import cli
+from lang3dxl_ns.common.presets import load_preset
+from lang3dxl_ns.methods import run_config
+from lang3dxl_ns.numerics.catalog import groups
+
+
+def test_without_a_checkout_the_remedy_is_told_and_numerics_has_what_is_used_after_training(monkeypatch):
+    monkeypatch.setattr("lang3dxl_ns.__file__", "/site-packages/lang3dxl_ns/__init__.py")
+    assert [group.__name__ for group in groups()] == [
+        "lang3dxl_ns.numerics.rasterizer",
+        "lang3dxl_ns.numerics.relevancy",
+    ]
+    with pytest.raises(SystemExit, match="comes with a checkout of the repository"):
+        cli.main(["benchmark", "scale", "--help"])
+
+
+def test_a_scenes_splat_is_attached_with_photos_and_without_once(tmp_path, monkeypatch):
+    made = []
+
+    def attached(splat, photos, out, config):
+        made.append((out.name, photos))
+        out.touch()
+
+    monkeypatch.setattr(attach, "attach", attached)
+    wanted = [tmp_path / "with-photos.scene", tmp_path / "without-photos.scene"]
+    assert attach.attached(painted_scene(), tmp_path / "photos", tmp_path) == wanted
+    assert made == [("with-photos.scene", tmp_path / "photos"), ("without-photos.scene", None)]
+    wanted[1].unlink()
+    attach.attached(painted_scene(), tmp_path / "photos", tmp_path)
+    assert made[2:] == [("without-photos.scene", None)]
+
+
+def test_ours_stand_beside_the_published_figures_of_their_scene_and_category():
+    def results(**photos):
+        mean = float(np.mean(list(photos.values())))
+        figures = {name: {"authors_ap_windows": ap, "ap_windows": ap} for name, ap in photos.items()}
+        both = {"map": mean, "authors_map": mean, "ap_windows": mean, "authors_ap_windows": mean}
+        return both | {"ap_windows_photos": len(photos), "photos": figures}
+
+    scenes = {"milano": results(a=0.1, b=0.2, c=0.3), "St_Paul": results(a=0.9)}
+    benchmark = HolyScenes(data=Path(), out=Path())
+    _, by_scene, _, together = benchmark.tables(scenes, load_preset("published/holyscenes"))
+    heads, _, *lines = ([cell.strip() for cell in line.split("|")[1:-1]] for line in by_scene.splitlines())
+    rows = {(line[0], line[1]): dict(zip(heads, line, strict=True)) for line in lines}
+    for scene, ours, theirs in (("milano", "0.200", "0.740"), ("St_Paul", "0.900", "0.720")):
+        row = rows[scene, "windows"]
+        assert row["AP as published"] == ours and row["Lang3D-XL, published"] == theirs
+    assert "| photos pooled | windows | 4 | 0.375 |" in together
+    assert "| mean of scenes | windows | " in together and "| 0.550 |" in together
+
+
+def test_a_stage_of_scale_is_a_row():
+    stages = [Stage("words", "20,000 Gaussians", 12.34, 9.87, "0.5 s", 2_500_000_000)]
+    report = markdown(ScaleBenchmark(out=Path("x")), stages)
+    assert "| words | 20,000 Gaussians | 12.3 | 9.9 | 0.5 s | 2.50 |" in report
+    assert "lang3dxl benchmark scale --out x" in report
+
+
+@pytest.mark.parametrize("name", ways(2))
+def test_marks_lie_on_the_word(name):
+    mask = np.zeros((40, 60), bool)
+    mask[10:20, 30:50] = True
+    example = ways(2)[name]("x.jpg", mask, (120, 80))
+    for x, y in example.points:
+        assert mask[int((y + 0.5) / 2), int((x + 0.5) / 2)]
+    if example.box is not None:
+        assert example.box == (60, 20, 100, 40)
+    assert example.points or example.complete
+
+
+def test_the_report_of_training_has_the_parts_of_a_step(tmp_path, tiny_clip, tiny_dense, monkeypatch):
+    def quick(*arguments):
+        config = run_config(*arguments)
+        config.pipeline.model.decoder.compression.steps = 40  # 15 seconds otherwise
+        return config
+
+    monkeypatch.setattr("lang3dxl_ns.methods.run_config", quick)
+    monkeypatch.setattr(training, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
+    data = write_scene(tmp_path / "scene", photos=4, points=60)
+    models = str(tiny_clip), str(tiny_dense)
+    training.TrainingBenchmark(data, tmp_path / "out", *models, iterations=3, scale=1.0).main()
+    found = json.loads((tmp_path / "out/training.json").read_text())
+    assert {"render", "backward", "optimizer"} <= set(found["rgb only"]["split_seconds"])
+    assert all(seconds > 0 for run in found.values() for seconds in run["split_seconds"].values())
+    assert "| backward (ms) |" in (tmp_path / "out/training.md").read_text()
