@@ -92,7 +92,7 @@ def lerf_ovs(width: object = 8, outline: object = ((0, 0), (4, 0), (4, 4))) -> C
     ("write", "message"),
     [
         (holyscenes, "but no .*0002-gt.jpg: add the mask, or remove the photo"),
-        (lerf_ovs(width=0), "can't have a side of 0 pixels.*fix or remove the file"),
+        (lerf_ovs(width=0), "a photo of 0 × 8 pixels.*fix or remove the file"),
         (lerf_ovs(outline=[[0, 0], [4, 0]]), "has 2 points, but needs three"),
     ],
 )

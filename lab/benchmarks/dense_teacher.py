@@ -43,9 +43,11 @@ from lang3dxl_ns.preparation.encoders import (
 from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.engine import PerGaussian, QueryEngine
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import read_scene
 from lang3dxl_ns.rendering.gathering import Pixels, gather
@@ -163,33 +165,59 @@ def engine_of(scene: Scene, features: Float[Tensor, "n c"]) -> PerGaussian:
     return PerGaussian(GaussianFeatures(rows, None, (rows != 0).any(1)), scene.engine.temperature)
 
 
+@dataclass(frozen=True, eq=False)
+class Gathering:
+    """The training photos of a finished demo, whose features can be gathered onto its Gaussians."""
+
+    scene: Scene
+    photos: dict[str, ScenePhoto]
+    targets: TargetReader
+
+    @classmethod
+    def of(cls, run: Path, scene: Scene) -> Gathering:
+        photos = {photo.name: photo for photo in scene.photos if photo.split == "train"}
+        collection = read_collection(run / "scene")
+        collection = replace(collection, photos=[p for p in collection.photos if p.name in photos])
+        config = settled(PreparationConfig(clip="builtin"))
+        _, targets = prepare_photos(collection, config, run / "scene" / "lang3dxl_cache", "cpu")
+        return cls(scene, photos, targets)
+
+    @torch.no_grad()
+    def features(
+        self, read: Callable[[str], Float[Tensor, "h w c"]]
+    ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
+        """Sharpened features of all Gaussians, and their mass. read: the feature map of a photo."""
+        dense, width = self.targets.dense, self.targets.clip_dim
+        basis = PrincipalBasis.of((F.normalize(dense(n).float(), dim=-1) for n in self.photos), DENSE_AXES)
+
+        def views():
+            for name, photo in self.photos.items():
+                camera = resized(photo.camera, GATHERED)
+                groups = basis.coordinates(F.normalize(dense(name).float(), dim=-1))
+                pixels = Pixels.of([read(name), groups], (camera.height, camera.width), None)
+                yield partial(composite, self.scene.splats, camera), pixels
+
+        means = self.scene.splats.means
+        features, mass = gather(len(means), views(), width + basis.axes.shape[1], means)
+        return sharpen(features[:, :width], features[:, width:], mass), mass
+
+
+def gathered_crops(run: Path, scene: Scene) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
+    """Features of the crops of a demo's training photos on its Gaussians, and the Gaussians' mass."""
+    gathering = Gathering.of(run, scene)
+    return gathering.features(lambda name: gathering.targets.clip(name).features.float())
+
+
 @torch.no_grad()
 def compare(run: Path, teacher: Teacher) -> list[tuple[str, dict[str, float]]]:
     """AP of each word in the labeled views, by where features come from."""
     scene = read_scene(next((run / "run").rglob("*.scene")))
     truth = GroundTruth(run / "scene" / "ground_truth")
-    trained = {photo.name: photo for photo in scene.photos if photo.split == "train"}
-    collection = read_collection(run / "scene")
-    collection = replace(collection, photos=[photo for photo in collection.photos if photo.name in trained])
-    config = settled(PreparationConfig(clip="builtin"))
-    collection, targets = prepare_photos(collection, config, run / "scene" / "lang3dxl_cache", "cpu")
-    basis = PrincipalBasis.of(
-        (F.normalize(targets.dense(name).float(), dim=-1) for name in trained), DENSE_AXES
-    )
+    gathering = Gathering.of(run, scene)
+    targets = gathering.targets
 
     def gathered(read: Callable[[str], Float[Tensor, "h w c"]]) -> PerGaussian:
-        def views():
-            for name, photo in trained.items():
-                camera = resized(photo.camera, GATHERED)
-                groups = basis.coordinates(F.normalize(targets.dense(name).float(), dim=-1))
-                pixels = Pixels.of([read(name), groups], (camera.height, camera.width), None)
-                yield partial(composite, scene.splats, camera), pixels
-
-        channels = targets.clip_dim + basis.axes.shape[1]
-        features, mass = gather(len(scene.splats.means), views(), channels, scene.splats.means)
-        return engine_of(
-            scene, sharpen(features[:, : targets.clip_dim], features[:, targets.clip_dim :], mass)
-        )
+        return engine_of(scene, gathering.features(read)[0])
 
     crops = gathered(lambda name: targets.clip(name).features.float())
     dense = gathered(lambda name: teacher.read(targets.dense(name)))

@@ -20,8 +20,8 @@ from lang3dxl_ns.common.presets import load_preset, scene_presets, train_flags
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import pool
-from lang3dxl_ns.evaluation.holyscenes import is_holyscenes
 from lang3dxl_ns.evaluation.lerf_ovs import is_lerf_ovs
+from lang3dxl_ns.evaluation.mask_folders import is_holyscenes
 
 _DEPTH = 4
 """Levels of folders below --data that are searched."""

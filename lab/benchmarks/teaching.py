@@ -25,9 +25,8 @@ from lang3dxl_ns.common.reports import (
     write_report,
 )
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.evaluation.average_precision import average_precision
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.evaluation.scores import overlap
+from lang3dxl_ns.evaluation.scores import average_precision, overlap
 from lang3dxl_ns.query.teach import Box, Example, Point
 
 if TYPE_CHECKING:

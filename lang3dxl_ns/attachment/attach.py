@@ -31,7 +31,7 @@ from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
 from lang3dxl_ns.rendering.splats import Splats
 
 _LIGHT = 0.15
-"""Deviation of the photos' brightness (natural logarithm) from which it is told."""
+"""Deviation of the photos' brightness (natural logarithm) from which a message says so."""
 _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
 
 
@@ -144,13 +144,13 @@ def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path 
 
 
 def _no_fit(splats: Splats, collection: PhotoCollection, fit: Fit, place: Path | None) -> str:
-    told = ""
+    shown = ""
     if place is not None:
         picture = place.with_name(f"{place.stem}.frame.png")
         save_picture(side_by_side(splats, collection, fit), picture)
-        told = f"; {picture} shows a photo beside the splat at its camera"
+        shown = f"; {picture} shows a photo beside the splat at its camera"
     return (
         f"the photos in {collection.folder} don't show this splat in any frame that programs use (the best, "
-        f"{fit.name}, agrees to {fit.score:.2f} of 1){told}: give the photos and poses that the splat was "
+        f"{fit.name}, agrees to {fit.score:.2f} of 1){shown}: give the photos and poses that the splat was "
         "trained with, or leave out --data"
     )

@@ -70,12 +70,13 @@ class Fit:
         return float(np.std(np.log(np.clip(self.gains, 1e-3, None)))) if self.gains else 0.0
 
 
-def camera_in(similarity: Similarity, tracked: TrackedPhoto) -> Camera:
+def camera_in(similarity: Similarity | Float[Tensor, "4 4"], tracked: TrackedPhoto) -> Camera:
     """A photo's camera in the splat's frame. Its lens must not distort, or be of the undistorted photo."""
-    scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
-    view = np.vstack([tracked.camera_from_world, [0, 0, 0, 1]]) @ np.linalg.inv(similarity)
-    view[:3] = scale * view[:3]  # the camera's own axes stay of unit length
-    return tracked.lens.camera(torch.from_numpy(view).float())
+    whole = torch.as_tensor(similarity, dtype=torch.float64)
+    pose = torch.from_numpy(np.vstack([tracked.camera_from_world, [0, 0, 0, 1]])).double()
+    view = pose @ whole.inverse()
+    scale = whole[:3, :3].det().pow(1 / 3)
+    return tracked.lens.camera(torch.cat([scale * view[:3], view[3:]]).float())  # axes stay of unit length
 
 
 def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
@@ -130,7 +131,6 @@ class _Compared:
     """A photo, small and gray."""
 
     tracked: TrackedPhoto
-    side: int
     gray: Float[Tensor, "h w"]
     mask: Bool[Tensor, "h w"]
 
@@ -139,7 +139,20 @@ class _Compared:
         scale = min(side / max(photo.width, photo.height), 1.0)
         gray, mask = photo.read(scale).mean(-1), photo.read_mask(scale)
         own = tracked.resized(gray.shape[1], gray.shape[0])
-        return cls(own, side, gray, torch.ones_like(gray, dtype=torch.bool) if mask is None else mask)
+        return cls(own, gray, torch.ones_like(gray, dtype=torch.bool) if mask is None else mask)
+
+    def beside(
+        self, splats: Splats, similarity: Similarity | Float[Tensor, "4 4"]
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+        """A rendering at the photo's camera, the photo, and where the two can be compared: what is behind the
+        splat is not in it, and the edges of it are mixed."""
+        camera = camera_in(similarity, self.tracked)
+        colors = splats.colors(camera.position.detach()).mean(1, keepdim=True)
+        gaussians = splats.gaussians.seen_from(camera)
+        raster = rasterize(gaussians, camera, colors, antialiased=splats.antialiased)
+        drawn, alpha = raster.image[..., 0], raster.alpha[..., 0].detach()
+        covered = -F.max_pool2d(-alpha[None], 3, 1, 1)[0] > 0.8
+        return drawn, self.gray.to(drawn), self.mask.to(drawn.device) & covered
 
 
 @dataclass(frozen=True)
@@ -159,8 +172,7 @@ class _Comparison:
     def fit(self, splats: Splats, name: str, similarity: Similarity) -> Fit:
         scores, gains = [], []
         for photo in self.photos:
-            drawn, covered = _gray(splats, camera_in(similarity, photo.tracked))
-            mask, gray = photo.mask.to(drawn.device) & covered, photo.gray.to(drawn)
+            drawn, gray, mask = photo.beside(splats, similarity)
             scores.append(float(_correlation(drawn, gray, mask)))
             gains.append(float(gray[mask].mean() / drawn[mask].mean().clamp_min(1e-3)) if mask.any() else 1.0)
         return Fit(name, similarity, float(np.mean(scores)), tuple(gains))
@@ -188,13 +200,7 @@ class _Comparison:
         return best
 
     def _loss(self, splats: Splats, similarity: Float[Tensor, "4 4"], photo: _Compared) -> Float[Tensor, ""]:
-        scale = similarity[:3, :3].det().pow(1 / 3)
-        pose = torch.from_numpy(np.vstack([photo.tracked.camera_from_world, [0, 0, 0, 1]]))
-        view = pose @ similarity.inverse()
-        view = torch.cat([view[:3] * scale, view[3:]])
-        camera = photo.tracked.lens.camera(view.float())
-        drawn, covered = _gray(splats, camera)
-        return 1 - _correlation(drawn, photo.gray.to(drawn), photo.mask.to(drawn.device) & covered)
+        return 1 - _correlation(*photo.beside(splats, similarity))
 
 
 def _similarity(values: Float[Tensor, "7"], middle: Float[Tensor, "3"], size: float) -> Float[Tensor, "4 4"]:
@@ -206,16 +212,6 @@ def _similarity(values: Float[Tensor, "7"], middle: Float[Tensor, "3"], size: fl
     shift = middle + size * values[3:6] - turn @ middle
     top = torch.cat([turn, shift[:, None]], dim=1)
     return torch.cat([top, top.new_tensor([[0.0, 0, 0, 1]])])
-
-
-def _gray(splats: Splats, camera: Camera) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """The brightness of a rendering, and where there is one: what is behind the splat is not in it."""
-    pose = camera.view_matrix.detach()
-    colors = splats.colors(-pose[:3, :3].T @ pose[:3, 3]).mean(1, keepdim=True)
-    gaussians = splats.gaussians.seen_from(camera)
-    raster = rasterize(gaussians, camera, colors, antialiased=splats.antialiased)
-    alpha = raster.alpha[..., 0].detach()
-    return raster.image[..., 0], -F.max_pool2d(-alpha[None], 3, 1, 1)[0] > 0.8  # without the edges
 
 
 def _correlation(

@@ -73,14 +73,12 @@ def _upright(poses: Float[Array, "n 4 4"]) -> Similarity:
 
 
 def _between(source: Float[Array, "3"], target: Float[Array, "3"]) -> Similarity:
+    """The smallest rotation that takes a direction to another."""
     axis, cosine = np.cross(source, target), float(source @ target)
     turn = np.eye(4)
-    if cosine < -1 + 1e-8:
-        turn[:3, :3] = np.diag([1.0, -1, -1])
-    else:
-        x, y, z = axis
-        skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        turn[:3, :3] += skew + skew @ skew / (1 + cosine)
+    opposite = cosine < -1 + 1e-8
+    skew = np.cross(np.eye(3), axis)  # its product with a vector is axis × vector
+    turn[:3, :3] = np.diag([1.0, -1, -1]) if opposite else np.eye(3) + skew + skew @ skew / (1 + cosine)
     return turn
 
 
@@ -135,8 +133,10 @@ def registered_frames(
     if len(points) < 50 or len(means) < 50:
         return {}
     chosen = np.random.default_rng(0)
-    source = _typical(points)[chosen.permutation(len(_typical(points)))[:_POINTS]]
-    target = _typical(means)[chosen.permutation(len(_typical(means)))[:_GAUSSIANS]]
+    source, target = (
+        chosen.permutation(_typical(cloud))[:count]
+        for cloud, count in ((points, _POINTS), (means, _GAUSSIANS))
+    )
     tree, starts = KDTree(target), Rotation.create_group("O").as_matrix()
     fits = sorted((_closest(source, target, tree, start) for start in starts), key=lambda fit: fit[0])
     return {f"by its shape, {i + 1}": fit for i, (_, fit) in enumerate(fits[:most])}
@@ -152,47 +152,25 @@ def _closest(
     source: Float[Array, "m 3"], target: Float[Array, "n 3"], tree: KDTree, turn: Float[Array, "3 3"]
 ) -> tuple[float, Similarity]:
     """Iterated closest points from principal axes and a rotation; the mean distance in units of the size."""
-    size = np.linalg.norm(target - np.median(target, axis=0), axis=1).mean()
-    fit = _axes_aligned(source, target, turn)
-    distance = np.inf
+    from skimage.transform import estimate_transform  # takes a second to import
+
+    (a, from_axes, small), (b, to_axes, size) = map(_principal, (source, target))
+    fit, distance = np.eye(4), np.inf
+    fit[:3, :3] = size / max(small, 1e-12) * to_axes @ turn @ from_axes.T
+    fit[:3, 3] = b - fit[:3, :3] @ a
     for _ in range(_STEPS):
-        moved = source @ fit[:3, :3].T + fit[:3, 3]
-        near, rows = tree.query(moved)
+        near, rows = tree.query(source @ fit[:3, :3].T + fit[:3, 3])
         kept = near <= np.quantile(near, 0.8)
         distance = float(near[kept].mean() / size)
-        fit = _umeyama(source[kept], target[rows[kept]])
+        fit = estimate_transform("similarity", source[kept], target[rows[kept]]).params
     # Everything shrunk onto one place is close, too.
-    return distance * max(1.0, size / max(_spread(source) * np.cbrt(np.linalg.det(fit[:3, :3])), 1e-12)), fit
+    return distance * max(1.0, size / max(small * np.cbrt(np.linalg.det(fit[:3, :3])), 1e-12)), fit
 
 
-def _spread(points: Float[Array, "m 3"]) -> float:
-    return float(np.linalg.norm(points - np.median(points, axis=0), axis=1).mean())
-
-
-def _axes_aligned(
-    source: Float[Array, "m 3"], target: Float[Array, "n 3"], turn: Float[Array, "3 3"]
-) -> Similarity:
-    frames = []
-    for points in (source, target):
-        middle = np.median(points, axis=0)
-        _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
-        axes[:, 0] *= np.sign(np.linalg.det(axes))
-        frames.append((middle, axes, _spread(points)))
-    (a, from_axes, small), (b, to_axes, large) = frames
-    fit = np.eye(4)
-    fit[:3, :3] = large / max(small, 1e-12) * to_axes @ turn @ from_axes.T
-    fit[:3, 3] = b - fit[:3, :3] @ a
-    return fit
-
-
-def _umeyama(source: Float[Array, "m 3"], target: Float[Array, "m 3"]) -> Similarity:
-    """The similarity with the least squared distances (Umeyama 1991)."""
-    a, b = source.mean(axis=0), target.mean(axis=0)
-    covariance = (target - b).T @ (source - a) / len(source)
-    left, values, right = np.linalg.svd(covariance)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
-    scale = (values * signs).sum() / max(((source - a) ** 2).sum() / len(source), 1e-30)
-    fit = np.eye(4)
-    fit[:3, :3] = scale * (left * signs) @ right
-    fit[:3, 3] = b - fit[:3, :3] @ a
-    return fit
+def _principal(points: Float[Array, "m 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"], float]:
+    """Middle of points, their principal axes as columns of a rotation, of smallest variance first, and their
+    mean distance from the middle."""
+    middle = np.median(points, axis=0)
+    _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    return middle, axes, float(np.linalg.norm(points - middle, axis=1).mean())

@@ -24,6 +24,7 @@ from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.rendering.projection import rotations
 from lang3dxl_ns.rendering.render import Rendering, composite, render
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, Lens, resized
@@ -32,7 +33,7 @@ from lang3dxl_ns.scene.photo import Photo
 
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
 LENS = Lens(480, 360, 384.0, 384.0, 240.0, 180.0)
-"""Of the views: 64 degrees wide, as a phone's."""
+"""Lens of the views: 64 degrees wide, as a phone's."""
 BACKGROUND = (0.75, 0.8, 0.85)
 """Behind the splat: a pale sky."""
 _RULE = 3
@@ -123,13 +124,8 @@ def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[T
 
 def _normals(solid: Splats) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
     """The thinnest axis of each Gaussian, and the area of the other two, which nothing huge dominates."""
-    w, x, y, z = F.normalize(solid.quats, dim=1).unbind(1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    turns = torch.stack(rows, dim=1).reshape(-1, 3, 3)
     thin = solid.scales.argmin(1)
-    normals = turns.gather(2, thin[:, None, None].expand(-1, 3, 1))[..., 0]
+    normals = rotations(solid.quats)[torch.arange(len(solid), device=thin.device), :, thin]
     area = solid.scales.prod(1) / solid.scales.amin(1).clamp_min(1e-12)
     return normals, area.clamp_max(float(area.quantile(0.99)))
 

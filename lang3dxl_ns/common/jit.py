@@ -29,6 +29,12 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return compiled
 
 
+@numba.njit(cache=True)
+def successor(number: int) -> int:
+    """The smallest kernel, which shows that numba compiles."""
+    return number + 1
+
+
 class _Announcement(Listener):
     """Logs once per process that kernels are being compiled; loading them from disk is silent."""
 

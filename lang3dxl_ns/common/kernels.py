@@ -16,7 +16,7 @@ VARIABLE = "LANG3DXL_CPU_KERNELS"
 
 
 def takes_kernels(tensor: Tensor, wanted: str | None = None) -> bool:
-    """Whether the compiled kernels can be had, are enabled, and support a tensor's device and number type.
+    """Whether the compiled kernels are available, enabled, and suit a tensor's device and number type.
 
     wanted: "numba" or "torch"; None reads the environment variable.
     """
@@ -27,9 +27,13 @@ def takes_kernels(tensor: Tensor, wanted: str | None = None) -> bool:
 
 @functools.cache
 def numba_works() -> bool:
-    """Whether numba is installed, and not broken, which is said: it may not fit numpy, for example."""
+    """Whether numba is installed and compiles. A broken one is reported: it may not fit numpy or LLVM."""
     try:
         import numba  # noqa: F401
+
+        from lang3dxl_ns.common import jit
+
+        jit.successor(0)
     except Exception as error:  # of any kind, depending on what doesn't fit
         if not (isinstance(error, ModuleNotFoundError) and error.name == "numba"):
             say(f"numba does not work ({in_a_line(error)}): torch takes its place, at 2 to 4 times the time")

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from lang3dxl_ns.evaluation.average_precision import deviation_over_photos, mean_over_photos
-
-PREFIXES = ("", "raw_", "authors_", "teacher_", "limit_", "chance_")
-"""Which maps: the field's, unblurred, processed as published, the 2D teacher's, the lifted labels', and maps
-without information."""
+PREFIXES = {
+    "": "blurred",
+    "raw_": "unprocessed",
+    "authors_": "as published",
+    "teacher_": "2-D teacher",
+    "limit_": "limit",
+    "chance_": "chance",
+}
+"""Which maps, and their name in reports: the field's, the same unblurred or processed as published, the 2D
+teacher's, the lifted labels', and maps without information."""
 TOTALS = {
     "located": "localization_accuracy",
     "iou": "miou",
@@ -26,47 +31,45 @@ TOTALS = {
 }
 """Measures whose total is the mean over all pairs of a photo and a category, as for LERF-OVS and PT-OVS."""
 Figures = Mapping[str, float]
-"""Of one photo: psnr etc., and `{prefix}{measure}_{category}`."""
+"""Figures of one photo: psnr etc., and `{prefix}{measure}_{category}`."""
 
 
 def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str, Any]:
-    """Means over photos of every figure, and totals.
+    """Means over the photos that have a figure, for every figure, and totals.
 
     `{prefix}map`: unweighted mean of average precision over the categories. `{prefix}miou`,
     `{prefix}localization_accuracy` etc.: means over all pairs of a photo and a category.
-    `ap_{category}_photos`: number of photos with that category. with_deviation: adds `…_std` of every mean.
+    `ap_{category}_photos`: number of photos with that category. with_deviation: adds `…_std` of every mean,
+    the sample standard deviation, 0 for a single photo.
     """
-    means: dict[str, Any] = mean_over_photos(photos)
-    counts = {
-        f"{name}_photos": sum(name in photo for photo in photos) for name in means if name.startswith("ap_")
-    }
-    totals = _totals(photos, means)
+    values = _by_name(photos)
+    means: dict[str, Any] = {name: float(np.mean(found)) for name, found in values.items()}
+    totals: dict[str, float] = {}
+    for prefix in PREFIXES:
+        totals |= _mean_average_precision(means, prefix)
+        for measure, total in TOTALS.items():
+            start = f"{prefix}{measure}_"
+            pairs = [v for name, found in values.items() if name.startswith(start) for v in found]
+            if pairs:
+                totals[f"{prefix}{total}"] = float(np.mean(pairs))
+    counts = {f"{name}_photos": len(found) for name, found in values.items() if name.startswith("ap_")}
     if with_deviation:
-        deviations = deviation_over_photos(photos)
-        means = {
-            key: v for name in means for key, v in ((name, means[name]), (f"{name}_std", deviations[name]))
-        }
+        means |= {f"{n}_std": float(np.std(v, ddof=1)) if len(v) > 1 else 0.0 for n, v in values.items()}
     return means | totals | counts
 
 
-def _totals(photos: Sequence[Figures], means: Figures) -> dict[str, float]:
-    totals: dict[str, float] = {}
-    for prefix in PREFIXES:
-        precision = mean_average_precision(means, prefix)
-        if precision is not None:
-            totals[f"{prefix}map"] = precision
-        for measure, total in TOTALS.items():
-            start = f"{prefix}{measure}_"
-            pairs = [v for photo in photos for name, v in photo.items() if name.startswith(start)]
-            if pairs:
-                totals[f"{prefix}{total}"] = float(np.mean(pairs))
-    return totals
+def _by_name(photos: Iterable[Figures]) -> dict[str, list[float]]:
+    values: dict[str, list[float]] = {}
+    for photo in photos:
+        for name, value in photo.items():
+            values.setdefault(name, []).append(value)
+    return values
 
 
-def mean_average_precision(means: Figures, prefix: str = "") -> float | None:
-    """Unweighted mean of the categories' APs in `means`, each a mean over photos; None if there are none."""
+def _mean_average_precision(means: Figures, prefix: str) -> dict[str, float]:
+    """`{prefix}map`, the unweighted mean of the categories' APs in `means`; nothing if there are none."""
     found = [value for name, value in means.items() if name.startswith(f"{prefix}ap_")]
-    return float(np.mean(found)) if found else None
+    return {f"{prefix}map": float(np.mean(found))} if found else {}
 
 
 def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
@@ -78,13 +81,9 @@ def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
     totals of each scene.
     """
     per_scene = {name: average(photos) for name, photos in scenes.items()}
-    means = mean_over_photos(
-        {name: value for name, value in figures.items() if not name.endswith("_photos")}
-        for figures in per_scene.values()
-    )
+    values = _by_name(per_scene.values())
+    means = {name: float(np.mean(v)) for name, v in values.items() if not name.endswith("_photos")}
     for prefix in PREFIXES:
-        precision = mean_average_precision(means, prefix)
-        if precision is not None:
-            means[f"{prefix}map"] = precision
+        means |= _mean_average_precision(means, prefix)
     everything = [photo for photos in scenes.values() for photo in photos]
     return {"image_pooled": average(everything), "scene_mean": means, "per_scene": per_scene}

@@ -12,9 +12,8 @@ from numpy import ndarray as Array
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth
-from lang3dxl_ns.evaluation.holyscenes import is_holyscenes, read_holyscenes
 from lang3dxl_ns.evaluation.lerf_ovs import is_lerf_ovs, read_lerf_ovs
-from lang3dxl_ns.evaluation.plain_masks import read_plain
+from lang3dxl_ns.evaluation.mask_folders import is_holyscenes, read_holyscenes, read_plain
 
 Layout = Literal["holyscenes", "lerf_ovs", "plain"]
 _READERS: dict[str, Callable[[Path], Annotations]] = {
@@ -70,7 +69,7 @@ class GroundTruth:
     def scoring_size(self, height: int, width: int) -> tuple[int, int]:
         """Height and width at which maps of a photo are scored: half the photo's for masks, as in Lang3D-XL;
         the photo's own for LERF-OVS, whose filter sizes are in its pixels."""
-        return (height, width) if self.layout == "lerf_ovs" else scoring_size(height, width)
+        return (height, width) if self.layout == "lerf_ovs" else (max(height // 2, 1), max(width // 2, 1))
 
     def truths(self, photo: str, size: tuple[int, int]) -> dict[str, Truth]:
         """The photo's labels by category, at `size` (height, width).
@@ -90,17 +89,12 @@ class GroundTruth:
 
 
 def _layout(folder: Path) -> Layout:
-    found: list[Layout] = []
-    if is_holyscenes(folder):
-        found.append("holyscenes")
-    if is_lerf_ovs(folder):
-        found.append("lerf_ovs")
-    if len(found) > 1:
+    if is_holyscenes(folder) and is_lerf_ovs(folder):
         raise UserError(f"{folder} holds masks NNNN-gt.jpg and labels <photo>.json: name the layout to read")
-    if found:
-        return found[0]
-    # A folder that fits no layout gets the error message of the most common one.
-    if any(folder.glob("*/*/*-gt.*")):
+    if is_lerf_ovs(folder):
+        return "lerf_ovs"
+    # A folder above one in a layout gets the error message of that layout's reader.
+    if is_holyscenes(folder) or any(folder.glob("*/*/*-gt.*")):
         return "holyscenes"
     return "lerf_ovs" if any(folder.glob("*/*.json")) else "plain"
 
@@ -112,11 +106,6 @@ def find_ground_truth(data: Path) -> Path | None:
         return data / "ground_truth"
     labels = (data / "label", data / "label" / data.name, data.parent / "label" / data.name)
     return next((folder for folder in labels if is_lerf_ovs(folder)), None)
-
-
-def scoring_size(height: int, width: int) -> tuple[int, int]:
-    """Half a photo's size, as in Lang3D-XL."""
-    return max(height // 2, 1), max(width // 2, 1)
 
 
 def held_out_photos(truth: GroundTruth, per_category: int = 5) -> list[str]:

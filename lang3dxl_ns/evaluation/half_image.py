@@ -38,10 +38,10 @@ class HalfImage:
     vector: Float[Tensor, " v"]
     """The fitted look."""
     rendering: Float[Tensor, "h w 3"]
-    """Of the whole photo, in this look."""
+    """The whole photo's view, in this look."""
     figures: dict[str, float]
-    """Of the right half: `half_psnr` (dB), `half_ssim`, and `half_lpips` if its weights are available; and
-    `fit_seconds`."""
+    """Figures of the right half: `half_psnr` (dB), `half_ssim`, and `half_lpips` if its weights are
+    available; and `fit_seconds`."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class HalfImageProtocol:
     background: Float[Tensor, "3"]
     """Color behind the scene, 0…1."""
     ssim_weight: float
-    """Of 1 − SSIM in the color loss, as in training."""
+    """Weight of 1 − SSIM in the color loss, as in training."""
     backend: Backend = "auto"
 
     @torch.no_grad()

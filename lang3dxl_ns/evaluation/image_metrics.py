@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -27,23 +28,21 @@ class Lpips:
     Not an nn.Module, so that AlexNet stays out of checkpoints.
     """
 
-    def __init__(self) -> None:
-        self._metric: nn.Module | None = None
-        self._available = True
+    @cached_property
+    def _metric(self) -> nn.Module | None:
+        if not _weights().is_file():
+            say(f"LPIPS is skipped: it needs {ALEXNET}, put into {_weights().parent}")
+            return None
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        try:
+            return LearnedPerceptualImagePatchSimilarity(normalize=True)
+        except (OSError, RuntimeError) as error:  # a damaged file
+            say(f"LPIPS is skipped: its weights cannot be loaded ({error})")
+            return None
 
     def __call__(self, target: Float[Tensor, "1 3 h w"], predicted: Float[Tensor, "1 3 h w"]) -> float | None:
         """Distance of two images in [0, 1]; None without weights."""
-        if self._metric is None and self._available and not _weights().is_file():
-            say(f"LPIPS is skipped: it needs {ALEXNET}, put into {_weights().parent}")
-            self._available = False
-        if self._metric is None and self._available:
-            from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-            try:
-                self._metric = LearnedPerceptualImagePatchSimilarity(normalize=True)
-            except (OSError, RuntimeError) as error:  # a damaged file
-                say(f"LPIPS is skipped: its weights cannot be loaded ({error})")
-                self._available = False
         if self._metric is None:
             return None
         return float(self._metric.to(target.device)(target, predicted.clamp(0, 1)))

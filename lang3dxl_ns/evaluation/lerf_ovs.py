@@ -1,7 +1,7 @@
 """Ground truth in the layout of LERF-OVS (LangSplat's labels of LERF's scenes) and PT-OVS: polygons in JSON.
 
 One file per photo, `label/<scene>/<photo>.json`:
-`{"info": {"name", "width", "height"}, "objects": [{"category", "bbox": [left, top, right, bottom],
+`{"info": {"width", "height"}, "objects": [{"category", "bbox": [left, top, right, bottom],
 "segmentation": [[x, y], …]}, …]}`, in pixels. Several objects may share a category.
 """
 
@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lang3dxl_ns.common.checks import is_coordinate
+from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth, check_shape
+from lang3dxl_ns.scene.camera import MOST_PIXELS
 
-_MOST_PIXELS = 200_000_000
 _SLACK = 0.02
 """Share of a side by which hand-drawn outlines may exceed the photo; they are clipped to it."""
-_Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -32,9 +31,9 @@ class Outlines:
     path: Path
     height: int
     width: int
-    polygons: tuple[tuple[_Point, ...], ...]
+    polygons: tuple[tuple[tuple[float, float], ...], ...]
     """x, y in pixels, origin at the photo's top-left corner."""
-    boxes: tuple[tuple[float, float, float, float], ...]
+    boxes: tuple[tuple[float, ...], ...]
 
     def size(self) -> tuple[int, int]:
         """Height and width of the labeled photo, in pixels."""
@@ -66,7 +65,11 @@ def read_lerf_ovs(folder: Path) -> Annotations:
         raise UserError(f"{folder} holds no labels <photo>.json{hint}")
     found: dict[str, dict[str, Annotation]] = {}
     for path in paths:
-        for category, outlines in _read_labels(path).items():
+        try:
+            labels = _read_labels(path)
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+            raise UserError(f"labels {path} can't be used ({error}): fix or remove the file") from error
+        for category, outlines in labels.items():
             found.setdefault(category, {})[path.stem] = outlines
     if not found:
         raise UserError(f"the labels in {folder} contain no objects: there is nothing to score")
@@ -75,60 +78,31 @@ def read_lerf_ovs(folder: Path) -> Annotations:
 
 def _read_labels(path: Path) -> dict[str, Outlines]:
     """A photo's labels by category. Label files come from others, so everything is validated."""
-    try:
-        content = read_json(path)
-        info = content["info"]
-        _check_name(info["name"])
-        height, width = (_side(info[side]) for side in ("height", "width"))
-        if height * width > _MOST_PIXELS:
-            raise ValueError(f"a photo of {width} × {height} pixels is too large")
-        objects = [_read_object(item, height, width) for item in content["objects"]]
-    except KeyError as error:
-        raise UserError(f"labels {path} have no {error}: replace or remove the file") from error
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"labels {path} can't be used ({error}): fix or remove the file") from error
-    by_category: dict[str, Outlines] = {}
-    for category, polygon, box in objects:
-        known = by_category.get(category, Outlines(path, height, width, (), ()))
-        by_category[category] = Outlines(path, height, width, (*known.polygons, polygon), (*known.boxes, box))
-    return by_category
+    content = read_json(path)
+    height, width = (content["info"][side] for side in ("height", "width"))
+    whole = all(type(side) is int and side > 0 for side in (height, width))
+    expect(whole and height * width <= MOST_PIXELS, f"a photo of {width!r} × {height!r} pixels")
+    found: dict[str, Outlines] = {}
+    for item in content["objects"]:
+        category, polygon, box = _read_object(item, height, width)
+        known = found.get(category, Outlines(path, height, width, (), ()))
+        found[category] = Outlines(path, height, width, (*known.polygons, polygon), (*known.boxes, box))
+    return found
 
 
-def _read_object(item: Any, height: int, width: int) -> tuple[str, tuple[_Point, ...], Any]:
-    category = item["category"]
-    category = category.strip() if isinstance(category, str) else category
-    _check_name(category)
-    polygon = tuple((_number(x), _number(y)) for x, y in item["segmentation"])
-    if len(polygon) < 3:
-        raise ValueError(f"an outline of {category!r} has {len(polygon)} points, but needs three")
-    left, top, right, bottom = box = tuple(_number(value) for value in item["bbox"])
-    if not (left < right and top < bottom):
-        raise ValueError(f"a box of {category!r}, {list(box)}, is not [left, top, right, bottom]")
-    for x, y in (*polygon, (left, top), (right, bottom)):
-        if not (_within(x, width) and _within(y, height)):
-            raise ValueError(
-                f"{category!r} reaches ({x:g}, {y:g}), outside the photo of {width} × {height} pixels"
-            )
-    return category, polygon, box
-
-
-def _check_name(name: Any) -> None:
-    """Names become parts of paths, so none may lead out of its folder."""
-    if not isinstance(name, str) or name in ("", ".", "..") or any(c in name for c in "/\\\0"):
-        raise ValueError(f"{name!r} is not a plain name")
-
-
-def _side(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise ValueError(f"a photo can't have a side of {value!r} pixels")
-    return value
-
-
-def _number(value: Any) -> float:
-    if not is_coordinate(value):
-        raise ValueError(f"{value!r:.40} is not a coordinate")
-    return float(value)
-
-
-def _within(value: float, side: int) -> bool:
-    return -_SLACK * side <= value <= (1 + _SLACK) * side
+def _read_object(item: Any, height: int, width: int) -> tuple[str, tuple[Any, ...], tuple[float, ...]]:
+    """Name, outline and box of an object. The name becomes part of a path, and must not leave its folder."""
+    category = item["category"].strip()
+    plain = category not in ("", ".", "..") and not set(category) & set("/\\\0")
+    expect(plain, f"{category!r} is not a plain name")
+    outline, box = [(x, y) for x, y in item["segmentation"]], tuple(item["bbox"])
+    expect(len(outline) >= 3, f"an outline of {category!r} has {len(outline)} points, but needs three")
+    wrong = [value for point in (*outline, box) for value in point if not is_coordinate(value)]
+    expect(not wrong, f"{wrong[:1]!r:.40} is not a coordinate")
+    left, top, right, bottom = box
+    in_order = left < right and top < bottom
+    expect(in_order, f"a box of {category!r}, {list(box)}, is not [left, top, right, bottom]")
+    for x, y in (*outline, (left, top), (right, bottom)):
+        inside = abs(x / width - 0.5) <= 0.5 + _SLACK and abs(y / height - 0.5) <= 0.5 + _SLACK
+        expect(inside, f"{category!r} reaches ({x:g}, {y:g}), outside the photo of {width} × {height} pixels")
+    return category, tuple(outline), box

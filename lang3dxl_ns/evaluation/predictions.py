@@ -24,44 +24,67 @@ _LARGEST = 1e30
 """Scores beyond are as good as infinite: their squares overflow float32."""
 
 
-class PredictedMaps:
-    """A folder of maps, `<prompt>/<photo>.npy` (float, [h, w], or LangSplat's [levels, h, w]) or pictures
-    (black 0, white 1), of any size with the photo's aspect ratio.
+def score_predictions(
+    truth: GroundTruth,
+    maps: Path,
+    photos: Sequence[str] | None = None,
+    masks: Path | None = None,
+    temperature: float = 1.0,
+) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
+    """Figures of every labeled photo, by name, and the scoring protocol.
 
-    Prompts and photos are named as in the ground truth, or as `lang3dxl query` names its files.
+    Args:
+        truth: the labels.
+        maps: folder of `<prompt>/<photo>.npy` (float, [h, w], or LangSplat's [levels, h, w]) or pictures
+            (black 0, white 1), of any size with the photo's aspect ratio. Prompts and photos are named as in
+            the ground truth, or as `lang3dxl query` names its files.
+        photos: names of the photos (or labels) to score; by default all with a label.
+        masks: folder of foreground masks, white = keep; predictions become 0 elsewhere.
+        temperature: the one the maps were made with (see `MapScorer.variants`).
+
+    Raises:
+        UserError: a map is missing, damaged or of another aspect ratio.
     """
+    maps = expanded(maps)
+    if not maps.is_dir():
+        raise UserError(f"{maps} is not a folder: pass the one that holds <prompt>/<photo>.npy")
+    scorer, folders = MapScorer(truth), dict(zip(truth.categories, slugs(truth.categories), strict=True))
+    keys = truth.labeled if photos is None else [_key(truth, photo) for photo in photos]
+    keeps = {key: None if masks is None else _read_mask(masks, key) for key in keys}
+    figures: dict[str, dict[str, float]] = {}
+    with progress_bar() as bar:
+        for key in bar.track(keys, description="scoring"):
+            size = truth.scoring_size(*truth.size(key))
+            truths = truth.truths(key, size)
+            found: Maps = {c: _read_map(maps, (c, folders[c]), key, size) for c in truths}
+            figures[key] = scorer.scores_of(key, scorer.variants(found, keeps[key], temperature), truths)
+    masked = sum(keep is not None for keep in keeps.values())
+    statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"
+    protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(
+        statement if masked else "none beyond those in the maps"
+    )
+    return figures, protocol
 
-    def __init__(self, folder: Path, categories: Sequence[str]) -> None:
-        self.folder = expanded(folder)
-        if not self.folder.is_dir():
-            raise UserError(f"{self.folder} is not a folder: pass the one that holds <prompt>/<photo>.npy")
-        self._folders = {c: (c, slug) for c, slug in zip(categories, slugs(list(categories)), strict=True)}
 
-    def read(self, category: str, photo: str, size: tuple[int, int]) -> Float[Tensor, "h w"]:
-        """A map at `size`. Raises UserError if it is missing, damaged or has another aspect ratio."""
-        path = self._find(category, photo)
-        score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_gray(path, "map")) / 255
-        if score.ndim == 3:
-            score = strongest_level(score)
-        height, width = score.shape
-        check_shape(path, (height, width), size)
-        return resize_map(torch.from_numpy(score.astype(np.float32))[None], size)[0]
-
-    def _find(self, category: str, photo: str) -> Path:
-        names = dict.fromkeys((photo, photo.replace("/", "_")))
-        paths = [
-            self.folder / folder / f"{name}{suffix}"
-            for folder in self._folders[category]
-            for name in names
-            for suffix in (".npy", *PICTURES, ".JPG", ".JPEG", ".PNG")
-        ]
-        found = next((path for path in paths if path.is_file()), None)
-        if found is None:
-            raise UserError(
-                f"there is no map of {category!r} for the photo {photo}: make {paths[0]} (or a picture), or "
-                f"name the photos to score with --photos"
-            )
-        return found
+def _read_map(
+    maps: Path, folders: tuple[str, str], photo: str, size: tuple[int, int]
+) -> Float[Tensor, "h w"]:
+    """A prompt's map at `size`, from the first of the prompt's folders that holds one of the photo."""
+    names = dict.fromkeys((photo, photo.replace("/", "_")))
+    suffixes = (".npy", *PICTURES, ".JPG", ".JPEG", ".PNG")
+    paths = [maps / folder / f"{name}{suffix}" for folder in folders for name in names for suffix in suffixes]
+    path = next((path for path in paths if path.is_file()), None)
+    if path is None:
+        raise UserError(
+            f"there is no map of {folders[0]!r} for the photo {photo}: make {paths[0]} (or a picture), or "
+            f"name the photos to score with --photos"
+        )
+    score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_gray(path, "map")) / 255
+    if score.ndim == 3:
+        score = strongest_level(score)
+    height, width = score.shape
+    check_shape(path, (height, width), size)
+    return resize_map(torch.from_numpy(score.astype(np.float32))[None], size)[0]
 
 
 def _read_array(path: Path) -> Float[Array, "*levels h w"]:
@@ -77,37 +100,6 @@ def _read_array(path: Path) -> Float[Array, "*levels h w"]:
     if not (np.abs(score) < _LARGEST).all():
         raise UserError(f"map {path} holds NaN or infinity: fix the program that made it")
     return score
-
-
-def score_predictions(
-    truth: GroundTruth,
-    maps: Path,
-    photos: Sequence[str] | None = None,
-    masks: Path | None = None,
-    temperature: float = 1.0,
-) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
-    """Figures of every labeled photo, by name, and the scoring protocol.
-
-    photos: names of the photos (or labels) to score; by default all with a label. masks: folder of foreground
-    masks, white = keep; predictions become 0 elsewhere. temperature: the one the maps were made with
-    (see `MapScorer.variants`). Raises UserError for a missing map.
-    """
-    scorer, predicted = MapScorer(truth), PredictedMaps(maps, truth.categories)
-    keys = truth.labeled if photos is None else [_key(truth, photo) for photo in photos]
-    keeps = {key: None if masks is None else _read_mask(masks, key) for key in keys}
-    figures: dict[str, dict[str, float]] = {}
-    with progress_bar() as bar:
-        for key in bar.track(keys, description="scoring"):
-            size = truth.scoring_size(*truth.size(key))
-            truths = truth.truths(key, size)
-            found: Maps = {category: predicted.read(category, key, size) for category in truths}
-            figures[key] = scorer.scores_of(key, scorer.variants(found, keeps[key], temperature), truths)
-    masked = sum(keep is not None for keep in keeps.values())
-    statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"
-    protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(
-        statement if masked else "none beyond those in the maps"
-    )
-    return figures, protocol
 
 
 def _key(truth: GroundTruth, photo: str) -> str:

@@ -43,7 +43,7 @@ def score_scene(
     figures: dict[str, dict[str, float]] = {}
     with progress_bar() as bar:
         for photo in bar.track(photos, description="evaluating"):
-            width, height = photo.size or (photo.lens.width, photo.lens.height)
+            width, height = photo.file_size
             size, keep = truth.scoring_size(height, width), photo.foreground()
             keep = None if keep is None else keep.to(scene.device)
             raw, published = (

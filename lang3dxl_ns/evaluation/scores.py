@@ -14,7 +14,6 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from torch import Tensor
 
 from lang3dxl_ns.evaluation.annotations import Truth
-from lang3dxl_ns.evaluation.average_precision import average_precision
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
 Maps = dict[str, Float[Tensor, "h w"]]
@@ -31,6 +30,19 @@ _VOTERS = 7
 
 
 # ── one map ─────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"]) -> float | None:
+    """AP = Σ (R_n − R_{n−1}) P_n over all pixels, as in scikit-learn; None without a positive pixel.
+
+    Equal scores form one step, so the order of pixels does not matter.
+    Raises ValueError on NaN or on shapes that differ.
+    """
+    from sklearn.metrics import average_precision_score
+
+    if score.shape != truth.shape:
+        raise ValueError(f"the score map has shape {score.shape}, the truth {truth.shape}")
+    return float(average_precision_score(truth.ravel(), score.ravel())) if truth.any() else None
 
 
 def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) -> dict[str, float]:
@@ -92,7 +104,7 @@ def smooth_mask(score: Float[Array, "h w"], mean: Float[Array, "h w"]) -> Bool[A
 
 
 def strongest_level(levels: Float[Array, "l h w"]) -> Float[Array, "h w"]:
-    """Of maps at several levels (LangSplat has three), the one with the highest smoothed peak."""
+    """The map with the highest smoothed peak among maps at several levels (LangSplat has three)."""
     peaks = [uniform_filter(level.astype(np.float64), SMOOTHING, mode="mirror").max() for level in levels]
     return levels[int(np.argmax(peaks))]
 

@@ -170,8 +170,8 @@ class Conversation:
             best = max((view.score for view in found.views), default=0.0)
             where = f"{count} good views, best {best:.2f}" if count else "nothing in the scene looks like it"
             lines.append(f"**{plain(text)}**: {where}")
-            told = (None if found.prompt.taught else caution(text), doubtful(text, found.doubt))
-            lines += [plain(line) for line in told if line]
+            warnings = (None if found.prompt.taught else caution(text), doubtful(text, found.doubt))
+            lines += [plain(line) for line in warnings if line]
         return "  \n".join(lines)
 
     def status(self) -> str:

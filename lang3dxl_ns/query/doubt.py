@@ -8,7 +8,7 @@ here depends on the encoder or the scene (conformal p-values: Vovk, Gammerman & 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import torch
@@ -59,25 +59,19 @@ class Doubts:
         """For each prompt, from the relevancy of all Gaussians to it, the share of texts, itself among them,
         that fit the scene at least as well: (1 + #{u ≥ prompt}) / (1 + 60). At most x with a probability of x
         for an absent thing. 1 for a prompt that fits nowhere (`LEAST_PEAK`)."""
-        unrelated = self._unrelated
+        unrelated = self.unrelated
         return [
             (1 + int((unrelated >= peak).sum())) / (1 + len(unrelated)) if peak >= LEAST_PEAK else 1.0
             for peak in peaks(relevancy)
         ]
 
     @cached_property
-    def _unrelated(self) -> Float[Tensor, " u"]:
-        return torch.cat([peaks(self._relevancy(few)) for few in _few(self._queries(UNRELATED))])
-
-
-def _few(queries: Queries) -> Iterator[Queries]:
-    """The same queries, a few at a time: all of them to millions of Gaussians would take gigabytes."""
-    for first in range(0, len(queries), _AT_A_TIME):
-        groups = [group[first : first + _AT_A_TIME] for group in (queries.positive, queries.negative)]
-        rows = sorted({row for group in groups for members in group for row in members})
-        place = {row: k for k, row in enumerate(rows)}
-        positive, negative = (tuple(tuple(place[row] for row in each) for each in group) for group in groups)
-        yield Queries(queries.vectors[rows], positive, negative)
+    def unrelated(self) -> Float[Tensor, " u"]:
+        """How well the unrelated words fit: `peaks`. A few are asked at a time, since all of them to millions
+        of Gaussians would take gigabytes."""
+        self._queries(UNRELATED)  # encodes them together
+        parts = [UNRELATED[i : i + _AT_A_TIME] for i in range(0, len(UNRELATED), _AT_A_TIME)]
+        return torch.cat([peaks(self._relevancy(self._queries(part))) for part in parts])
 
 
 def peaks(relevancy: Float[Tensor, "q n"]) -> Float[Tensor, " q"]:

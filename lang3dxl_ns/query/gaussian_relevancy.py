@@ -33,8 +33,8 @@ class GaussianFeatures:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, decoder: Decoder, carried: Float[Tensor, "n d"]) -> GaussianFeatures:
-        """Decode the carried values of Gaussians; a NaN marks an unknown one."""
+    def of(cls, decoder: Decoder, codes: Float[Tensor, "n d"]) -> GaussianFeatures:
+        """Decode the codes of Gaussians; a NaN marks an unknown one."""
         layer = decoder.clip_head()
         narrow = layer is not None and layer[0].shape[1] < layer[0].shape[0]
         head = torch.cat([layer[0].T, layer[1][None]]) if narrow and layer else None
@@ -51,7 +51,7 @@ class GaussianFeatures:
             # A feature that all but vanishes says nothing, and its row may exceed half precision.
             return torch.where(seen & (rows.abs() < 6e4).all(1, keepdim=True), rows, 0.0).half()
 
-        rows = _in_chunks(decode, carried, decoder.clip_dim)
+        rows = _in_chunks(decode, codes, decoder.clip_dim)
         return cls(rows, head, (rows != 0).any(1))
 
     def some(self, count: int) -> GaussianFeatures:

@@ -162,7 +162,7 @@ class Found:
     box: Box | None
     """Around the strongest connected match; None if nothing matches."""
     relevancy: Float[Array, " n"]
-    """Of every Gaussian, 0…1."""
+    """Relevancy of every Gaussian, 0…1."""
     gaussians: Bool[Array, " n"]
     """Those that match: the selection that masks show in 2D."""
     doubt: float

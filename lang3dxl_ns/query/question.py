@@ -77,8 +77,8 @@ class Question:
             there = F.interpolate(foreground[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
             keep = keep & there.to(keep.device)
         count = len(self.prompts)
-        carried, covered = rendering.channels.tensor_split([-count], dim=2)
-        maps = torch.cat([self._confined(self.engine.maps(carried, self.queries)), covered.permute(2, 0, 1)])
+        values, covered = rendering.channels.tensor_split([-count], dim=2)
+        maps = torch.cat([self._confined(self.engine.maps(values, self.queries)), covered.permute(2, 0, 1)])
         if maps.shape[1:] != size:
             maps = F.interpolate(maps[None].float(), size, mode="bilinear", align_corners=False)[0]
         return maps[:count] * keep, (maps[count:] >= COVERED) & keep

@@ -10,17 +10,18 @@ import pickle
 import re
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import isqrt
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Shaped
+from jaxtyping import Float, Float32
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
@@ -131,16 +132,9 @@ def _activated(
     """Splats from what files store: logarithms of scales, logits of opacities, harmonics [n, k, 3]."""
     means, log_scales, quats, logits, harmonics = map(_tensor, (means, log_scales, quats, logits, harmonics))
     bands = harmonics.shape[1]
-    if isqrt(bands) ** 2 != bands:
-        raise ValueError(f"it has {bands} harmonics per color")
-    return Splats(
-        means,
-        quats,
-        log_scales.exp(),
-        logits.reshape(-1).sigmoid(),
-        harmonics[:, :_ALL_BANDS].contiguous(),
-        antialiased,
-    )
+    expect(isqrt(bands) ** 2 == bands, f"it has {bands} harmonics per color")
+    opacities, harmonics = logits.reshape(-1).sigmoid(), harmonics[:, :_ALL_BANDS].contiguous()
+    return Splats(means, quats, log_scales.exp(), opacities, harmonics, antialiased)
 
 
 def _tensor(values: Any) -> Float[Tensor, "n ..."]:
@@ -156,127 +150,89 @@ _PLY_TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
-
-
-@dataclass(frozen=True)
-class _Element:
-    """A table of a PLY."""
-
-    count: int
-    columns: dict[str, str]
-    """NumPy's types without byte order."""
-
-    @property
-    def bands(self) -> int:
-        """Harmonics per color."""
-        return 1 + sum(name.startswith("f_rest_") for name in self.columns) // 3
+_NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
+_Tables = dict[str, tuple[int, "np.dtype[Any]"]]
+"""Length and row of each table of a PLY, by its name, in the file's order."""
 
 
 def _ply(path: Path) -> Splats:
     with path.open("rb") as file:
-        form, elements = _ply_header(file)
-        if "chunk" in elements and "packed_position" in elements.get("vertex", _Element(0, {})).columns:
-            return _supersplat(path, elements)
-        vertex = elements.get("vertex")
-        missing = [name for name in _NEEDED if vertex is None or name not in vertex.columns]
-        if vertex is None or missing:
+        form, tables = _ply_header(file)
+        count, row = tables.get("vertex", (0, np.dtype([])))
+        columns = row.names or ()
+        if form != "ascii":
+            announced = sum(length * kind.itemsize for length, kind in tables.values())
+            expect(announced <= path.stat().st_size - file.tell(), "it announces more than it holds")
+        if "chunk" in tables and "packed_position" in columns:
+            return _supersplat(path, tables)
+        if missing := [name for name in _NEEDED if name not in columns]:
             raise _OtherKindError(
                 f"its points have no {', '.join(missing[:3])}; a point cloud can't be attached to"
             )
-        if next(iter(elements)) != "vertex":
-            raise ValueError("its points don't come first")
-        _check_memory(vertex.count, vertex.bands)
-        return _of_table(_ply_table(file, path, form, vertex))
+        expect(next(iter(tables)) == "vertex", "its points don't come first")
+        _check_memory(count, 1 + sum(name.startswith("f_rest_") for name in columns) // 3)
+        if form != "ascii":
+            return _of_table(np.fromfile(file, row, count))
+        numbers = np.fromstring(file.read().decode("latin-1"), sep=" ", dtype=np.float32)
+        rows = numbers[: count * len(columns)].reshape(count, len(columns))
+        return _of_table({name: rows[:, i] for i, name in enumerate(columns)})
 
 
-_NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
-
-
-def _ply_header(file: BinaryIO) -> tuple[str, dict[str, _Element]]:
+def _ply_header(file: BinaryIO) -> tuple[str, _Tables]:
     """The format and the tables of a PLY; the file is left at the first of them."""
     head = file.read(_HEADER)
-    if not head.startswith(b"ply"):
-        raise ValueError("it doesn't begin like a PLY")
+    expect(head.startswith(b"ply"), "it doesn't begin like a PLY")
     end = re.search(rb"end_header\r?\n", head)
     if end is None:
         raise ValueError("its header doesn't end")
-    form, elements, columns = "", dict[str, _Element](), dict[str, str]()
+    form, order, listed = "", "<", dict[str, tuple[int, list[tuple[str, str]]]]()
+    columns: list[tuple[str, str]] = []
     for line in head[: end.start()].decode("latin-1").splitlines():
         match line.split():
-            case ["format", name, *_]:
-                form = name
-            case ["element", name, _] if name in elements:
-                raise ValueError(f"it lists {name} twice")
-            case ["property", _, name] if name in columns:
-                raise ValueError(f"its points have {name} twice")
+            case ["format", form, *_]:
+                order = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}[form]
             case ["element", name, count]:
-                columns = {}
-                elements[name] = _Element(int(count), columns)
-            case ["property", kind, name]:
-                columns[name] = _PLY_TYPES[kind]
-            case ["property", "list", *_]:
-                columns["list"] = "V0"  # follows the vertices in meshes; never read
-    if any(element.count < 0 for element in elements.values()):
-        raise ValueError("a table has a negative length")
+                expect(name not in listed and int(count) >= 0, f"it lists {name} twice, or less than none")
+                columns = []
+                listed[name] = (int(count), columns)
+            case ["property", "list", *_, column]:
+                columns.append((column, "V0"))  # follow the vertices in meshes, and are never read
+            case ["property", kind, column]:
+                columns.append((column, order + _PLY_TYPES[kind]))
     file.seek(end.end())
-    return form, elements
+    return form, {name: (count, np.dtype(columns)) for name, (count, columns) in listed.items()}
 
 
-def _ply_table(file: BinaryIO, path: Path, form: str, element: _Element) -> Mapping[str, Shaped[Array, " n"]]:
-    if form == "ascii":
-        text = np.fromstring(file.read().decode("latin-1"), sep=" ", dtype=np.float32)
-        rows = text[: element.count * len(element.columns)].reshape(element.count, len(element.columns))
-        return {name: rows[:, i] for i, name in enumerate(element.columns)}
-    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[form]
-    kind = np.dtype([(name, order + column) for name, column in element.columns.items()])
-    if element.count * kind.itemsize > path.stat().st_size - file.tell():
-        raise ValueError(f"it announces {element.count:,} Gaussians and holds fewer")
-    table = np.fromfile(file, kind, element.count)
-    return {name: table[name] for name in element.columns}
-
-
-def _of_table(table: Mapping[str, Shaped[Array, " n"]]) -> Splats:
+def _of_table(table: Any) -> Splats:
     """Splats from the columns that 3D Gaussian splatting writes."""
-    rest = sorted((name for name in table if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
-    constant = [table[f"f_dc_{i}"] for i in range(3)] if "f_dc_0" in table else None
-    if constant is None:
-        colors = torch.stack(
-            [_tensor(table[name].astype(np.float32)) for name in ("red", "green", "blue")], 1
-        )
-        first = harmonics_of(colors / 255)
+
+    def columns(*names: str) -> Float[Tensor, "n k"]:
+        return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in names], axis=1))
+
+    known = table.dtype.names if isinstance(table, np.ndarray) else tuple(table)
+    rest = sorted((name for name in known if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
+    if "f_dc_0" in known:
+        first = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     else:
-        first = _columns(constant)[:, None]
+        first = harmonics_of(columns("red", "green", "blue") / 255)
     # Channel by channel.
-    others = _columns([table[name] for name in rest]).reshape(len(first), 3, -1).mT if rest else first[:, :0]
-    scales = [table[f"scale_{i}"] for i in range(2)]
+    others = columns(*rest).reshape(len(first), 3, -1).mT if rest else first[:, :0]
+    scales = columns("scale_0", "scale_1")
     # A flat Gaussian (2D Gaussian splatting) has two scales.
-    scales.append(table["scale_2"] if "scale_2" in table else np.minimum(*scales) - 5)
-    return _activated(
-        _columns([table[name] for name in "xyz"]),
-        _columns(scales),
-        _columns([table[f"rot_{i}"] for i in range(4)]),
-        _tensor(table["opacity"].astype(np.float32)),
-        torch.cat([first, others], dim=1),
-    )
+    third = columns("scale_2") if "scale_2" in known else scales.amin(1, keepdim=True) - 5
+    quats, harmonics = columns("rot_0", "rot_1", "rot_2", "rot_3"), torch.cat([first, others], dim=1)
+    scales = torch.cat([scales, third], dim=1)
+    return _activated(columns("x", "y", "z"), scales, quats, columns("opacity"), harmonics)
 
 
-def _columns(columns: list[Shaped[Array, " n"]]) -> Float[Tensor, "n k"]:
-    return torch.from_numpy(np.stack([column.astype(np.float32) for column in columns], axis=1))
-
-
-def _supersplat(path: Path, elements: dict[str, _Element]) -> Splats:
+def _supersplat(path: Path, tables: _Tables) -> Splats:
     """SuperSplat's compressed PLY, in chunks of 256 Gaussians."""
     import gsply
 
-    vertex, chunks = elements["vertex"], elements["chunk"].count
-    if chunks != -(-vertex.count // 256):
-        raise ValueError(f"{vertex.count:,} Gaussians don't lie in {chunks:,} chunks")
-    _check_memory(vertex.count, _ALL_BANDS)
-    kinds = {name: np.dtype([(c, t) for c, t in e.columns.items()]) for name, e in elements.items()}
-    if sum(e.count * kinds[name].itemsize for name, e in elements.items()) > path.stat().st_size:
-        raise ValueError(f"it announces {vertex.count:,} Gaussians and holds fewer")
-    if elements.get("sh", _Element(vertex.count, {})).count != vertex.count:
-        raise ValueError("its harmonics are of other Gaussians")
+    count, chunks = tables["vertex"][0], tables["chunk"][0]
+    expect(chunks == -(-count // 256), f"{count:,} Gaussians don't lie in {chunks:,} chunks")
+    expect(tables.get("sh", (count,))[0] == count, "its harmonics are of other Gaussians")
+    _check_memory(count, _ALL_BANDS)
     return _of_gsply(gsply.plyread(path))
 
 
@@ -301,8 +257,8 @@ def _spz(path: Path) -> Splats:
             _, _, count, degree, *_ = struct.unpack("<IIIBBBB", stream.read(16))
             _check_memory(count, _ALL_BANDS)
             most = 20 * count + 3 * 15 * count + (1 << 20)
-            if degree > 3 or len(stream.read(most)) == most:
-                raise ValueError("it unpacks to more than its header announces")
+            fits = degree <= 3 and len(stream.read(most)) < most
+            expect(fits, "it unpacks to more than its header announces")
     return _of_gsply(gsply.read_spz(path))
 
 
@@ -312,8 +268,7 @@ _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), 
 def _splat(path: Path) -> Splats:
     """The format of the first viewers for the web: 32 bytes each, one color."""
     size = path.stat().st_size
-    if size % _SPLAT.itemsize:
-        raise ValueError(f"{size} bytes are not whole Gaussians of {_SPLAT.itemsize} bytes")
+    expect(size % _SPLAT.itemsize == 0, f"{size} bytes are not whole Gaussians of {_SPLAT.itemsize} bytes")
     _check_memory(size // _SPLAT.itemsize, 1)
     table = np.fromfile(path, _SPLAT)
     colors = torch.from_numpy(table["color"].astype(np.float32) / 255)
@@ -344,10 +299,11 @@ def _checkpoint(path: Path) -> Splats:
             state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except pickle.UnpicklingError as error:
         raise ValueError("it holds more than tensors, or is no checkpoint; nothing in it was run") from error
-    if isinstance(state, dict) and isinstance(state.get("pipeline"), dict):
-        return _splatfacto(state["pipeline"], path)
-    if isinstance(state, dict) and isinstance(state.get("splats"), dict):
-        return _gsplat(state["splats"])
+    parts = state if isinstance(state, dict) else {}
+    if isinstance(parts.get("pipeline"), dict):
+        return _splatfacto(parts["pipeline"], path)
+    if isinstance(parts.get("splats"), dict):
+        return _gsplat(parts["splats"])
     raise _OtherKindError("it is a checkpoint of another program than gsplat and nerfstudio")
 
 
@@ -364,8 +320,9 @@ def _gsplat(parts: Mapping[str, Any]) -> Splats:
 
 
 def _splatfacto(pipeline: Mapping[str, Any], path: Path) -> Splats:
-    """nerfstudio's splatfacto, of any version."""
-    own = {name.rpartition(".")[2]: value for name, value in pipeline.items() if _is_gaussian(name)}
+    """nerfstudio's splatfacto, of any version: older ones call the means _model.means."""
+    names = {name: re.fullmatch(r"_model\.(?:gauss_params\.)?([^.]+)", name) for name in pipeline}
+    own = {found[1]: pipeline[name] for name, found in names.items() if found}
     _check_parts(own, ("means", "scales", "quats", "opacities", "features_dc", "features_rest"))
     first, rest = own["features_dc"].float().reshape(-1, 1, 3), own["features_rest"].float()
     if not rest.shape[1]:  # colors themselves, as logits
@@ -376,20 +333,16 @@ def _splatfacto(pipeline: Mapping[str, Any], path: Path) -> Splats:
     return _activated(own["means"], own["scales"], own["quats"], own["opacities"], harmonics, antialiased)
 
 
-def _is_gaussian(name: str) -> bool:
-    return name.startswith("_model.gauss_params.") or (name.startswith("_model.") and name.count(".") == 1)
-
-
 def _check_parts(parts: Mapping[str, Any], names: tuple[str, ...]) -> None:
     missing = [name for name in names if not isinstance(parts.get(name), Tensor)]
     if missing:
         raise _OtherKindError(f"it has no {', '.join(missing)}")
     count = len(parts["means"])
     for name, value in parts.items():
-        if name in names and len(value) != count:
-            raise ValueError(f"{name} are {len(value):,}, and means {count:,}")
-        if isinstance(value, Tensor) and value.nbytes > value.untyped_storage().nbytes():
-            raise ValueError(f"{name} is larger than what is stored of it")
+        expect(name not in names or len(value) == count, f"{name} are not as many as means")
+        if isinstance(value, Tensor):
+            stored = value.untyped_storage().nbytes()
+            expect(value.nbytes <= stored, f"{name} is larger than what is stored of it")
     _check_memory(count, _ALL_BANDS)
 
 

@@ -43,16 +43,21 @@ class ScenePhoto:
     camera_to_world: list[list[float]]
     """[3, 4], the model's frame, nerfstudio's camera axes (x right, y up, z backward)."""
     lens: Lens
-    """Of the file: masks are drawn on the distorted photo, while views are undistorted."""
+    """Lens of the file: masks are drawn on the distorted photo, while views are undistorted."""
     mask: str | bytes | None = None
     """Foreground mask of the photo: its file, or the content of a PNG of the undistorted mask."""
     size: tuple[int, int] | None = None
     """Width and height of the file; None in runs of earlier versions: that of the lens."""
 
     def __repr__(self) -> str:
-        width, height = self.size or (self.lens.width, self.lens.height)
+        width, height = self.file_size
         held_out = ", held out" if self.split == "eval" else ""
         return f"ScenePhoto({self.name!r}, {width} × {height} pixels{held_out})"
+
+    @property
+    def file_size(self) -> tuple[int, int]:
+        """Width and height of the file."""
+        return self.size or (self.lens.width, self.lens.height)
 
     @property
     def camera(self) -> Camera:
@@ -62,8 +67,7 @@ class ScenePhoto:
     @property
     def full_camera(self) -> Camera:
         """The camera at the file's resolution."""
-        lens = self.lens if self.size is None else self.lens.resized(*self.size)
-        return lens.camera(self._view_matrix)
+        return self.lens.resized(*self.file_size).camera(self._view_matrix)
 
     @property
     def _view_matrix(self) -> Float[Tensor, "4 4"]:
@@ -157,44 +161,31 @@ def scene_from_json(content: dict[str, Any]) -> SceneFile:
 
     Raises ValueError, KeyError, TypeError or AttributeError for anything else.
     """
-    return _checked(SceneFile(**{**content, "photos": [_photo(**photo) for photo in content["photos"]]}))
-
-
-def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
-    distortion = tuple(lens.pop("distortion"))
-    size = None if size is None else tuple(size)
-    return ScenePhoto(lens=Lens(**lens, distortion=distortion), size=size, **rest)
-
-
-def _checked(scene: SceneFile) -> SceneFile:
-    """The scene, after validating all its values. Raises ValueError."""
-    expect(scene.photos != [], "it lists no photo")
-    for photo in scene.photos:
-        expect(is_name(photo.name), f"a photo is called {photo.name!r}")
-        expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
-        expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
-        expect(len(photo.camera_to_world) == 3, f"{photo.name} has no pose")
-        check_pose(photo.camera_to_world)
-        photo.lens.check()
-        if photo.size is not None:
-            expect(len(photo.size) == 2, f"{photo.name} has the size {photo.size}")
-            replace(photo.lens, width=photo.size[0], height=photo.size[1]).check()
-    expect(len({photo.name for photo in scene.photos}) == len(scene.photos), "a photo is listed twice")
+    photos = [_photo(**photo) for photo in content["photos"]]
+    scene = SceneFile(**{**content, "photos": photos})
+    expect(photos != [], "it lists no photo")
+    expect(len({photo.name for photo in photos}) == len(photos), "a photo is listed twice")
     for text in (scene.clip, scene.clip_identity):
         expect(isinstance(text, str | None), f"its CLIP is {text!r}")
     expect(isinstance(scene.data, str), f"its data are in {scene.data!r}")
-    expect(
-        isinstance(scene.scale, float | int) and 0 < scene.scale < math.inf, f"its scale is {scene.scale!r}"
-    )
-    expect(_is_transform(scene.transform), "it has no transform")
+    expect(is_coordinate(scene.scale) and scene.scale > 0, f"its scale is {scene.scale!r}")
+    known = all(is_coordinate(value) for row in scene.transform for value in row)
+    expect(known and [len(row) for row in scene.transform] == [4, 4, 4], "it has no transform")
     return scene
 
 
-def _is_transform(rows: object) -> bool:
-    """Whether these are three rows of four finite numbers."""
-    if not isinstance(rows, list) or [len(row) for row in rows if isinstance(row, list)] != [4, 4, 4]:
-        return False
-    return len(rows) == 3 and all(is_coordinate(value) for row in rows for value in row)
+def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
+    distortion, size = tuple(lens.pop("distortion")), None if size is None else tuple(size)
+    photo = ScenePhoto(lens=Lens(**lens, distortion=distortion), size=size, **rest)
+    expect(is_name(photo.name), f"a photo is called {photo.name!r}")
+    expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
+    expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
+    expect(len(photo.camera_to_world) == 3, f"{photo.name} has no pose")
+    check_pose(photo.camera_to_world)
+    photo.lens.check()
+    width, height = photo.file_size
+    replace(photo.lens, width=width, height=height).check()
+    return photo
 
 
 def read_camera_path(path: Path) -> Sequence[Camera]:

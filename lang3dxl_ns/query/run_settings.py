@@ -9,19 +9,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, in_a_line
 from lang3dxl_ns.common.files import read_text
 
 TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
 _PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
-_PYTHON = "tag:yaml.org,2002:python/"
 _MOVED = {
     f"lang3dxl_ns.plugin.{old}": f"lang3dxl_ns.plugin.{new}"
     for old, new in {
@@ -32,6 +30,8 @@ _MOVED = {
 """Where settings are that earlier versions kept elsewhere."""
 _REMOVED = {"DecoderConfig": ("start",)}
 """Settings of earlier versions, by their class, that only training read: a finished run opens without."""
+_DAMAGED = (LookupError, TypeError, AttributeError, ValueError, RecursionError, ImportError)
+"""Exceptions raised on making settings of values that are none."""
 _UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
 """nerfstudio's classes that unpickle what they read."""
 
@@ -62,10 +62,7 @@ def read_settings(path: Path, places: Sequence[Sequence[str]], complete: bool = 
         found = _construct(read_text(path), places)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError) as error:
         raise UserError(f"{path} is not a file: pass the config.yml of a run") from error
-    except (
-        *(yaml.YAMLError, OSError, LookupError, TypeError, AttributeError, ValueError),
-        *(RecursionError, ImportError),
-    ) as error:
+    except (yaml.YAMLError, OSError, *_DAMAGED) as error:
         raise UserError(
             f"{path} can't be read ({error}): it is damaged, or from a version of lang3dxl-ns whose settings "
             "are no longer known; restore it, open it with that version, or train anew"
@@ -86,8 +83,6 @@ def _construct(text: str, places: Sequence[Sequence[str]]) -> list[Any]:
     loader = _SettingsLoader(text)
     try:
         root = loader.get_single_node()
-        if why := _asks_for(root):
-            raise yaml.constructor.ConstructorError(None, None, f"it asks to {why}")
         nodes = [_at(root, place) for place in places]
         return [None if node is None else loader.construct_document(node) for node in nodes]
     finally:
@@ -165,15 +160,14 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def check_command_line(arguments: Sequence[str]) -> None:
-    """Exit from an `ns-…` command whose `--load-config` file is a run of this method's and asks for more than
+    """Exit from an `ns-…` command whose `--load-config` file is a run of this method's and holds more than
     settings, or can't be looked at before nerfstudio reads it: a pipe, or a device.
 
     nerfstudio calls whatever such a file names. It imports the methods first, this one among them, which is
-    the earliest moment a plugin can check. The YAML nodes are inspected, not constructed. Files that do not
-    name this package are left to nerfstudio.
+    the earliest moment a plugin can check. Files that do not name this package are left to nerfstudio.
     """
     for path in load_configs(arguments):
-        if os.environ.get(TRUST_VARIABLE) != "1" and (why := _file_asks_for(path)):
+        if os.environ.get(TRUST_VARIABLE) != "1" and (why := _trouble(path)):
             sys.exit(
                 f"Error: {path} {why}: nothing in it was run. If you trust its author, set {TRUST_VARIABLE}=1"
             )
@@ -189,80 +183,19 @@ def load_configs(arguments: Sequence[str]) -> Iterator[Path]:
                 yield path
 
 
-def _file_asks_for(path: Path) -> str | None:
+def _trouble(path: Path) -> str | None:
+    """Why a file may not be passed on to nerfstudio; None if it may."""
     try:
         text = read_text(path)
-        why = _asks_for(yaml.compose(text, Loader=yaml.Loader)) if "lang3dxl" in text.lower() else None
-        return why and f"asks to {why}, which settings never need"
-    except yaml.YAMLError:
-        return None  # the command can't read it either
-    except (OSError, ValueError) as error:
+        if "lang3dxl_ns." in text:
+            _construct(text, [()])
+    except (OSError, UnicodeError) as error:
         return f"can't be checked before it is used ({error})"
-    except RecursionError:  # the command, called from fewer functions, might
-        return "asks to nest more deeply than settings do"
-
-
-def _asks_for(root: yaml.Node | None) -> str | None:
-    """What settings should not ask for, in a few words; None if there is nothing."""
-    known = {"torch", *_PACKAGES, *_plugins()}
-    for tag in _tags(root):
-        kind, _, name = tag.removeprefix(_PYTHON).partition(":")
-        package, last = name.partition(".")[0], name.rpartition(".")[2]
-        if kind == "module":
-            return f"load the module {name}"
-        if last in _UNSAFE:
-            return f"load {name}"
-        if kind in ("object/apply", "object/new") and not _is_harmless(name, known):
-            return f"call {name}"
-        if kind == "object" and not (package in known and last[:1].isupper()):
-            return f"make a {name}"
-        if kind == "name" and not (package in known and (last[:1].isupper() or _is_settings_function(name))):
-            return f"load {name}"
+    except (yaml.constructor.ConstructorError, *_DAMAGED) as error:
+        return f"holds more than settings ({in_a_line(error)})"
+    except yaml.YAMLError:
+        pass  # the command can't read it either
     return None
-
-
-def _tags(node: yaml.Node | None) -> Iterator[str]:
-    """The Python tags of a file's nodes."""
-    waiting, seen = [node], set()
-    while waiting:
-        node = waiting.pop()
-        if node is None or id(node) in seen:
-            continue
-        seen.add(id(node))
-        if node.tag.startswith(_PYTHON):
-            yield node.tag
-        if isinstance(node, yaml.MappingNode):
-            waiting += [part for pair in node.value for part in pair]
-        elif isinstance(node, yaml.SequenceNode):
-            waiting += node.value
-
-
-def _is_harmless(name: str, known: set[str]) -> bool:
-    """Whether this constructs a path, a member of an enumeration, or a class of another plugin."""
-    if name == "_operator.getitem":  # how types are written in nerfstudio's own settings
-        return True
-    module, _, last = name.rpartition(".")
-    if module.partition(".")[0] not in known or not last[:1].isupper():
-        return False
-    if module in sys.modules:
-        kind = getattr(sys.modules[module], last, None)
-        return isinstance(kind, type) and issubclass(kind, PurePath | Enum)
-    return module.partition(".")[0] in _plugins() - {"lang3dxl_ns"}
-
-
-def _is_settings_function(name: str) -> bool:
-    """Whether this is the one function in nerfstudio's settings, or may be one in another plugin's."""
-    ours = ("nerfstudio.", "torch.", "lang3dxl_ns.", "pathlib.")
-    return name == "nerfstudio.data.utils.nerfstudio_collate.nerfstudio_collate" or not name.startswith(ours)
-
-
-def _plugins() -> set[str]:
-    """Installed packages that provide methods and data parsers for nerfstudio."""
-    groups = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
-    modules = [point.module for group in groups for point in entry_points(group=group)]
-    for definition in os.environ.get("NERFSTUDIO_METHOD_CONFIGS", "").split(","):
-        modules.append(definition.partition("=")[2].partition(":")[0])
-    return {module.partition(".")[0] for module in modules if module}
 
 
 class _SettingsLoader(yaml.UnsafeLoader):

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -23,6 +23,7 @@ from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.learn_word import Weights, learn
 from lang3dxl_ns.query.match import Found, Match, Viewpoint
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING
 from lang3dxl_ns.query.places import strongest_match
@@ -32,12 +33,11 @@ from lang3dxl_ns.query.rank_views import rank_views
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.splat_file import write_index, write_splats
-from lang3dxl_ns.query.teach import MARK_SIDE, Example, TaughtWord, Weights, known_word, learn, marks
+from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched, texts_of
 from lang3dxl_ns.query.threshold import match_thresholds
 from lang3dxl_ns.query.viewed_scene import Place, ViewedScene
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
-from lang3dxl_ns.rendering.gathering import filled_parts
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.rendering.splats import Splats
@@ -132,23 +132,24 @@ class Scene(ViewedScene):
         rivals = texts_of(negatives, "a negative")
         prompts = [replace(p, negatives=(*p.negatives, *rivals)) for p in self.prompts(texts)]
         within = self.config.foreground if foreground is None else foreground
-        everything, count = [*prompts, *(self.prompts(within) if within else ())], len(prompts)
-        queries = self.queries(everything)
-        doubts, levels = self._judged(everything, queries)
-        own = levels[:count] if requested is None else (requested,) * count
-        return Question(
-            self.engine, tuple(prompts), queries, doubts[:count], own, levels[count:], self.config.min_alpha
-        )
-
-    def _judged(
-        self, prompts: Sequence[Prompt], queries: Queries
-    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Doubt about each prompt, and the relevancy from which places match it."""
+        everything = [*prompts, *(self.prompts(within) if within else ())]
+        queries, count = self.queries(everything), len(prompts)
         relevancy = self.engine.of_gaussians(queries)
-        doubts = self.doubts.of(relevancy)
-        doubts = [p.taught.doubt if p.taught else d for p, d in zip(prompts, doubts, strict=True)]
-        strict = [bool(prompt.negatives or prompt.taught) for prompt in prompts]
-        return tuple(doubts), match_thresholds(relevancy, doubts, strict)
+        doubts = [
+            doubt if prompt.taught is None else prompt.taught.doubt
+            for prompt, doubt in zip(everything, self.doubts.of(relevancy), strict=True)
+        ]
+        strict = [bool(prompt.negatives or prompt.taught) for prompt in everything]
+        levels = match_thresholds(relevancy, doubts, strict)
+        return Question(
+            self.engine,
+            tuple(prompts),
+            queries,
+            tuple(doubts[:count]),
+            levels[:count] if requested is None else (requested,) * count,
+            levels[count:],
+            self.config.min_alpha,
+        )
 
     def query(
         self,
@@ -386,18 +387,15 @@ class Scene(ViewedScene):
         """
         (prompt,) = parse_prompts(f'"{word}"')
         listed = [examples] if isinstance(examples, Example) else list(examples)
-        queries = self.text.plain_queries([prompt.text]).to(self.device)
-
-        def margin(features: Float[Tensor, "m c"]) -> Float[Tensor, " m"]:
-            return queries.relevancy_of_cosines(queries.cosines(features), 1.0)[0].logit()
-
-        weights = [self._marked(example) for example in listed]
+        photos = [self.file.photo(example.photo) for example in listed]
+        weights = [
+            Weights.of(example, photo, self.splats, self.backend)
+            for example, photo in zip(listed, photos, strict=True)
+        ]
         if selection is not None:
             weights = [Weights(w.seen * selection, torch.zeros_like(w.seen), w.seen) for w in weights]
-        engine = self.engine
-        learned = learn(
-            prompt.text, listed, weights, engine.features, margin, engine.head, engine.temperature
-        )
+        queries = self.text.plain_queries([prompt.text]).to(self.device)
+        learned = learn(prompt.text, listed, weights, self.engine, queries)
         learned = replace(learned, clip=self.file.clip_identity, scene=Path(self.file.data).name)
         return self.with_words([*self.words.values(), learned])
 
@@ -431,23 +429,11 @@ class Scene(ViewedScene):
         if taught is None:
             raise UserError(f"{word!r} was not taught: see lang3dxl words")
         chance = self._one(taught.name).relevancy[0]
-        open_question = chance * (1 - chance)
         marked = {self.file.photo(example.photo).name for example in taught.examples}
         views = {name: view for name, view in self.visible.items() if name not in marked} or self.visible
-        return max(
-            views, key=lambda name: float(open_question[views[name].rows.long()] @ views[name].pixels.float())
-        )
-
-    def _marked(self, example: Example) -> Weights:
-        photo = self.file.photo(example.photo)
-        camera = resized(photo.full_camera, MARK_SIDE)
-        size = (camera.height, camera.width)
-        foreground = photo.foreground(size)
-        shown = torch.ones(size) if foreground is None else foreground.float()
-        pixels = torch.cat([marks(example, photo, size) * shown, shown[None]]).permute(1, 2, 0)
-        drawn = partial(composite, self.splats, camera, backend=self.backend)
-        word, other, seen = filled_parts(drawn, pixels.to(self.device), len(self.splats)).unbind(1)
-        return Weights(word, other, seen)
+        open_question = chance * (1 - chance)
+        unsure = {name: view.pixels @ open_question[view.rows.long()] for name, view in views.items()}
+        return max(unsure, key=lambda name: float(unsure[name]))
 
     def _with_taught(self, prompt: Prompt) -> Prompt:
         taught = self.words.get(known_word(prompt.text))
@@ -507,27 +493,20 @@ class Scene(ViewedScene):
             Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
             for name, found in ranks.items()
         ]
+        return sorted(views, key=lambda view: (self._shows(view), view.rank), reverse=True)
 
-        def order(view: Viewpoint) -> tuple[bool, float]:
-            return view.area * self.visible[view.name].size >= _LEAST_PIXELS, view.rank
-
-        return sorted(views, key=order, reverse=True)
+    def _shows(self, view: Viewpoint) -> bool:
+        """Whether the match fills as much as a pixel of the small view."""
+        return view.area * self.visible[view.name].size >= _LEAST_PIXELS
 
     def _found(self, question: Question, row: int, most: int) -> Found:
         scores, threshold = question.relevancy[row], question.thresholds[row]
         means, closest = self.splats.means, self._ranked(question, row)
-        views = [v for v in closest if v.area * self.visible[v.name].size >= _LEAST_PIXELS]
+        views = list(filter(self._shows, closest))
         box = strongest_match(means, scores, self.mass, threshold, self.gap) if views else None
-        return Found(
-            question.prompts[row],
-            views[:most],
-            box,
-            scores.cpu().float().numpy(),
-            question.gaussians[row].cpu().numpy(),
-            question.doubts[row],
-            threshold,
-            closest[:most],
-        )
+        relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
+        prompt, doubt = question.prompts[row], question.doubts[row]
+        return Found(prompt, views[:most], box, relevancy, matching, doubt, threshold, closest[:most])
 
     # ── computed once ───────────────────────────────────────────────────────────────────────────────
 

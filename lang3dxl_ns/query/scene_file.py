@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Shaped, UInt16
+from jaxtyping import Float, Shaped
 from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
@@ -34,10 +34,10 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
-from lang3dxl_ns.query.teach import TaughtWord, words_from_json
+from lang3dxl_ns.query.teach import TaughtWord
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering.splats import Splats
@@ -50,8 +50,8 @@ _KEY = "lang3dxl"
 _MASK_SIDE = 800
 """Longer side of a stored foreground mask in pixels."""
 _LARGEST_HALF = 6e4
-_UNKNOWN_CODE = 0
-"""Stored code of a Gaussian that is visible in no photo; the others are 1 to 65,535."""
+_STEPS = 65534
+"""Stored codes are 1 to 65,535, and 0 for a Gaussian that is visible in no photo."""
 _MOST_SETTING = 100_000
 """No setting of a decoder is larger: sizes are refused before anything of that size is built."""
 
@@ -93,28 +93,35 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}")
     from safetensors.numpy import save
 
-    content = _splat_tensors(scene.splats)
+    splats = scene.splats
+    content = {
+        "means": _array(splats.means, np.float32),
+        "quats": _array(F.normalize(splats.quats, dim=1), np.float16),
+        "log_scales": _array(log_scales(splats), np.float16),
+        "logits": _array(logits(splats), np.float16),
+        "harmonics": _array(splats.harmonics.clamp(-_LARGEST_HALF, _LARGEST_HALF), np.float16),
+    }
     described: dict[str, Any] = {
         "version": VERSION,
-        "antialiased": scene.splats.antialiased,
+        "antialiased": splats.antialiased,
         "background": None if scene.background is None else scene.background.tolist(),
         "provenance": asdict(provenance or Provenance()),
+        "taught": [word.to_json() for word in scene.words.values()],
     }
     if scene.decoder is not None and scene.codes is not None:
-        described["decoder"] = _described(scene.decoder)
-        content["codes"] = _stored_codes(scene.codes, scene.decoder.bounded)
+        described |= {"decoder": _described(scene.decoder), "words": list(common_words())}
         content |= _stored_state("decoder", scene.decoder)
-        described["words"] = list(common_words())
+        content["codes"] = _stored_codes(scene.codes, scene.decoder.bounded)
         content["words"] = _array(scene.text.vectors(described["words"]), np.float16)
     if scene.looks is not None:
         field = scene.looks.field
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
-    masks = {i: _mask_of(photo) for i, photo in enumerate(scene.photos) if photo.mask is not None}
-    content |= {f"mask.{i}": np.frombuffer(mask, np.uint8) for i, mask in masks.items() if mask}
-    described["taught"] = [word.to_json() for word in scene.words.values()]
-    file = replace(scene.file, photos=[replace(photo, mask=None) for photo in scene.photos])
-    described["scene"] = asdict(replace(file, data=Path(file.data).name))
+    for i, photo in enumerate(scene.photos):
+        if photo.mask is not None and (mask := _stored_mask(photo)):
+            content[f"mask.{i}"] = np.frombuffer(mask, np.uint8)
+    photos = [replace(photo, mask=None) for photo in scene.photos]
+    described["scene"] = asdict(replace(scene.file, photos=photos, data=Path(scene.file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
     write_atomically(path, data)
     return len(data)
@@ -130,9 +137,7 @@ def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
     Raises:
         UserError: as `read_scene`.
     """
-    with _reported(path):
-        with _opened(path) as file:
-            _description(file)
+    with _opened(path):
         content = path.read_bytes()
         begin = 8 + int.from_bytes(content[:8], "little")
         header = json.loads(content[8:begin])
@@ -144,38 +149,27 @@ def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
     write_atomically(path, len(start).to_bytes(8, "little") + start + content[begin:])
 
 
-def _splat_tensors(splats: Splats) -> dict[str, Shaped[Array, "..."]]:
-    return {
-        "means": _array(splats.means, np.float32),
-        "quats": _array(F.normalize(splats.quats, dim=1), np.float16),
-        "log_scales": _array(log_scales(splats), np.float16),
-        "logits": _array(logits(splats), np.float16),
-        "harmonics": _array(splats.harmonics.clamp(-_LARGEST_HALF, _LARGEST_HALF), np.float16),
-    }
-
-
 def _stored_codes(codes: Float[Tensor, "n d"], bounded: bool) -> Shaped[Array, "n d"]:
     """Bounded codes as 16-bit coordinates in (0, 1), which are what the hash grid reads; others as they
     are."""
     if not bounded:
         return _array(codes, np.float32)
-    known = codes.isfinite().all(1, keepdim=True)
-    places = 1 + (codes.double().sigmoid() * 65534).round()
-    return torch.where(known, places, _UNKNOWN_CODE).cpu().numpy().astype(np.uint16)
+    places = 1 + (codes.double().sigmoid() * _STEPS).round()
+    return _array(torch.where(codes.isfinite().all(1, keepdim=True), places, 0), np.uint16)
 
 
 def _stored_state(name: str, module: torch.nn.Module) -> dict[str, Shaped[Array, "..."]]:
-    tensors = {key: value for key, value in module.state_dict().items() if isinstance(value, Tensor)}
-    return {f"{name}.{key}": _smallest(value) for key, value in tensors.items()}
+    """Weights of a module: in half precision, unless they are too large for it, or few."""
+    stored = {}
+    for key, values in module.state_dict().items():
+        if isinstance(values, Tensor):
+            many = values.is_floating_point() and values.numel() > 256
+            half = many and float(values.abs().max()) < _LARGEST_HALF
+            stored[f"{name}.{key}"] = _array(values.half() if half else values)
+    return stored
 
 
-def _smallest(values: Tensor) -> Shaped[Array, "..."]:
-    """Weights in half precision, unless they are too large for it, or few."""
-    half = values.is_floating_point() and values.numel() > 256 and float(values.abs().max()) < _LARGEST_HALF
-    return _array(values, np.float16 if half else values.cpu().numpy().dtype.type)
-
-
-def _mask_of(photo: Any) -> bytes | None:
+def _stored_mask(photo: ScenePhoto) -> bytes | None:
     camera = resized(photo.camera, _MASK_SIDE)
     mask = photo.foreground((camera.height, camera.width))
     if mask is None:
@@ -195,8 +189,9 @@ def _described(decoder: Decoder) -> dict[str, Any]:
     }
 
 
-def _array(tensor: Tensor, kind: Any) -> Shaped[Array, "..."]:
-    return tensor.detach().cpu().numpy().astype(kind, order="C")
+def _array(tensor: Tensor, kind: Any = None) -> Shaped[Array, "..."]:
+    values = tensor.detach().cpu().numpy()
+    return values.astype(kind or values.dtype, order="C")
 
 
 # ── reading ─────────────────────────────────────────────────────────────────────────────────────────────
@@ -219,9 +214,26 @@ def read_scene(
     Raises:
         UserError: the file is missing, damaged, cut short, or of a newer version.
     """
-    path = expanded(path)
-    with _reported(path):
-        return _read(path, torch.device(device or best_device()), config, encode_texts)
+    path, device = expanded(path), torch.device(device or best_device())
+    with _opened(path) as file:
+        splats, decoder, codes, looks, vectors = _splats(file).to(device), None, None, None, None
+        if (settings := file.about.get("decoder")) is not None:
+            decoder = _decoder(file, settings).to(device)
+            codes = _codes(file, decoder.bounded, len(splats)).to(device)
+        if (described := file.about.get("looks")) is not None:
+            looks = Looks(_looks(file, described).to(device))
+        if (words := file.about.get("words")) is not None:
+            expect(all(isinstance(word, str) for word in words), "its words are no texts")
+            rows = file.tensor("words", len(words), file.shapes["words"][1]).float()
+            vectors = dict(zip(words, F.normalize(rows, dim=1), strict=True))
+        masks = [file.mask(i) for i in range(len(file.scene.photos))]
+    photos = [replace(photo, mask=mask) for photo, mask in zip(file.scene.photos, masks, strict=True)]
+    background = None if file.background is None else torch.tensor(file.background, device=device)
+    return Scene(
+        splats, replace(file.scene, photos=photos), decoder, codes,
+        looks=looks, background=background, config=config, encode_texts=encode_texts,
+        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"), words=file.taught,
+    )  # fmt: skip
 
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
@@ -231,202 +243,138 @@ def describe_scene_file(path: str | Path) -> dict[str, Any]:
     Raises UserError as `read_scene` does; no tensor is read.
     """
     path = expanded(path)
-    with _reported(path), _opened(path) as file:
-        described, sizes = _description(file), _sizes(file)
+    with _opened(path) as file:
         return {
-            "provenance": described.provenance,
-            "scene": described.scene,
-            "gaussians": sizes["means"][0],
-            "photos": len(described.scene.photos),
-            "clip": described.scene.clip,
-            "decoder": described.decoder,
-            "looks": described.looks is not None,
-            "taught": described.taught,
+            "provenance": file.provenance,
+            "scene": file.scene,
+            "gaussians": file.shapes["means"][0],
+            "photos": len(file.scene.photos),
+            "clip": file.scene.clip,
+            "decoder": file.about.get("decoder"),
+            "looks": file.about.get("looks") is not None,
+            "taught": file.taught,
             "bytes": path.stat().st_size,
         }
 
 
-@contextmanager
-def _reported(path: Path) -> Iterator[None]:
-    """Errors of reading as one sentence."""
-    if not path.is_file():
-        raise UserError(f"{path} is not a file: name a {SUFFIX} file")
-    try:
-        yield
-    except _NewerError as error:
-        raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
-    except (UserError, *DAMAGE) as error:
-        raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): copy it again") from error
+class _File:
+    """A safetensors file with a scene: its description, and tensors whose shapes are checked first."""
+
+    def __init__(self, opened: Any) -> None:
+        self._opened = opened
+        self.shapes = {name: opened.get_slice(name).get_shape() for name in opened.keys()}  # noqa: SIM118
+        self.about: dict[str, Any] = json.loads((opened.metadata() or {})[_KEY])
+        if self.about["version"] != VERSION:
+            raise _NewerError(self.about["version"])
+        self.scene: SceneFile = scene_from_json(self.about["scene"])
+        self.provenance = Provenance(**self.about["provenance"])
+        texts = vars(self.provenance).values()
+        expect(all(isinstance(text, str) for text in texts), "its origin is no text")
+        self.background: list[float] | None = self.about["background"]
+        if self.background is not None:
+            channels = [0 <= float(x) <= 1 for x in self.background]
+            expect(channels == [True] * 3, "its background is no color")
+        self.taught = [TaughtWord.from_json(word) for word in self.about.get("taught", [])]
+
+    def tensor(self, name: str, *shape: int) -> Tensor:
+        """A tensor of this shape, of whatever type. Raises ValueError for another shape."""
+        expect(self.shapes[name] == list(shape), f"{name} has the shape {self.shapes[name]}")
+        values = self._opened.get_tensor(name)
+        return torch.from_numpy(values.astype(np.int32) if values.dtype == np.uint16 else values)
+
+    def mask(self, photo: int) -> bytes | None:
+        """The PNG of a photo's foreground, of a sensible size."""
+        name = f"mask.{photo}"
+        if name not in self.shapes:
+            return None
+        content = self.tensor(name, *self.shapes[name]).numpy().astype(np.uint8).tobytes()
+        with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+            expect(image.width * image.height <= MOST_PIXELS, "a mask is too large")
+        return content
+
+    def loaded(self, name: str, module: Module, state: Mapping[str, Any] | None = None) -> Module:
+        """A module with its tensors from the file, whose shapes must be those that it expects."""
+        tensors = {
+            key: self.tensor(f"{name}.{key}", *value.shape)
+            for key, value in module.state_dict().items()
+            if isinstance(value, Tensor)
+        }
+        module.load_state_dict({**tensors, **(state or {})})
+        return module.eval().requires_grad_(False)
 
 
 class _NewerError(Exception):
     """The file's format version is unknown."""
 
 
-@dataclass(frozen=True)
-class _Description:
-    """The file's metadata, checked."""
-
-    scene: SceneFile
-    provenance: Provenance
-    antialiased: bool
-    background: list[float] | None
-    decoder: dict[str, Any] | None
-    looks: dict[str, Any] | None
-    words: list[str] | None
-    taught: list[TaughtWord]
-
-
-def _read(
-    path: Path, device: torch.device, config: QueryConfig | None, encode_texts: EncodeTexts | None
-) -> Scene:
-    with _opened(path) as file:
-        about, sizes = _description(file), _sizes(file)
-        splats = _splats(file, sizes, about.antialiased).to(device)
-        decoder = codes = looks = None
-        if about.decoder is not None:
-            decoder = _decoder(file, sizes, about.decoder).to(device)
-            codes = _codes(file, sizes, decoder.bounded, len(splats)).to(device)
-        if about.looks is not None:
-            looks = Looks(_looks(file, sizes, about.looks).to(device))
-        vectors = None if about.words is None else _vectors(file, sizes, about.words)
-        photos = [
-            replace(photo, mask=_checked_mask(file.get_tensor(f"mask.{i}")) if f"mask.{i}" in sizes else None)
-            for i, photo in enumerate(about.scene.photos)
-        ]
-    background = None if about.background is None else torch.tensor(about.background, device=device)
-    return Scene(
-        splats, replace(about.scene, photos=photos), decoder, codes,
-        looks=looks, background=background, config=config, encode_texts=encode_texts,
-        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"), words=about.taught,
-    )  # fmt: skip
-
-
-def _opened(path: Path) -> Any:
+@contextmanager
+def _opened(path: Path) -> Iterator[_File]:
+    """The file; errors of reading it are one sentence."""
     from safetensors import SafetensorError, safe_open
 
+    if not path.is_file():
+        raise UserError(f"{path} is not a file: name a {SUFFIX} file")
     try:
-        return safe_open(path, "np")
-    except SafetensorError as error:
-        raise ValueError(str(error)) from error
+        with safe_open(path, "np") as opened:
+            yield _File(opened)
+    except _NewerError as error:
+        raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
+    except (UserError, SafetensorError, *DAMAGE) as error:
+        raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): copy it again") from error
 
 
-def _description(file: Any) -> _Description:
-    content = json.loads((file.metadata() or {})[_KEY])
-    if content["version"] != VERSION:
-        raise _NewerError(content["version"])
-    provenance = Provenance(**content["provenance"])
-    expect(all(isinstance(text, str) for text in vars(provenance).values()), "its origin is no text")
-    background = content["background"]
-    if background is not None:
-        expect(len(background) == 3 and all(0 <= float(x) <= 1 for x in background), "its background")
-    expect(isinstance(content["antialiased"], bool), "antialiased")
-    return _Description(
-        scene_from_json(content["scene"]),
-        provenance,
-        content["antialiased"],
-        background,
-        content.get("decoder"),
-        content.get("looks"),
-        content.get("words"),
-        words_from_json(content.get("taught", [])),
+def _splats(file: _File) -> Splats:
+    count, bands = file.shapes["means"][0], file.shapes["harmonics"][1]
+    expect(bands in (1, 4, 9, 16), f"{bands} harmonics")
+    antialiased = file.about["antialiased"]
+    expect(isinstance(antialiased, bool), "antialiased")
+    return Splats(
+        file.tensor("means", count, 3).float(),
+        file.tensor("quats", count, 4).float(),
+        file.tensor("log_scales", count, 3).float().exp(),
+        file.tensor("logits", count).float().sigmoid(),
+        file.tensor("harmonics", count, bands, 3).float(),
+        antialiased,
     )
 
 
-def _sizes(file: Any) -> dict[str, list[int]]:
-    return {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
-
-
-def _splats(file: Any, sizes: Mapping[str, list[int]], antialiased: bool) -> Splats:
-    count, bands = sizes["means"][0], sizes["harmonics"][1]
-    expect(bands in (1, 4, 9, 16), f"{bands} harmonics")
-    wanted = {"means": [count, 3], "quats": [count, 4], "log_scales": [count, 3]}
-    wanted |= {"logits": [count], "harmonics": [count, bands, 3]}
-    for name, size in wanted.items():
-        expect(sizes[name] == size, f"{name} has the shape {sizes[name]}")
-    means, quats, scales, opacities, harmonics = (_tensor(file, name) for name in wanted)
-    return Splats(means, quats, scales.exp(), opacities.sigmoid(), harmonics, antialiased)
-
-
-def _codes(file: Any, sizes: Mapping[str, list[int]], bounded: bool, count: int) -> Float[Tensor, "n d"]:
-    expect(len(sizes["codes"]) == 2 and sizes["codes"][0] == count, "its codes")
-    stored: UInt16[Array, "n d"] = file.get_tensor("codes")
+def _codes(file: _File, bounded: bool, count: int) -> Float[Tensor, "n d"]:
+    stored = file.tensor("codes", count, file.shapes["codes"][1])
     if not bounded:
-        return torch.from_numpy(stored).float()
-    expect(stored.dtype == np.uint16, "its codes")
-    places = torch.from_numpy(stored.astype(np.float64))
-    codes = ((places - 1) / 65534).clamp(1e-9, 1 - 1e-9).logit().float()
-    return torch.where(places == _UNKNOWN_CODE, torch.nan, codes)
+        return stored.float()
+    expect(not stored.is_floating_point(), "its codes are no coordinates")
+    codes = ((stored.double() - 1) / _STEPS).clamp(1e-9, 1 - 1e-9).logit().float()
+    return torch.where(stored == 0, torch.nan, codes)
 
 
-def _decoder(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> Decoder:
-    settings, clip, dense = told["settings"] or {}, told["clip_dim"], told["dense_dim"]
+def _decoder(file: _File, described: dict[str, Any]) -> Decoder:
+    settings, clip, dense = described["settings"] or {}, described["clip_dim"], described["dense_dim"]
     for value in (clip, dense, *settings.values()):
         expect(isinstance(value, int | float | str), f"a decoder has the setting {value!r}")
         expect(isinstance(value, str) or 0 <= value <= _MOST_SETTING, f"a decoder has the setting {value}")
-    stored = sum(prod(size) for name, size in sizes.items() if name.startswith("decoder."))
-    expect(
-        _parameters(settings, clip + dense) <= 4 * stored + 10_000_000, "its decoder is larger than the file"
-    )
-    decoder = make_decoder(
-        # The first versions called it by the name of the method.
-        DecoderConfig(name="gathered" if told["name"] == "lang3dxl" else told["name"]),
-        SemanticFieldConfig(preset="short", **settings),
-        *(clip, dense, torch.zeros(3), 1.0),
-    )
-    return _loaded(file, sizes, "decoder", decoder)
+    stored = sum(prod(shape) for name, shape in file.shapes.items() if name.startswith("decoder."))
+    needed = _parameters(settings, clip + dense)
+    expect(needed <= 4 * stored + 10_000_000, "its decoder is larger than the file")
+    # The first versions called it by the name of the method.
+    name: Any = "gathered" if described["name"] == "lang3dxl" else described["name"]
+    config = SemanticFieldConfig(preset="short", **settings)
+    decoder = make_decoder(DecoderConfig(name=name), config, clip, dense, torch.zeros(3), 1.0)
+    return file.loaded("decoder", decoder)
 
 
 def _parameters(settings: Mapping[str, Any], channels: int) -> int:
     """At most how many numbers a decoder with these settings and outputs has."""
     if not settings:
         return 1000 * channels + channels**2
-    depth, width = settings["hidden_layers"], settings["hidden_width"]
-    expect(
-        max(settings["log2_table_size"], settings["levels"], depth) <= 64, "its decoder has too many layers"
-    )
-    table = settings["levels"] * 2 ** int(settings["log2_table_size"]) * settings["features_per_level"]
-    inputs = settings["levels"] * settings["features_per_level"] + channels + 100
-    return table + width * (inputs + depth * width + channels)
+    levels, depth, width = (settings[name] for name in ("levels", "hidden_layers", "hidden_width"))
+    expect(max(settings["log2_table_size"], levels, depth) <= 64, "its decoder has too many layers")
+    inputs = levels * settings["features_per_level"]
+    table = inputs * 2 ** int(settings["log2_table_size"])
+    return table + width * (inputs + depth * width + 2 * channels + 100)
 
 
-def _vectors(file: Any, sizes: Mapping[str, list[int]], words: list[str]) -> dict[str, Float[Tensor, " c"]]:
-    expect(isinstance(words, list) and all(isinstance(word, str) for word in words), "its words")
-    expect(len(sizes["words"]) == 2 and sizes["words"][0] == len(words), "its words")
-    return dict(zip(words, F.normalize(_tensor(file, "words"), dim=1), strict=True))
-
-
-def _looks(file: Any, sizes: Mapping[str, list[int]], told: dict[str, Any]) -> AppearanceField:
-    names, config = told["names"], AppearanceConfig(**told["config"])
+def _looks(file: _File, described: dict[str, Any]) -> AppearanceField:
+    names, config = described["names"], AppearanceConfig(**described["config"])
     expect(isinstance(names, list) and all(isinstance(name, str) for name in names), "its looks' photos")
-    expect(sizes["looks.vectors"] == [len(names), config.vector_dim], "its looks")
-    field = AppearanceField(config, names, torch.zeros(3), 1.0)
-    return _loaded(file, sizes, "looks", field, {"_extra_state": names})
-
-
-def _loaded(
-    file: Any,
-    sizes: Mapping[str, list[int]],
-    name: str,
-    module: Module,
-    state: Mapping[str, Any] | None = None,
-) -> Module:
-    """A module with its tensors from the file, whose shapes must be those that it expects."""
-    tensors = {}
-    for key, value in module.state_dict().items():
-        if isinstance(value, Tensor):
-            expect(sizes.get(f"{name}.{key}") == list(value.shape), f"{name}.{key} has the wrong shape")
-            tensors[key] = torch.from_numpy(file.get_tensor(f"{name}.{key}"))
-    module.load_state_dict({**tensors, **(state or {})})
-    return module.eval().requires_grad_(False)
-
-
-def _checked_mask(stored: Shaped[Array, " b"]) -> bytes:
-    content = stored.astype(np.uint8).tobytes()
-    with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
-        expect(image.width * image.height <= MOST_PIXELS, "a mask is too large")
-    return content
-
-
-def _tensor(file: Any, name: str) -> Float[Tensor, "n ..."]:
-    return torch.from_numpy(file.get_tensor(name)).float()
+    expect(file.shapes["looks.vectors"] == [len(names), config.vector_dim], "its looks")
+    return file.loaded("looks", AppearanceField(config, names, torch.zeros(3), 1.0), {"_extra_state": names})

@@ -6,7 +6,7 @@ import re
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Literal
 
 import torch
@@ -141,18 +141,16 @@ class TextConfig:
             raise UserError("--negatives is empty: give at least one phrase, such as object")
 
 
-class SynonymTable:
-    """The shipped table: configs/synonyms/architecture.yaml."""
+@cache
+def synonym_table() -> dict[str, list[str]]:
+    """The shipped table of architectural terms: common synonyms of each, most common first."""
+    return load_preset("synonyms/architecture")
 
-    @cached_property
-    def terms(self) -> dict[str, list[str]]:
-        """Common synonyms of every term, most common first."""
-        return load_preset("synonyms/architecture")
 
-    def __call__(self, text: str) -> list[str]:
-        """Synonyms of a term in singular or plural, with or without an article; none for other texts."""
-        words = re.sub(r"^(an?|the)\s+", "", " ".join(text.lower().split()))
-        return next((self.terms[form] for form in _singulars(words) if form in self.terms), [])
+def synonyms_of(text: str) -> list[str]:
+    """Synonyms of a term in singular or plural, with or without an article; none for other texts."""
+    words, table = re.sub(r"^(an?|the)\s+", "", " ".join(text.lower().split())), synonym_table()
+    return next((table[form] for form in _singulars(words) if form in table), [])
 
 
 def _singulars(words: str) -> list[str]:
@@ -183,18 +181,12 @@ class TextEncoder:
         self.config = config or TextConfig()
         self._encode = encode
         self._vectors = dict(known or {})
-        self._synonyms: dict[str, list[str]] = {}
-        self._table = SynonymTable()
         self._lock = threading.Lock()
 
     def synonyms(self, text: str) -> list[str]:
         """Common words for a prompt, most common first; none if it is common itself."""
-        if self.config.synonyms == "off":
-            return []
-        if text not in self._synonyms:
-            found = self._table(searched(text))
-            self._synonyms[text] = [word for word in found if word.lower() != text.lower()]
-        return self._synonyms[text]
+        found = [] if self.config.synonyms == "off" else synonyms_of(searched(text))
+        return [word for word in found if word.lower() != text.lower()]
 
     def queries(self, prompts: Sequence[Prompt], known: Collection[str] = ()) -> Queries:
         """Vectors of prompts, with synonyms combined as configured, and of their competitors.
@@ -205,10 +197,7 @@ class TextEncoder:
             [self._positive(p, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
             self.vectors(self.config.negatives),
             [self.vectors(prompt.negatives) for prompt in prompts],
-            [
-                self._against_all_but(p.vector) if p.vector is not None else self._against(p.text)
-                for p in prompts
-            ],
+            [self._against(p.text) if p.vector is None else self._against_all_but(p.vector) for p in prompts],
         ).taught([prompt.taught for prompt in prompts])
 
     def plain_queries(self, texts: Sequence[str]) -> Queries:

@@ -14,16 +14,15 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import sysconfig
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 from filelock import FileLock, Timeout
 
@@ -40,8 +39,7 @@ UNITS = 6
 _COMPILE = "import json, sys; from torch.utils.cpp_extension import load; load(**json.loads(sys.argv[1]))"
 
 
-@dataclass(frozen=True)
-class Extension:
+class Extension(NamedTuple):
     """CUDA and C++ sources that become one Python module."""
 
     name: str
@@ -49,8 +47,7 @@ class Extension:
     include: Sequence[Path] = ()
 
 
-@dataclass(frozen=True)
-class Need:
+class Need(NamedTuple):
     """One thing that the build needs."""
 
     what: str
@@ -61,14 +58,14 @@ class Need:
 
 def gsplat_extension() -> Extension:
     """gsplat's kernels."""
-    found = importlib.util.find_spec("gsplat")
-    assert found is not None and found.submodule_search_locations is not None
-    source = Path(found.submodule_search_locations[0]) / "cuda" / "csrc"
+    source = _package("gsplat")[0] / "cuda" / "csrc"
     sources = sorted([*source.glob("*.cu"), *source.glob("*.cpp")])
     return Extension("gsplat_cuda", sources, [source, source / "third_party" / "glm"])
 
 
-# ── what is there ───────────────────────────────────────────────────────────────────────────────────────
+def _package(name: str) -> list[Path]:
+    found = importlib.util.find_spec(name)
+    return [Path(folder) for folder in (found and found.submodule_search_locations) or ()]
 
 
 def find_toolkit(cuda: str) -> Path | None:
@@ -76,8 +73,8 @@ def find_toolkit(cuda: str) -> Path | None:
     major = cuda.partition(".")[0]
     for home in _toolkit_places(major):
         with contextlib.suppress(OSError, subprocess.SubprocessError):
-            nvcc = str(home / "bin" / "nvcc")
-            told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, timeout=30).stdout
+            nvcc = [str(home / "bin" / "nvcc"), "--version"]
+            told = subprocess.run(nvcc, capture_output=True, text=True, timeout=30).stdout
             if f"release {major}." in told and _headers(home):
                 return home
     return None
@@ -85,12 +82,11 @@ def find_toolkit(cuda: str) -> Path | None:
 
 def _toolkit_places(major: str) -> list[Path]:
     """The environment's packages, then where torch looks, and other versions beside the system's default."""
-    nvidia, nvcc = importlib.util.find_spec("nvidia"), shutil.which("nvcc")
-    packages = (nvidia and nvidia.submodule_search_locations) or ()
+    nvcc = shutil.which("nvcc")
     named = os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), nvcc and Path(nvcc).resolve().parents[1]
     others = sorted(Path("/usr/local").glob(f"cuda-{major}*"), reverse=True)
-    system = [Path(home) for home in named if home]
-    return [*(Path(folder) / f"cu{major}" for folder in packages), *system, Path("/usr/local/cuda"), *others]
+    pip = [folder / f"cu{major}" for folder in _package("nvidia")]
+    return [*pip, *(Path(home) for home in named if home), Path("/usr/local/cuda"), *others]
 
 
 def _headers(home: Path) -> list[Path]:
@@ -109,32 +105,32 @@ def needs(folder: Path) -> list[Need]:
     header = Path(sysconfig.get_paths()["include"]) / "Python.h"
     there = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     free, memory = shutil.disk_usage(there).free, machine_memory()
+    trouble = "" if free > BUILD_BYTES and os.access(there, os.W_OK) else "full, or not writable"
     if re.search(r"\s", str(folder.absolute())):
         trouble = "a space in its name, which the compilers' rules can't hold"
-    else:
-        trouble = "" if free > BUILD_BYTES and os.access(there, os.W_OK) else "full, or not writable"
-    room = None if trouble else f"{free / 1e9:.1f} GB free"
     nvcc = f"install the CUDA toolkit {cuda} and set CUDA_HOME to it, or torch's CUDA 13 build"
     if cuda.startswith("13."):
         nvcc = f"pip install 'lang3dxl-ns[cuda]' (or a system CUDA toolkit {cuda}, with CUDA_HOME at it)"
     apt = f"apt install g++ python{sys.version_info.major}.{sys.version_info.minor}-dev"
     compiler = shutil.which(os.environ.get("CXX", "g++"), path=search_path())
+    cub = f"nvcc and cub of CUDA {cuda.partition('.')[0] or '13'}"
+    disk = f"{trouble}: free half a gigabyte, or set TORCH_EXTENSIONS_DIR"
     return [
         Need("torch with CUDA", cuda or None, "https://pytorch.org/get-started/locally"),
-        Need(
-            f"nvcc and cub of CUDA {cuda.partition('.')[0] or '13'}", str(toolkit) if toolkit else None, nvcc
-        ),
+        Need(cub, str(toolkit) if toolkit else None, nvcc),
         Need("C++ compiler", compiler, apt),
         Need("Python.h", str(header) if header.is_file() else None, apt),
         Need("ninja", shutil.which("ninja", path=search_path()), "pip install ninja"),
         Need("memory", f"{memory / 1e9:.1f} GB" if memory >= JOB_BYTES else None, "a build takes 3.5 GB"),
-        Need(f"disk, {folder}", room, f"{trouble}: free half a gigabyte, or set TORCH_EXTENSIONS_DIR"),
+        Need(f"disk, {folder}", None if trouble else f"{free / 1e9:.1f} GB free", disk),
     ]
 
 
-def search_path() -> str:
+def search_path(*first: Path) -> str:
     """PATH with the environment's programs first, whether it is activated or not."""
-    return os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+    return os.pathsep.join(
+        [*map(str, first), str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)]
+    )
 
 
 def device_arch() -> str:
@@ -148,7 +144,7 @@ def device_arch() -> str:
         return os.environ.get("TORCH_CUDA_ARCH_LIST", "")
     known = [re.match(r"sm_(\d+)(\d)", name) for name in torch.cuda.get_arch_list()]
     newest = max(((int(sm[1]), int(sm[2])) for sm in known if sm), default=(99, 9))
-    names = {f"{min(gpu, newest)[0]}.{min(gpu, newest)[1]}" + "+PTX" * (gpu > newest) for gpu in gpus}
+    names = {"{}.{}".format(*min(gpu, newest)) + "+PTX" * (gpu > newest) for gpu in gpus}
     return ";".join(sorted(names))
 
 
@@ -161,9 +157,6 @@ def build_folder(arch: str) -> Path:
     cuda, sm = torch.version.cuda, re.sub(r"[^\w+]", "-", arch.replace(".", ""))
     plain = torch.__version__.partition("+")[0]
     return cache / f"gsplat-{version('gsplat')}-torch-{plain}-cuda-{cuda}-{python}-sm-{sm}"
-
-
-# ── building and loading ────────────────────────────────────────────────────────────────────────────────
 
 
 def built(folder: Path, name: str = "gsplat_cuda") -> Path | None:
@@ -183,20 +176,19 @@ def build(extension: Extension, folder: Path, arch: str) -> Path:
     missing = [f"{need.what} is missing: {need.remedy}" for need in needs(folder) if need.found is None]
     if missing:
         raise UserError("gsplat's CUDA kernels can't be built here. " + ". ".join(missing))
+    lock = FileLock(folder / "building")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / "building")
         try:
             lock.acquire(timeout=0)
         except Timeout:
             say(f"Another process builds gsplat's CUDA kernels in {folder}: waiting for it")
             lock.acquire()
-        try:
-            return built(folder, extension.name) or _compile(extension, folder, arch)
-        finally:
-            lock.release()
+        return built(folder, extension.name) or _compile(extension, folder, arch)
     except OSError as error:
         raise UserError(f"gsplat's CUDA kernels can't be built in {folder} ({error})") from error
+    finally:
+        lock.release()
 
 
 def _compile(extension: Extension, folder: Path, arch: str) -> Path:
@@ -205,14 +197,9 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
     toolkit = find_toolkit(torch.version.cuda or "")
     assert toolkit is not None
     home = _link_tree(toolkit, folder / "cuda")
-    jobs = str(max(1, min(os.cpu_count() or 1, int(machine_memory() / JOB_BYTES))))
-    environment = {
-        "MAX_JOBS": jobs,
-        **os.environ,
-        "CUDA_HOME": str(home),
-        "TORCH_CUDA_ARCH_LIST": arch,
-        "PATH": os.pathsep.join([str(home / "bin"), search_path()]),
-    }
+    jobs = max(1, min(os.cpu_count() or 1, int(machine_memory() / JOB_BYTES)))
+    environment = {"MAX_JOBS": str(jobs), **os.environ, "CUDA_HOME": str(home), "TORCH_CUDA_ARCH_LIST": arch}
+    environment["PATH"] = search_path(home / "bin")
     arguments = {
         "name": extension.name,
         "sources": [str(path) for path in _united(extension.sources, folder)],
@@ -223,15 +210,18 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
         "verbose": True,
     }
     (folder / "lock").unlink(missing_ok=True)  # older versions of torch would wait for ever for its holder
-    log, start = folder / "build.log", time.monotonic()
+    log, start, library = folder / "build.log", time.monotonic(), folder / f"{extension.name}.so"
     say(
         f"Building {extension.name} for compute capability {arch} with {environment['MAX_JOBS']} jobs: once, "
         f"for some minutes. Interrupted, it goes on next time. Log: {log}"
     )
-    status = _run([sys.executable, "-c", _COMPILE, json.dumps(arguments)], environment, log)
-    library = folder / f"{extension.name}.so"
+    command = [sys.executable, "-c", _COMPILE, json.dumps(arguments)]
+    with log.open("w") as output:
+        status = subprocess.run(command, stdout=output, stderr=output, env=environment).returncode
     if status != 0 or not library.is_file():
-        reason = _reason(log)
+        lines = log.read_text(errors="replace").splitlines() or ["no output"]
+        named = (line.strip() for line in lines if re.search(r"error|Error|No space|Killed", line))
+        reason = next(named, lines[-1])[:300]
         if status < 0:
             reason = f"signal {-status} stopped it, perhaps for lack of memory (MAX_JOBS=1 takes less)"
         raise UserError(f"building {extension.name} failed: {reason} (the whole output: {log})")
@@ -260,35 +250,12 @@ def _united(sources: Sequence[Path], folder: Path) -> list[Path]:
     """The sources, with the CUDA ones dealt to a few files that include them; written only if they change,
     so that what is compiled stays valid."""
     cuda = sorted((path for path in sources if path.suffix == ".cu"), key=lambda p: p.stat().st_size)
-    units = []
-    for number in range(min(UNITS, len(cuda))):
-        unit = folder / f"unit_{number}.cu"
+    units = [folder / f"unit_{number}.cu" for number in range(min(UNITS, len(cuda)))]
+    for number, unit in enumerate(units):
         text = "".join(f'#include "{path}"\n' for path in cuda[number::UNITS])
         if not unit.is_file() or unit.read_text() != text:
             unit.write_text(text)
-        units.append(unit)
     return [*units, *(path for path in sources if path.suffix != ".cu")]
-
-
-def _run(command: Sequence[str], environment: dict[str, str], log: Path) -> int:
-    """Exit status of a command whose output goes to a file; its own processes end with ours."""
-    with log.open("w") as file:
-        process = subprocess.Popen(
-            command, stdout=file, stderr=subprocess.STDOUT, env=environment, start_new_session=True
-        )
-        try:
-            return process.wait()
-        except BaseException:
-            os.killpg(process.pid, signal.SIGTERM)
-            process.wait()
-            raise
-
-
-def _reason(log: Path) -> str:
-    """The first line of a build's output that names an error."""
-    lines = log.read_text(errors="replace").splitlines()
-    named = (line.strip() for line in lines if re.search(r"error|Error|No space|Killed", line))
-    return next(named, lines[-1] if lines else "no output")[:300]
 
 
 def load(library: Path, name: str = "gsplat_cuda") -> ModuleType:
@@ -298,9 +265,6 @@ def load(library: Path, name: str = "gsplat_cuda") -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-# ── use ─────────────────────────────────────────────────────────────────────────────────────────────────
 
 
 def make_ready() -> None:

@@ -39,7 +39,7 @@ def project(
         ],
         dim=1,
     )
-    axes_x, axes_y = torch.bmm(jacobian, _rotations(gaussians.quats) * scales[:, None]).unbind(1)
+    axes_x, axes_y = torch.bmm(jacobian, rotations(gaussians.quats) * scales[:, None]).unbind(1)
     # The determinant as the squared area of the parallelogram of the two rows (Cauchy-Binet), and that
     # of the blurred covariance as a sum of positive terms: nothing cancels, so float32 is enough for
     # needles, where xx·yy − xy² would lose all digits.
@@ -85,7 +85,7 @@ def _jacobian_row(
     return (focal / z)[:, None] * (axis - slope[:, None] * forward)
 
 
-def _rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
+def rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
     """Rotation matrices of quaternions (w, x, y, z) of any length; the identity for length zero."""
     w, x, y, z = F.normalize(quats, dim=1).unbind(1)
     xx, yy, zz = x * x, y * y, z * z

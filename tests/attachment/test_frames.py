@@ -81,20 +81,6 @@ def test_a_frame_that_is_close_is_refined(collection, tmp_path):
     assert misplacement(fit.similarity, wanted) < 0.03
 
 
-def test_of_frames_that_fit_only_the_best_is_refined(collection, tmp_path, monkeypatch):
-    """Refining is what takes minutes with a million Gaussians."""
-    monkeypatch.setattr(frames, "_CLOSE", 1.1)
-    refined = []
-
-    def stand_in(comparison, splats, start, steps, advance):
-        refined.append(start)
-        return start
-
-    monkeypatch.setattr(frames._Comparison, "refined", stand_in)
-    assert find_frame(box_splat(), collection, tmp_path / "a.ply").fits
-    assert len({start.tobytes() for start in refined}) == 1
-
-
 def test_of_many_gaussians_some_are_enough_to_refine_a_frame(collection, tmp_path, monkeypatch):
     monkeypatch.setattr(frames, "_MOST", len(box_splat()) // 2)
     counted, loss = set(), frames._Comparison._loss

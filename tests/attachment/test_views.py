@@ -12,7 +12,6 @@ from lang3dxl_ns.attachment.views import (
     LENS,
     Extent,
     candidates,
-    choose_views,
     looking,
     rendered_views,
     solids,
@@ -122,8 +121,3 @@ def test_another_splat_gets_other_views(tmp_path, monkeypatch):
 
 def choose_first(extent):
     return list(candidates(extent, views._FreeSpace(solids(SPLATS), extent), 2))
-
-
-def test_all_of_a_splat_is_chosen_from(capsys):
-    found = choose_views(SPLATS, Extent.of(SPLATS, "z"), 4)
-    assert len(found) == 4

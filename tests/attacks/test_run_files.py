@@ -84,7 +84,10 @@ def test_a_scene_file_with_something_of_another_kind_is_named(tmp_path, change):
         SceneFile.read(path)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "", "null", "3", "\x00", '{"version": 2}'])
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, "", "null", "[]", "{}", "\x00", '{"version": 2}', '{"version": 1, "photos": [{}]}'],
+)
 def test_a_scene_file_that_is_none_is_named(tmp_path, text):
     (tmp_path / "scene.json").write_text(text)
     with pytest.raises(UserError, match=r"scene\.json can't be read"):
@@ -161,6 +164,14 @@ def test_poses_written_as_integers_are_poses(tmp_path):
     whole = [[int(value) for value in row] for row in POSE]
     path = scene_file(tmp_path, set_of_photo("camera_to_world", whole))
     assert SceneFile.read(path).photos[1].camera.view_matrix.is_floating_point()
+
+
+@pytest.mark.parametrize("content", [None, "", "{}", '{"render_width": 1, "camera_path": [{}]}'])
+def test_a_camera_path_that_is_none_is_named(tmp_path, content):
+    if content is not None:
+        (tmp_path / "path.json").write_text(content)
+    with pytest.raises(UserError, match="is not a camera path"):
+        read_camera_path(tmp_path / "path.json")
 
 
 @pytest.mark.parametrize("read", [SceneFile.read, read_camera_path])

@@ -91,12 +91,21 @@ def test_a_full_output_is_one_line():
     assert done.stderr.decode().strip() == "Error: the output can't be written: No space left on device"
 
 
-def test_consoles_without_a_character_show_it_escaped(monkeypatch):
-    narrow = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+@pytest.mark.parametrize(
+    ("encoding", "shown"), [("ascii", b"fa\\xe7ade \\u2026\n"), ("latin-1", b"fa\xe7ade \\u2026\n")]
+)
+def test_consoles_without_a_character_show_it_escaped(monkeypatch, encoding, shown):
+    narrow = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
     monkeypatch.setattr(sys, "stdout", narrow)
     accept_any_console()
-    print("façade", flush=True)
-    assert narrow.buffer.getvalue() == b"fa\\xe7ade\n"
+    print("façade …", flush=True)
+    assert narrow.buffer.getvalue() == shown
+
+
+def test_a_command_runs_on_a_latin_1_console():
+    """Helps and messages hold dashes and ellipses that Latin-1 lacks."""
+    done = shell("query --help", PYTHONIOENCODING="latin-1", PYTHONUTF8="0")
+    assert done.returncode == 0 and b"Traceback" not in done.stderr
 
 
 def scene(folder, **figures):

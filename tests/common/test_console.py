@@ -3,9 +3,10 @@
 import warnings
 
 import pytest
+import rich.progress
 import torch
 
-from lang3dxl_ns.common.console import silence_libraries
+from lang3dxl_ns.common.console import progress, silence_libraries
 from lang3dxl_ns.evaluation.image_metrics import Lpips
 
 
@@ -32,3 +33,23 @@ def test_alexnet_is_not_downloaded_unasked(monkeypatch, tmp_path, capsys):
     picture, lpips = torch.rand(1, 3, 64, 64), Lpips()
     assert lpips(picture, picture) is None and lpips(picture, picture) is None
     assert capsys.readouterr().out.count("LPIPS is skipped") == 1  # said once
+
+
+def test_the_time_left_is_that_of_equal_lots(monkeypatch):
+    """Matching a video's photos advances by a hundred pairs at a time, seconds apart."""
+    now, bars = [0.0], []
+
+    class Clocked(rich.progress.Progress):
+        def __init__(self, *columns, **options):
+            super().__init__(*columns, **options, get_time=lambda: now[0], disable=True)
+            bars.append(self)
+
+    monkeypatch.setattr(rich.progress, "Progress", Clocked)
+    lots, seconds = 17, 9.0
+    with progress("pairs of photos", 100 * lots) as advance:
+        for done in range(1, lots):
+            now[0] += seconds
+            advance(100)
+            if done > 1:
+                left = bars[0].tasks[0].time_remaining
+                assert left == pytest.approx((lots - done) * seconds, rel=0.1, abs=1)

@@ -5,6 +5,7 @@ import sys
 import pytest
 import torch
 
+from lang3dxl_ns.common import jit
 from lang3dxl_ns.common.kernels import numba_works, takes_kernels
 
 
@@ -31,3 +32,19 @@ def test_a_broken_numba_is_told_of_and_a_missing_one_is_not(tmp_path, monkeypatc
     finally:
         numba_works.cache_clear()
     assert capsys.readouterr().out.count("numba does not work") == told
+
+
+def test_a_numba_that_loads_but_does_not_compile_is_told_of(monkeypatch, capsys):
+    def fails(number):
+        raise OSError("LLVM ERROR: unsupported processor")
+
+    monkeypatch.delenv("LANG3DXL_CPU_KERNELS", raising=False)
+    monkeypatch.setattr(jit, "successor", fails)
+    numba_works.cache_clear()
+    try:
+        assert not takes_kernels(torch.zeros(3))
+    finally:
+        numba_works.cache_clear()
+    assert "numba does not work (LLVM ERROR: unsupported processor)" in " ".join(
+        capsys.readouterr().out.split()
+    )

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from lang3dxl_ns.evaluation.aggregate import average, mean_average_precision, pool
+from lang3dxl_ns.evaluation.aggregate import average, pool
 
 PHOTOS = [
     {"psnr": 20.0, "ap_domes": 0.2, "iou_domes": 0.1, "located_domes": 1.0},
@@ -37,13 +37,6 @@ def test_prefixes_are_kept_apart():
     results = average(photos)
     assert (results["map"], results["raw_map"], results["teacher_map"]) == (0.5, 0.4, 0.3)
     assert results["teacher_miou"] == 0.2 and "miou" not in results
-
-
-def test_the_mean_is_over_categories_not_over_photos():
-    means = {"psnr": 20.0, "ap_domes": 0.5, "ap_windows": 1.0, "teacher_ap_domes": 0.1}
-    assert mean_average_precision(means) == 0.75
-    assert mean_average_precision(means, "teacher_") == pytest.approx(0.1)
-    assert mean_average_precision({"psnr": 20.0}) is None
 
 
 def test_the_order_of_photos_changes_nothing():

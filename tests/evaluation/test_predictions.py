@@ -10,9 +10,9 @@ from PIL import Image
 
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.evaluation.average_precision import average_precision
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.evaluation.predictions import PredictedMaps, score_predictions
+from lang3dxl_ns.evaluation.predictions import score_predictions
+from lang3dxl_ns.evaluation.scores import average_precision
 
 RNG = np.random.default_rng(0)
 
@@ -100,7 +100,7 @@ def test_a_missing_map_is_named(scene):
     with pytest.raises(UserError, match=r"make .*spires/0002\.npy"):
         score_predictions(GroundTruth(truth), maps)
     with pytest.raises(UserError, match="nowhere is not a folder"):
-        PredictedMaps(maps / "nowhere", ["spires"])
+        score_predictions(GroundTruth(truth), maps / "nowhere")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Scores of maps against values worked out by hand, scikit-learn and torchmetrics."""
+"""Scores of maps against values worked out by hand and scikit-learn."""
 
 import numpy as np
 import pytest
@@ -7,11 +7,11 @@ from label_sets import box_object, write_holyscenes, write_labels, write_plain
 from scipy.ndimage import uniform_filter
 
 from lang3dxl_ns.evaluation.annotations import Truth
-from lang3dxl_ns.evaluation.average_precision import average_precision
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import (
     MapScorer,
     as_published,
+    average_precision,
     blurred,
     inside,
     located,
@@ -57,22 +57,22 @@ def test_all_measures_agree_with_scikit_learn(seed):
     assert found["precision"] == pytest.approx(metrics.precision_score(true, mask))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_average_precision_iou_and_f1_agree_with_torchmetrics(seed):
-    from torchmetrics.functional.classification import (
-        binary_average_precision,
-        binary_f1_score,
-        binary_jaccard_index,
-    )
+def test_average_precision_by_hand():
+    """Pixels with one score count as one step: their arbitrary order must not matter."""
+    truth = np.array([[False, True], [False, True]])
+    assert average_precision(np.array([[0.1, 0.9], [0.2, 0.8]]), truth) == 1
+    assert average_precision(np.array([[0.9, 0.1], [0.8, 0.2]]), truth) == pytest.approx((1 / 3 + 2 / 4) / 2)
+    assert average_precision(np.zeros((2, 2)), truth) == pytest.approx(0.5)
+    assert average_precision(np.zeros((2, 2)), np.zeros((2, 2), bool)) is None
+    with pytest.raises(ValueError, match="shape"):
+        average_precision(np.zeros((2, 2)), np.zeros((4,), bool))
 
-    score, truth = random_pair(seed)
-    found = score_map(score, Truth(truth))
-    scores, target = torch.from_numpy(score), torch.from_numpy(truth).int()
-    assert found["ap"] == pytest.approx(
-        float(binary_average_precision(scores.flatten(), target.flatten())), rel=1e-5
-    )
-    assert found["iou"] == pytest.approx(float(binary_jaccard_index(scores, target)), rel=1e-5)
-    assert found["f1"] == pytest.approx(float(binary_f1_score(scores, target)), rel=1e-5)
+
+def test_the_order_of_pixels_and_any_rising_function_of_the_score_change_no_average_precision():
+    score, truth = random_pair(1)
+    order, expected = np.random.default_rng(1).permutation(score.size), average_precision(score, truth)
+    assert average_precision(score.ravel()[order], truth.ravel()[order]) == pytest.approx(expected)
+    assert average_precision(np.exp(5 * score), truth) == pytest.approx(expected)
 
 
 # ── by hand ─────────────────────────────────────────────────────────────────────────────────────────────

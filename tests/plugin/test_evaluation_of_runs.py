@@ -8,6 +8,7 @@ import pytest
 from conftest import make_trainer
 from label_sets import box_object, write_labels, write_plain
 from PIL import Image
+from scenes import write_scene
 
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
@@ -72,6 +73,19 @@ def test_ns_eval_reports_pictures_features_words_and_cost(evaluate, scene, tmp_p
     assert protocol["foreground"] == "none"
     assert set(results["photos"]) == {"photo_000.jpg", "photo_008.jpg"}
     json.dumps(results, allow_nan=False)
+
+
+def test_a_lens_that_distorts_is_not_counted_as_masks(tmp_path, tiny_clip):
+    """Undistorted photos have pixels without content at their border, which are masked as well."""
+    folder = write_scene(tmp_path / "bent", distortion=(0.3, 0.1, 0.0, 0.0))
+    trainer = make_trainer(folder, tiny_clip, "none", tmp_path / "run", iterations=2)
+    trainer.setup()
+    trainer.train()
+    pipeline = trainer.pipeline
+    pipeline.config.ground_truth = label(folder, tmp_path / "truth", range(6))
+    results = pipeline.get_average_eval_image_metrics(get_std=True)
+    assert "mask" in next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))[1]
+    assert results["protocol"]["foreground"] == "none"
 
 
 def test_photos_that_training_saw_are_scored_on_request_and_said_to_be(evaluate, scene, tmp_path):

@@ -60,7 +60,7 @@ def test_no_more_than_a_few_words_are_asked_together():
     whole = peaks(doubts._relevancy(doubts._queries(UNRELATED)))
     relevancy = doubts._relevancy
     doubts._relevancy = lambda queries: asked.append(len(queries.vectors)) or relevancy(queries)
-    torch.testing.assert_close(doubts._unrelated, whole, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(doubts.unrelated, whole, rtol=1e-5, atol=1e-6)
     assert max(asked) <= 8 and sum(asked) >= len(UNRELATED)
 
 

@@ -4,10 +4,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from lang3dxl_ns.baselines.direct import DirectFeatures
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.query.engine import PerGaussian, PerPixel, make_engine
+from lang3dxl_ns.query.engine import make_engine
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.rendering import Gaussians, rasterize
@@ -66,11 +65,6 @@ def test_memory_for_decoding_changes_no_answer(monkeypatch):
     monkeypatch.setattr("lang3dxl_ns.query.gaussian_relevancy._CHUNK_MB", 0.05)
     parts = GaussianFeatures.of(field, codes).relevancy(asked)
     torch.testing.assert_close(parts, whole, atol=1e-3, rtol=0)  # 16 bits may round otherwise
-
-
-def test_every_encoder_has_the_engine_of_its_order():
-    assert isinstance(make_engine(decoder(16), torch.zeros(3, 3)), PerGaussian)
-    assert isinstance(make_engine(DirectFeatures(16, 0), torch.zeros(3, 16)), PerPixel)
 
 
 def slab(count: int, seed: int = 0) -> tuple[Gaussians, Camera]:

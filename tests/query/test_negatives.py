@@ -4,11 +4,11 @@ whole."""
 import pytest
 
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
-from lang3dxl_ns.query.text import SynonymTable
+from lang3dxl_ns.query.text import synonyms_of
 
 
 def against(text: str) -> set[str]:
-    return {NEGATIVES[i] for i in competitors(NEGATIVES, [text, *SynonymTable()(text)])}
+    return {NEGATIVES[i] for i in competitors(NEGATIVES, [text, *synonyms_of(text)])}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Splats of other programs: one scene, however it is written; and files that are none."""
+"""Splat files, our own and of other programs: one scene, however it is written; and files that are none."""
 
 import gzip
 import pickle
@@ -53,6 +53,27 @@ def write_table(path, rows, form: str, kind: str, name: str) -> None:
     if form == "ascii":
         body = "\n".join(" ".join(map(repr, row)) for row in numbers.tolist()).encode()
     path.write_bytes(header.encode() + body)
+
+
+def test_every_property_of_a_ply_is_in_its_place(tmp_path):
+    splats, relevancy = some_splats(7), torch.linspace(0, 1, 7)
+    splats.scales[2, 1] = torch.nan  # broken Gaussians stay out
+    assert write_splats(tmp_path / "a.ply", splats, relevancy) == 6
+    names, rows = table(tmp_path / "a.ply")
+    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    expected += [*(f"f_rest_{i}" for i in range(9)), "opacity", "scale_0", "scale_1", "scale_2"]
+    assert names == [*expected, "rot_0", "rot_1", "rot_2", "rot_3", "relevancy"] and len(rows) == 6
+    keep = splats.sound()
+    splats = splats.select(keep)
+    np.testing.assert_array_equal(rows["y"], splats.means[:, 1])
+    np.testing.assert_allclose(1 / (1 + np.exp(-rows["opacity"])), splats.opacities, atol=1e-5)
+    np.testing.assert_allclose(np.exp(rows["scale_1"]), splats.scales[:, 1], rtol=1e-5)
+    np.testing.assert_array_equal(rows["relevancy"], relevancy[keep])
+    np.testing.assert_array_equal(rows["f_dc_2"], splats.harmonics[:, 0, 2])
+    for channel in range(3):
+        np.testing.assert_array_equal(rows[f"f_rest_{3 * channel}"], splats.harmonics[:, 1, channel])
+    with pytest.raises(UserError, match=r"end it in .ply or .spz"):
+        write_splats(tmp_path / "all.obj", splats)
 
 
 @pytest.mark.parametrize("bands", [1, 4, 9, 16])
@@ -255,5 +276,5 @@ def test_what_a_ply_lists_twice_is_refused(line, tmp_path):
     write_splats(tmp_path / "a.ply", some_splats())
     header, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     (tmp_path / "a.ply").write_bytes(header + line + b"end_header\n" + body)
-    with pytest.raises(UserError, match="twice"):
+    with pytest.raises(UserError, match=r"twice|more than once"):
         read_splats(tmp_path / "a.ply")

@@ -278,30 +278,10 @@ def test_the_cache_is_read_back_and_forgotten_with_the_geometry(tmp_path, monkey
     assert cache.stat().st_mtime_ns > stamp
 
 
-@pytest.mark.parametrize("damage", [b"", b"no tensors", None])
-def test_a_damaged_cache_is_made_anew(tmp_path, damage):
-    cache = tmp_path / "visible"
-    painted_scene(cache).find("dome")
-    content = cache.read_bytes()
-    cache.write_bytes(content[: len(content) // 2] if damage is None else damage)
-    assert painted_scene(cache).find("dome").box is not None
-
-
 def test_views_are_evenly_spread_when_there_are_more_than_requested():
     scene = painted_scene(config=QueryConfig(views=2, view_side=24))
     assert list(scene.visible) == ["left/0001.jpg", "right/0002.jpg"]
     assert scene.visible["left/0001.jpg"].camera.width == 24
-
-
-def test_what_a_view_shows_fills_it(scene):
-    """A wall that fills a view fills all of its pixels."""
-    camera = scene.camera("left/0001.jpg")
-    filled = scene._fill(camera, torch.ones(96, 96)).sum()
-    assert filled == pytest.approx(float(scene.draw(camera).alpha.sum()), rel=1e-4)
-
-
-def test_the_painted_scene_is_as_documented():
-    assert word_at(torch.tensor([[1.5, 1.5], [-0.8, -0.8], [0.0, 0.0]])).tolist() == [1, 2, 0]
 
 
 def test_nothing_is_found_outside_a_photos_mask(tmp_path):

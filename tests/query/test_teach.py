@@ -9,8 +9,10 @@ import torch
 from painted_scene import Painted, painted_gaussians, painted_scene
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.learn_word import _logistic, _Photo
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.teach import Example, _logistic, _separation, load_words, save_words
+from lang3dxl_ns.query.scene_file import read_scene, write_scene
+from lang3dxl_ns.query.teach import Example, load_words, save_words
 
 ALL = "all/0003.jpg"
 
@@ -126,6 +128,17 @@ def test_a_taught_word_survives_its_file_and_serves_another_scene(scene, tmp_pat
     assert np.allclose(other.relevancy("gizmo"), taught.relevancy("gizmo"), atol=1e-6)
 
 
+def test_an_outline_of_a_large_photo_survives_its_files(scene, tmp_path):
+    """Masks are kept at a limited size, and read at any."""
+    mask = np.kron(outline(scene, ALL, DOME_BOX), np.ones((20, 20), bool))
+    taught = scene.teach("gizmo", Example(ALL, mask))
+    save_words(tmp_path / "w.json", list(taught.words.values()))
+    write_scene(tmp_path / "a.scene", Scene(taught.splats, taught.file, words=taught.words.values()))
+    for (word,) in (load_words(tmp_path / "w.json"), read_scene(tmp_path / "a.scene").words.values()):
+        assert word.examples[0].mask.shape == (1024, 1024)
+        assert word.examples[0].mask.mean() == pytest.approx(mask.mean(), rel=0.02)
+
+
 def test_codes_decoded_per_pixel_can_be_taught_too(scene):
     decoder = Painted()
     decoder.per_gaussian = False
@@ -215,6 +228,6 @@ def test_the_fit_is_where_its_loss_has_no_slope():
 def test_separation_is_the_chance_to_rank_right():
     score = torch.tensor([1.0, 2.0, 2.0, 3.0], dtype=torch.float64)
     word = torch.tensor([0.0, 1.0, 0.0, 1.0], dtype=torch.float64)
-    rest = torch.tensor([1.0, 0.0, 1.0, 0.0], dtype=torch.float64)
-    assert _separation(score, word, rest) == pytest.approx((1 + 0.5 + 1 + 1) / 4)
-    assert _separation(-score, word, rest) == pytest.approx(1 - 3.5 / 4)
+    photo = _Photo("", word, 1 - word, 0.5, 1, True)
+    assert photo.separation(score) == pytest.approx((1 + 0.5 + 1 + 1) / 4)
+    assert photo.separation(-score) == pytest.approx(1 - 3.5 / 4)

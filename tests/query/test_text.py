@@ -6,12 +6,13 @@ import torch
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.text import (
     Prompt,
-    SynonymTable,
     TextConfig,
     TextEncoder,
     caution,
     parse_prompts,
     searched,
+    synonym_table,
+    synonyms_of,
 )
 
 
@@ -50,7 +51,7 @@ def test_negatives_alone_are_refused_in_words():
 
 
 def test_the_table_holds_architectural_terms_with_common_synonyms():
-    terms = SynonymTable().terms
+    terms = synonym_table()
     assert len(terms) >= 60
     for term, synonyms in terms.items():
         assert term == term.lower().strip() and isinstance(synonyms, list) and synonyms, term
@@ -61,7 +62,7 @@ def test_the_table_holds_architectural_terms_with_common_synonyms():
 
 @pytest.mark.parametrize("text", ["lintel", "Lintels", "the LINTEL", " a lintel "])
 def test_terms_are_known_in_singular_and_plural(text):
-    assert SynonymTable()(text)[0] == "beam above a door"
+    assert synonyms_of(text)[0] == "beam above a door"
 
 
 @pytest.mark.parametrize(
@@ -70,8 +71,7 @@ def test_terms_are_known_in_singular_and_plural(text):
      ("oculi", "oculus"), ("tympana", "tympanum"), ("niche", "niche"), ("basilica", None)],
 )  # fmt: skip
 def test_plurals_of_several_kinds(plural, term):
-    table = SynonymTable()
-    assert table(plural) == (table.terms[term] if term else [])
+    assert synonyms_of(plural) == (synonym_table()[term] if term else [])
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def rows(encoder: TextEncoder, text: str) -> torch.Tensor:
 
 
 def test_synonyms_are_joined_or_each_on_its_own(encode):
-    words = [*SynonymTable()("oculus"), "oculus"]
+    words = [*synonyms_of("oculus"), "oculus"]
     joined, each = (
         rows(TextEncoder(encode, TextConfig(combine=c)), "oculus") for c in ("joined", "fallback")
     )

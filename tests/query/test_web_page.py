@@ -236,7 +236,7 @@ def test_a_word_is_answered_as_by_python(answering, text):
     # A quarter of a logit per unit of the cosine at the steepest: 1e-3 of the latter at temperature 10.
     np.testing.assert_allclose(found["relevancy"], expected, atol=2.5e-3)
     assert found["threshold"] == pytest.approx(question.thresholds[0], abs=2.5e-3)
-    fit, unrelated = peaks(scene.engine.of_gaussians(question.queries))[0], scene.doubts._unrelated
+    fit, unrelated = peaks(scene.engine.of_gaussians(question.queries))[0], scene.doubts.unrelated
     least, most = (
         61 if fit < LEAST_PEAK else 1 + int((unrelated >= fit * factor).sum()) for factor in (1.002, 0.997)
     )

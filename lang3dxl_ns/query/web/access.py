@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import ipaddress
 import secrets
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
@@ -27,12 +27,9 @@ class Headers(Protocol):
 
 def is_local(host: str) -> bool:
     """Whether a server at this address can be reached from this machine only."""
-    if host == "localhost":
-        return True
-    try:
+    with suppress(ValueError):  # a name
         return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return host == "localhost"
 
 
 @dataclass
@@ -92,14 +89,8 @@ class Access:
         return own or (self.public and (site.hostname or "").endswith(".viser.studio"))
 
     def _knows_token(self, headers: Headers) -> bool:
-        for line in headers.get_all("Cookie") or []:
-            try:
-                cookie = SimpleCookie(line).get(self._cookie)
-            except CookieError:
-                continue
-            if cookie is not None and self._is_token(cookie.value):
-                return True
-        return False
+        pairs = (pair.strip() for line in headers.get_all("Cookie") or [] for pair in line.split(";"))
+        return any(self._is_token(pair.removeprefix(f"{self._cookie}=")) for pair in pairs)
 
     def _is_token(self, offered: str) -> bool:
         return secrets.compare_digest(offered.encode("utf-8", "replace"), self.token.encode())

@@ -119,14 +119,14 @@ def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning
     if decoded.head is not None and isinstance(decoder, SemanticField) and _is_small(decoder):
         settings, files = _packed_field(decoder)
         places = 1 + (torch.nan_to_num(codes).double().sigmoid() * 65534).round()
-        files["codes.bin"] = places.cpu().numpy().astype("<u2").tobytes() + _half(rows[:, -1])
+        files["codes.bin"] = places.cpu().numpy().astype("<u2").tobytes() + halves(rows[:, -1])
         return PackedMeaning(description | {"field": settings}, files, decoded.head)
     if rows.numel() * 2 > _MOST_ROW_BYTES:
         raise UserError(
             f"this scene's decoder has {width} numbers per Gaussian, {rows.numel() * 2 / 1e6:.0f} MB for a "
             "page: train it with the field preset `short`, which a page decodes itself"
         )
-    return PackedMeaning(description | {"field": None}, {"rows.bin": _half(rows)}, decoded.head)
+    return PackedMeaning(description | {"field": None}, {"rows.bin": halves(rows)}, decoded.head)
 
 
 def _is_small(field: SemanticField) -> bool:
@@ -161,12 +161,7 @@ def _packed_field(field: SemanticField) -> tuple[dict[str, Any], dict[str, bytes
         "rectify": [settings.activation == "every" or layer is layers[-1] for layer in layers],
     }
     weights = [np.concatenate([_array(x.weight.T).ravel(), _array(x.bias)]) for x in layers]
-    return described, {"field.bin": np.concatenate(weights).astype("<f4").tobytes() + _half(table)}
-
-
-def pack_words(numbers: Float[Tensor, "v r"]) -> bytes:
-    """Half floats of texts in a scene's own space."""
-    return _half(numbers)
+    return described, {"field.bin": np.concatenate(weights).astype("<f4").tobytes() + halves(table)}
 
 
 # ── views ───────────────────────────────────────────────────────────────────────────────────────────────
@@ -189,7 +184,8 @@ def camera_json(camera: Camera) -> dict[str, Any]:
     return {"pose": camera.pose.tolist(), **lens}
 
 
-def _half(values: Tensor) -> bytes:
+def halves(values: Tensor) -> bytes:
+    """The values in half precision."""
     return _array(values).astype("<f2").tobytes()
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socketserver import TCPServer
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.web.access import Access
@@ -26,6 +26,7 @@ _KINDS = {
     "json": "application/json",
     "txt": "text/plain; charset=utf-8",
 }
+_BYTES = "application/octet-stream"
 _HEADERS = {
     "Cache-Control": "no-cache",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -75,17 +76,19 @@ class PageServer(ThreadingHTTPServer):
     def answer(self, path: str) -> tuple[HTTPStatus, str, bytes]:
         """Status, type and content for a path of the page, or a request of it."""
         place = urlsplit(path)
-        values = {name: found[0] for name, found in parse_qs(place.query).items()}
+        values = dict(parse_qsl(place.query))
         if place.path == "/api/encode":
-            content = json.dumps(self.page.answer(values.get("text", ""))).encode()
-            return HTTPStatus.OK, "application/json", content
+            return (
+                HTTPStatus.OK,
+                _KINDS["json"],
+                json.dumps(self.page.answer(values.get("text", ""))).encode(),
+            )
         if place.path == "/api/look":
-            return HTTPStatus.OK, "application/octet-stream", self.page.colors(values.get("photo", ""))
+            return HTTPStatus.OK, _BYTES, self.page.colors(values.get("photo", ""))
         name = place.path.removeprefix("/") or "index.html"
         if name not in self.files:
             return HTTPStatus.NOT_FOUND, "text/plain", b"404\n"
-        kind = _KINDS.get(name.rpartition(".")[2], "application/octet-stream")
-        return HTTPStatus.OK, kind, self.files[name]
+        return HTTPStatus.OK, _KINDS.get(name.rpartition(".")[2], _BYTES), self.files[name]
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -104,11 +107,8 @@ class Handler(BaseHTTPRequestHandler):
         try:
             status, kind, content = self.server.answer(self.path)
         except (UserError, ValueError) as error:  # ValueError: an impossible address
-            status, kind, content = (
-                HTTPStatus.BAD_REQUEST,
-                _KINDS["txt"],
-                f"{error}".encode("utf-8", "replace"),
-            )
+            status, kind = HTTPStatus.BAD_REQUEST, _KINDS["txt"]
+            content = f"{error}".encode("utf-8", "replace")
         self._send(status, {"Content-Type": kind}, content)
 
     def _send(self, status: HTTPStatus, headers: Mapping[str, str], content: bytes) -> None:

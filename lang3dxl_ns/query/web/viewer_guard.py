@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
@@ -137,8 +136,13 @@ def guard_viewers() -> None:
     def guarded_start(self: infra.WebsockServer) -> None:
         self.guard = guard = Guard(self._host, self._port, root=self._http_server_root)  # type: ignore[attr-defined]
         self.on_client_connect(lambda connection: setattr(connection, "guard", guard))
-        with _serving(partial(GuardedProtocol, guard)):
+        module: Any = websockets.server
+        serve = module.serve
+        module.serve = partial(serve, create_protocol=partial(GuardedProtocol, guard))  # viser has no option
+        try:
             start(self)
+        finally:
+            module.serve = serve
         guard.port = self._port  # differs if the port was taken
 
     def guarded_handle(self: infra.WebsockMessageHandler, client_id: Any, message: Any) -> None:
@@ -151,18 +155,6 @@ def guard_viewers() -> None:
     infra.WebsockServer.start = guarded_start  # type: ignore[method-assign]
     infra.WebsockMessageHandler._handle_incoming_message = guarded_handle  # type: ignore[method-assign]
     infra.WebsockServer.is_guarded = True  # type: ignore[attr-defined]
-
-
-@contextlib.contextmanager
-def _serving(protocol: Any) -> Iterator[None]:
-    """While a server starts: make it use this protocol class, for which viser has no option."""
-    module: Any = websockets.server
-    serve = module.serve
-    module.serve = partial(serve, create_protocol=protocol)
-    try:
-        yield
-    finally:
-        module.serve = serve
 
 
 class GuardedProtocol(WebSocketServerProtocol):

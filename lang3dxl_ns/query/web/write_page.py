@@ -20,7 +20,7 @@ from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.negatives import NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.scene_file import Provenance
-from lang3dxl_ns.query.teach import TaughtWord, known_word
+from lang3dxl_ns.query.teach import known_word
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
 from lang3dxl_ns.query.web.pack import (
@@ -28,18 +28,18 @@ from lang3dxl_ns.query.web.pack import (
     PIXEL_STEPS,
     PackedMeaning,
     camera_json,
+    halves,
     pack_colors,
     pack_meaning,
     pack_splats,
     pack_view,
-    pack_words,
     spread,
 )
 
 _HERE = Path(__file__).parent
 _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
-"""Of the views that the page flies to, and of the photos' lightings; of more, evenly chosen ones are kept."""
+"""Bytes of the views that the page flies to, and of the lightings; of more, evenly chosen ones are kept."""
 _TEXTS = 256
 """Texts encoded at a time."""
 MOST_TEXT = 2_000
@@ -103,7 +103,7 @@ class Page:
             "start": camera_json(scene.overview.full_camera),
             "colors": PROMPT_COLORS,
             "live": self.live,
-            "prompts": [[prompt.text, *prompt.negatives] for prompt in self.prompts],
+            "prompts": _phrases(self.prompts),
             "words": None,
         }
         about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
@@ -112,7 +112,14 @@ class Page:
             about["looks"] = {name: f"look{i}.bin" for i, name in enumerate(chosen)}
             files |= {f"look{i}.bin": self.colors(name) for i, name in enumerate(chosen)}
         if self._meaning is not None:
-            about["words"] = self._meaning.description | self._settings()
+            about["words"] = self._meaning.description | {
+                "temperature": scene.engine.temperature,
+                "threshold": scene.config.threshold,
+                "unrelated": scene.doubts.unrelated.tolist(),
+                "gap": scene.gap,
+                "covered": scene.config.min_alpha,
+                "pixels": [LEAST_PIXELS, PIXEL_STEPS],
+            }
             files |= self._meaning.files | self._vocabulary(self._meaning)
             packed = {name: pack_view(view, len(scene.splats)) for name, view in scene.visible.items()}
             views = self._within_limits("views", list(packed), list(map(len, packed.values())))
@@ -121,7 +128,7 @@ class Page:
                 {"name": name, "bytes": len(packed[name]), **camera_json(scene.visible[name].camera)}
                 for name in views
             ]
-            about["foreground"] = [[prompt.text, *prompt.negatives] for prompt in self._foreground]
+            about["foreground"] = _phrases(self._foreground)
         about["left_out"] = self.left_out
         files["scene.json"] = json.dumps(about).encode()
         return files
@@ -135,59 +142,41 @@ class Page:
             self.left_out.append(f"{len(names) - count} of {len(names)} {what} are left out, to load quickly")
         return spread(names, count)
 
-    def _settings(self) -> dict[str, Any]:
-        """What answers depend on besides rows and words."""
-        scene = self.scene
-        return {
-            "temperature": scene.engine.temperature,
-            "threshold": scene.config.threshold,
-            "unrelated": scene.doubts._unrelated.tolist(),
-            "gap": scene.gap,
-            "covered": scene.config.min_alpha,
-            "pixels": [LEAST_PIXELS, PIXEL_STEPS],
-        }
-
     def _vocabulary(self, meaning: PackedMeaning) -> dict[str, bytes]:
         """The words that the page knows: those that may name a place first, then all others."""
-        negatives = list(self.scene.text.config.negatives)
-        prompts = [*self.prompts, *self._foreground]
-        asked = [plain(phrase) for prompt in prompts for phrase in (prompt.text, *prompt.negatives)]
-        naming = list(dict.fromkeys(filter(None, map(plain, [*shipped_vocabulary(), *self._words, *asked]))))
-        taught = self.scene.words
-        others = [*(plain(word.name) for word in taught.values()), *common_words(), *map(plain, self._more)]
-        words = list(dict.fromkeys([*naming, *filter(None, others)]))
-        own = torch.cat([*self._encoded(meaning, negatives), *self._encoded(meaning, words)])
-        special, extra = {}, [own]
+        negatives, taught = list(self.scene.text.config.negatives), self.scene.words
+        asked = [phrase for phrases in _phrases([*self.prompts, *self._foreground]) for phrase in phrases]
+        naming = _distinct([*shipped_vocabulary(), *self._words, *asked])
+        others = [*(word.name for word in taught.values()), *common_words(), *self._more]
+        words = _distinct([*naming, *others])
+        numbers = [*self._encoded(meaning, negatives), *self._encoded(meaning, words)]
+        count = len(negatives) + len(words)
+        special, learned = {}, {}
         for i, word in enumerate(words):
-            if i < len(naming) or known_word(word) in taught:
+            known = taught.get(known_word(word))
+            if i < len(naming) or known is not None:
                 near, against = self._meant(meaning, word)
             else:
-                near, against = own[:1], competitors(negatives, [word])
-            if len(near) > 1 or len(against) < len(negatives):
-                rows = range(sum(map(len, extra)), sum(map(len, extra)) + len(near))
-                special[i] = [list(rows) if len(near) > 1 else [len(negatives) + i], against]
-                extra += [near] if len(near) > 1 else []
+                near, against = numbers[0][:1], competitors(negatives, [word])
+            if len(near) > 1:
+                special[i] = [list(range(count, count + len(near))), against]
+                numbers.append(near)
+                count += len(near)
+            elif len(against) < len(negatives):
+                special[i] = [[len(negatives) + i], against]
+            if known is not None:  # what examples taught, in the scene's own numbers
+                vector = meaning.of_texts(known.vector[None].to(self.scene.device))[0].tolist()
+                learned[i] = {"vector": vector, "bias": known.bias, "text": known.text, "doubt": known.doubt}
         described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
         described["nothing"] = [i for i, phrase in enumerate(negatives) if phrase in NOTHING]
-        described["taught"] = {
-            i: self._learned(meaning, taught[known_word(word)])
-            for i, word in enumerate(words)
-            if known_word(word) in taught
-        }
-        return {
-            "vocabulary.json": json.dumps(described).encode(),
-            "vocabulary.bin": pack_words(torch.cat(extra)),
-        }
+        described["taught"] = learned
+        listed = json.dumps(described).encode()
+        return {"vocabulary.json": listed, "vocabulary.bin": halves(torch.cat(numbers))}
 
     def _meant(self, meaning: PackedMeaning, word: str) -> tuple[Float[Tensor, "s r"], list[int]]:
         """Vectors that are searched for along with a word, and the negatives that it competes with."""
         queries = self.scene.queries(self.scene.prompts([Prompt(word)]))
         return meaning.of_texts(queries.vectors[list(queries.positive[0])]).cpu(), list(queries.negative[0])
-
-    def _learned(self, meaning: PackedMeaning, word: TaughtWord) -> dict[str, Any]:
-        """What examples taught, in the scene's own numbers."""
-        vector = meaning.of_texts(word.vector[None].to(self.scene.device))[0].tolist()
-        return {"vector": vector, "bias": word.bias, "text": word.text, "doubt": word.doubt}
 
     def _encoded(self, meaning: PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
         parts = [texts[row : row + _TEXTS] for row in range(0, len(texts), _TEXTS)]
@@ -216,6 +205,16 @@ class Page:
         """Red, green, blue and opacity of every Gaussian under a photo's lighting. Raises UserError if there
         is no such look."""
         return pack_colors(self.scene.baked(photo), self._toward).tobytes()
+
+
+def _phrases(prompts: Sequence[Prompt]) -> list[list[str]]:
+    """Each prompt and its negatives."""
+    return [[prompt.text, *prompt.negatives] for prompt in prompts]
+
+
+def _distinct(phrases: Sequence[str]) -> list[str]:
+    """The phrases as the page compares them, each once."""
+    return list(dict.fromkeys(filter(None, map(plain, phrases))))
 
 
 def plain(text: str) -> str:

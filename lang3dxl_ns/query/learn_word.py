@@ -1,0 +1,277 @@
+"""Learning of a word from marks: a direction in CLIP's space, from the Gaussians that the marks show.
+
+A word is a linear score of unit CLIP features, fitted by logistic regression to the Gaussians that the marked
+pixels show. It joins the text's own relevancy in proportion to how well that separates the marked from the
+rest: docs/teach.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.engine import QueryEngine
+from lang3dxl_ns.query.marks import MARK_SIDE, marks
+from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.run_file import ScenePhoto
+from lang3dxl_ns.query.teach import Example, TaughtWord
+from lang3dxl_ns.rendering.gathering import filled_parts
+from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering.render import composite
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import resized
+
+_ROWS = 20_000
+"""Gaussians that a word is fitted to, at most; more are sampled by their weight."""
+_AXES = 64
+"""Principal components of the scene's features that a word is fitted in."""
+_TYPICAL = 4096
+"""Gaussians, evenly spaced, that the components are taken from."""
+_LEAST_SPREAD = 1e-3
+"""Spread of a coordinate that takes part, relative to the largest."""
+_RIDGE, _LEAST_RIDGE = 0.3, 0.01
+"""Penalty of the squared coefficients, per standardized coordinate, after one click; and at least."""
+_UP = 0.6
+"""Part of the way from the mean score of a clicked photo to that of the clicks where the word begins."""
+_GAIN = 1.5
+"""Weight of a text whose average precision is 1."""
+_TRUST = 3
+"""Clicks that the belief in a word's text is worth before anything is marked."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Pixels of an example's photo that each Gaussian fills."""
+
+    word: Float[Tensor, " n"]
+    """Pixels marked as the word."""
+    other: Float[Tensor, " n"]
+    """Pixels marked as something else."""
+    seen: Float[Tensor, " n"]
+    """All pixels."""
+
+    @classmethod
+    def of(cls, example: Example, photo: ScenePhoto, splats: Splats, backend: Backend = "auto") -> Weights:
+        """Those that an example marks in its photo's foreground. Raises UserError as `marks`."""
+        camera = resized(photo.full_camera, MARK_SIDE)
+        size = (camera.height, camera.width)
+        foreground = photo.foreground(size)
+        shown = torch.ones(size) if foreground is None else foreground.float()
+        pixels = torch.cat([marks(example, photo, size) * shown, shown[None]]).permute(1, 2, 0)
+        drawn = partial(composite, splats, camera, backend=backend)
+        parts = filled_parts(drawn, pixels.to(splats.means.device), len(splats))
+        return cls(*parts.unbind(1))
+
+    def check(self, photo: str, word: str) -> None:
+        """Raises UserError where the marks show nothing, or everything."""
+        marked, everything = float(self.word.sum()), float(self.seen.sum())
+        if marked <= 1e-6 * max(everything, 1.0):
+            raise UserError(f"the marks of {word!r} in {photo} lie where the scene shows nothing")
+        if marked >= 0.98 * everything:
+            raise UserError(f"{word!r} is everything that {photo} shows: mark the word alone")
+
+    @property
+    def rest(self) -> Float[Tensor, " n"]:
+        """Shares of what is not the word. Pixels marked so weigh as much as the rest of their photo."""
+        rest = (self.seen - self.word).clamp_min(0).double()
+        rest, marked = rest / rest.sum().clamp_min(1e-12), self.other.double()
+        return rest if float(marked.sum()) <= 0 else 0.5 * (rest + marked / marked.sum())
+
+
+def learn(
+    name: str,
+    examples: Sequence[Example],
+    weights: Sequence[Weights],
+    engine: QueryEngine,
+    queries: Queries,
+) -> TaughtWord:
+    """The word that examples teach; their order doesn't matter.
+
+    Args:
+        name: the word.
+        examples: the marks, for the record.
+        weights: what they show, one per example.
+        engine: has the features of the scene's Gaussians, and the temperature of its relevancies.
+        queries: of the word's text, without synonyms.
+
+    Raises:
+        UserError: there is no example, or the marks show nothing, or everything.
+    """
+    if not examples:
+        raise UserError(f"there is no example of {name!r}: mark it in a photo")
+    for example, one in zip(examples, weights, strict=True):
+        one.check(example.photo, name)
+    rows, photos = _sampled(examples, weights)
+    sample = engine.features(rows).double()
+    # Margins of the text: the cosine minus that of the best competitor.
+    text = queries.relevancy_of_cosines(queries.cosines(sample.float()), 1.0)[0].logit().double()
+    everywhere = torch.linspace(0, len(weights[0].seen) - 1, _TYPICAL).long().to(rows.device)
+    axes = _Axes.of(engine.features(everywhere).double(), engine.head)
+    fit = partial(_fitted, name, sample, text, axes, engine.temperature)
+    word = fit(photos)
+    # Each photo is judged by what the others teach.
+    judges = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))] if len(photos) > 1 else [word]
+    precision = {
+        photo.name: photo.precision(judge.margins(sample, text))
+        for photo, judge in zip(photos, judges, strict=True)
+    }
+    doubt = _mean([1 - photo.separation(word.margins(sample, text)) for photo in photos])
+    return replace(word, doubt=doubt, precision=precision, examples=tuple(examples))
+
+
+@dataclass(frozen=True)
+class _Photo:
+    """Weights of the sampled Gaussians in one marked photo."""
+
+    name: str
+    word: Float[Tensor, " m"]
+    """Weights of what is the word; they sum to 1."""
+    rest: Float[Tensor, " m"]
+    """Weights of what is not; they sum to 1."""
+    share: float
+    """Share of the photo that is marked as the word."""
+    evidence: int
+    complete: bool
+
+    def precision(self, score: Float[Tensor, " m"]) -> float:
+        """Average precision of a score, of Gaussians weighted by the pixels that they fill."""
+        from sklearn.metrics import average_precision_score
+
+        rest = (1 - self.share) * self.rest
+        labels, scores, weights = _labeled(score, self.share * self.word, rest)
+        return average_precision_score(labels, scores, sample_weight=weights)
+
+    def separation(self, score: Float[Tensor, " m"]) -> float:
+        """Chance that the word scores above the rest; equal scores share."""
+        from sklearn.metrics import roc_auc_score
+
+        labels, scores, weights = _labeled(score, self.word, self.rest)
+        return roc_auc_score(labels, scores, sample_weight=weights)
+
+
+def _labeled(
+    values: Float[Tensor, "m ..."], word: Float[Tensor, " m"], rest: Float[Tensor, " m"]
+) -> tuple[Float[Array, " k"], Float[Array, "k ..."], Float[Array, " k"]]:
+    """Labels, values and weights for scikit-learn: every Gaussian as the word (1), and as the rest (0)."""
+    labels = torch.cat([torch.ones_like(word), torch.zeros_like(rest)])
+    weights = torch.cat([word, rest])
+    found = [part[weights > 0].cpu().numpy() for part in (labels, torch.cat([values, values]), weights)]
+    return found[0], found[1], found[2]
+
+
+def _sampled(
+    examples: Sequence[Example], weights: Sequence[Weights]
+) -> tuple[Int[Tensor, " m"], list[_Photo]]:
+    """Gaussians to fit, and their weights in every photo: evenly spaced ones of those that are the word, then
+    of those that are not (a Gaussian at an edge may be both)."""
+    words = [one.word.double() / one.word.double().sum() for one in weights]
+    rests = [one.rest for one in weights]
+    first, second = (_spaced(torch.stack(parts).sum(0)) for parts in (words, rests))
+    photos = []
+    for example, one, word, rest in zip(examples, weights, words, rests, strict=True):
+        share = float(one.word.sum() / one.seen.sum())
+        word = torch.cat([word[first], torch.zeros_like(word[second])])
+        rest = torch.cat([torch.zeros_like(rest[first]), rest[second]])
+        kind = (share, example.evidence, example.complete)
+        photos.append(_Photo(example.photo, word / word.sum(), rest / rest.sum(), *kind))
+    return torch.cat([first, second]), photos
+
+
+def _spaced(weight: Float[Tensor, " n"]) -> Int[Tensor, " m"]:
+    rows = (weight > 1e-5 * weight.max()).nonzero().squeeze(1)
+    return rows[:: math.ceil(len(rows) / _ROWS)]
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Standardized coordinates of features."""
+
+    middle: Float[Tensor, " c"]
+    matrix: Float[Tensor, "c k"]
+
+    @classmethod
+    def of(cls, features: Float[Tensor, "n c"], head: Float[Tensor, "k c"] | None) -> _Axes:
+        """From features of a scene, and the rows that all of them are made of; None: principal components."""
+        known = features[features.abs().sum(1) > 0]
+        middle = known.mean(0)
+        if head is None:
+            axes = torch.linalg.eigh((known - middle).T @ (known - middle)).eigenvectors[:, -_AXES:]
+        else:
+            axes = torch.linalg.pinv(head.to(known))
+        spread = ((known - middle) @ axes).square().mean(0).sqrt()
+        return cls(middle, axes * torch.where(spread > _LEAST_SPREAD * spread.max(), 1 / spread, 0.0))
+
+    def places(self, features: Float[Tensor, "m c"]) -> Float[Tensor, "m k"]:
+        """Coordinates of features."""
+        return (features - self.middle) @ self.matrix
+
+
+def _fitted(
+    name: str,
+    sample: Float[Tensor, "m c"],
+    text: Float[Tensor, " m"],
+    axes: _Axes,
+    temperature: float,
+    photos: Sequence[_Photo],
+) -> TaughtWord:
+    word = torch.stack([photo.word for photo in photos]).mean(0)
+    rest = torch.stack([photo.rest for photo in photos]).mean(0)
+    evidence = sum(photo.evidence for photo in photos)
+    slope, bias = _logistic(axes.places(sample), word, rest, max(_RIDGE / evidence, _LEAST_RIDGE))
+    vector = axes.matrix @ slope / temperature
+    bias = bias / temperature - float(axes.middle @ vector)
+    trust = (evidence * _trust(text, photos) + _TRUST) / (evidence + _TRUST)
+    taught = TaughtWord(name, vector.float(), bias, trust, 0.5)
+    return replace(taught, bias=bias - _level(taught.margins(sample, text), photos))
+
+
+def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
+    """Weight of a text, by how well it tells the word from the rest: its average precision in photos where
+    all of the word is marked, or how far it ranks clicks above the rest."""
+    complete = [photo.precision(text) for photo in photos if photo.complete]
+    if complete:
+        return _GAIN * _mean(complete)
+    return max(_mean([2 * photo.separation(text) - 1 for photo in photos]), 0.0)
+
+
+def _logistic(
+    places: Float[Tensor, "m k"], word: Float[Tensor, " m"], rest: Float[Tensor, " m"], ridge: float
+) -> tuple[Float[Tensor, " k"], float]:
+    """Slope and bias of a logistic regression with both classes weighing the same:
+    minimizes ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
+    from sklearn.linear_model import LogisticRegression
+
+    labels, inputs, weights = _labeled(places, word / 2, rest / 2)
+    model = LogisticRegression(C=1 / ridge, solver="newton-cholesky", tol=1e-6)
+    model.fit(inputs, labels, weights)
+    return torch.from_numpy(model.coef_[0]).to(places), float(model.intercept_[0])
+
+
+def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
+    """The score above which the word is: where intersection over union is best in photos whose marks are
+    complete; without any, part of the way from what is not clicked to what is."""
+    complete = [photo for photo in photos if photo.complete]
+    if not complete:
+        on = _mean([float(score @ photo.word) for photo in photos])
+        return _UP * on + (1 - _UP) * _mean([float(score @ photo.rest) for photo in photos])
+    order = score.argsort(descending=True, stable=True)
+    overlap = torch.zeros_like(score)
+    for photo in complete:
+        found = photo.share * photo.word[order].cumsum(0)
+        overlap += found / (photo.share + (1 - photo.share) * photo.rest[order].cumsum(0))
+    falls = -score[order].diff()
+    overlap[:-1][falls <= 1e-4 * falls.sum()] = 0.0  # equal scores can't be told apart
+    best = min(int(overlap.argmax()), len(order) - 2)
+    return 0.5 * float(score[order[best]] + score[order[best + 1]])
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)

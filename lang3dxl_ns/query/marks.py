@@ -1,0 +1,77 @@
+"""Marks of an example, drawn into the views that the scene is measured in."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.run_file import ScenePhoto
+from lang3dxl_ns.query.teach import MASK_SIDE, Box, Example, Point
+
+MARK_SIDE = 320
+"""Longer side in pixels of the views that marks are gathered in."""
+_REACH = 0.01
+"""Radius of a click, in longer sides of the photo."""
+
+
+def marks(example: Example, photo: ScenePhoto, size: tuple[int, int]) -> Float[Tensor, "2 h w"]:
+    """Shares of the pixels of a view (height, width) that are marked as the word, and as not the word.
+
+    Marks are drawn on the file, and views are undistorted.
+
+    Raises:
+        UserError: marks lie outside the photo, or have other proportions.
+    """
+    width, height = photo.file_size
+    labels = photo.photo().undistort_labels(_drawn(example, width, height))
+    chosen = torch.stack([labels == 1, labels == 2]).float()
+    return F.interpolate(chosen[None], size, mode="area")[0]
+
+
+def _drawn(example: Example, width: int, height: int) -> Int[Tensor, "h w"]:
+    """1 on the word, 2 on what is not, 0 elsewhere, at most `MASK_SIDE` pixels wide and high."""
+    if example.mask is not None:
+        rows, columns = example.mask.shape
+        if abs(columns * height - rows * width) > 0.01 * rows * width + max(width, height):
+            raise UserError(
+                f"the mask of {example.photo} has {columns} × {rows} pixels, the photo {width} × {height}: "
+                "draw it on the whole photo"
+            )
+        labels = torch.from_numpy(example.mask.astype(np.int32))
+    else:
+        zoom = min(MASK_SIDE / max(width, height), 1.0)
+        labels = torch.zeros(max(round(height * zoom), 1), max(round(width * zoom), 1), dtype=torch.int32)
+    place = f"{example.photo} of {width} × {height} pixels"
+    x, y = labels.shape[1] / width, labels.shape[0] / height
+    if example.box is not None:
+        left, top, right, bottom = _cut(example.box, width, height, place)
+        across = slice(int(left * x), max(math.ceil(right * x), int(left * x) + 1))
+        labels[int(top * y) : max(math.ceil(bottom * y), int(top * y) + 1), across] = 1
+    for points, label in ((example.points, 1), (example.not_points, 2)):
+        for column, row in points:
+            if not (0 <= column <= width and 0 <= row <= height):
+                raise UserError(f"the point {column:g}, {row:g} lies outside {place}")
+            _draw_disk(labels, ((column + 0.5) * x, (row + 0.5) * y), label)
+    return labels
+
+
+def _cut(box: Box, width: int, height: int, place: str) -> Box:
+    """A box without what lies outside the photo. Raises UserError if nothing is left."""
+    left, top, right, bottom = box
+    cut = (max(left, 0), max(top, 0), min(right, width), min(bottom, height))
+    if not (cut[0] < cut[2] and cut[1] < cut[3]):
+        numbers = ", ".join(f"{x:g}" for x in box)
+        raise UserError(f"the box {numbers} marks nothing in {place}: give left, top, right and bottom")
+    return cut
+
+
+def _draw_disk(labels: Int[Tensor, "h w"], center: Point, label: int) -> None:
+    rows, columns = torch.meshgrid(*(torch.arange(side) + 0.5 for side in labels.shape), indexing="ij")
+    radius = max(_REACH * max(labels.shape), 0.8)
+    labels[(columns - center[0]) ** 2 + (rows - center[1]) ** 2 <= radius**2] = label
