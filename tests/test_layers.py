@@ -33,13 +33,6 @@ def modules(*layers: str) -> list[str]:
     ]
 
 
-IMPORT_ALL = """
-import importlib, json, sys
-for name in {names}: importlib.import_module(name)
-print(json.dumps(sorted({{m.split(".")[0] for m in sys.modules}})))
-"""
-
-
 ORDER = (
     {"common"},
     {"scene"},
@@ -144,20 +137,16 @@ def all_imports(source: str, modules) -> set[str]:
     return found & set(modules)
 
 
-def test_rooms_below_the_plugin_load_neither_nerfstudio_nor_cuda_code():
-    below = modules(
-        "common",
-        "scene",
-        "components",
-        "rendering",
-        "preparation",
-        "query",
-        "evaluation",
-        "baselines",
-        "attachment",
-    )
-    loaded = json.loads(run(IMPORT_ALL.format(names=below)))
-    assert not {"nerfstudio", "gsplat", "tinycudann"} & set(loaded)
+def test_public_names_load_at_first_use_and_rooms_below_the_plugin_load_neither_nerfstudio_nor_cuda_code():
+    below = ("common", "scene", "components", "rendering", "preparation", "query", "evaluation", "baselines")
+    code = f"""
+import importlib, json, sys, lang3dxl_ns
+assert "torch" not in sys.modules
+for name in {modules(*below, "attachment")}: importlib.import_module(name)
+print(json.dumps(sorted({{m.split(".")[0] for m in sys.modules}})))
+assert all(getattr(lang3dxl_ns, name) is not None for name in lang3dxl_ns.__all__)
+"""
+    assert not {"nerfstudio", "gsplat", "tinycudann"} & set(json.loads(run(code).splitlines()[0]))
 
 
 @pytest.mark.slow
@@ -180,12 +169,3 @@ entrypoint()
     said = run(code)
     assert said.startswith("set()\n")
     assert "--pipeline.model.sh-degree" in said
-
-
-def test_public_names_load_at_first_use_and_not_before():
-    code = """
-import sys, lang3dxl_ns
-assert "torch" not in sys.modules
-print(all(getattr(lang3dxl_ns, name) is not None for name in lang3dxl_ns.__all__))
-"""
-    assert run(code).strip() == "True"

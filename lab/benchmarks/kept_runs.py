@@ -57,7 +57,7 @@ def _train_and_keep(
     write_output_to(log)
     from lang3dxl_ns.commands.evaluate import write_scores
     from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-    from lang3dxl_ns.plugin.open_run import open_run
+    from lang3dxl_ns.plugin.trainer_config import open_run
 
     config = run_configuration(run, settings, folder)
     config.pipeline.ground_truth, config.pipeline.evaluated_photos = truth.absolute(), "seen"

@@ -78,7 +78,7 @@ def serve(folder: Path):
     from scenes import write_scene
     from tiny_models import make_tiny_clip, make_tiny_dinov2
 
-    from lang3dxl_ns.plugin.open_run import open_run
+    from lang3dxl_ns.plugin.trainer_config import open_run
 
     data = write_scene(folder / "scene", photos=6, points=2000)
     clip, dense = make_tiny_clip(folder / "clip"), make_tiny_dinov2(folder / "dinov2")

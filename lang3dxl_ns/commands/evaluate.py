@@ -85,7 +85,7 @@ class EvaluateRun:
         if self.run is not None and self.run.suffix == ".scene":
             self._score_scene(self.run)
             return
-        from lang3dxl_ns.plugin.open_run import open_run
+        from lang3dxl_ns.plugin.trainer_config import open_run
 
         if self.split == "test" and (self.ground_truth is not None or self.layout != "auto"):
             raise UserError("--split test has labels of its own, in test_views/: leave --ground-truth off")

@@ -31,7 +31,7 @@ class Prepare(PreparationConfig):
     removed photos, or dense features with --dense none)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.plugin.data_folder import check_data
+        from lang3dxl_ns.plugin.dataparser import check_data
         from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
         from lang3dxl_ns.preparation.store import FeatureStore
 

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import torch
+from lang3dxl_ns.common.reports import synchronize
 
 _seconds: dict[str, list[float]] | None = None
 
@@ -18,10 +18,10 @@ def part(name: str) -> Iterator[None]:
     if _seconds is None:
         yield
         return
-    _synchronize()
+    synchronize()
     start = time.perf_counter()
     yield
-    _synchronize()
+    synchronize()
     _seconds[name].append(time.perf_counter() - start)
 
 
@@ -34,8 +34,3 @@ def measure() -> Iterator[dict[str, list[float]]]:
         yield _seconds
     finally:
         _seconds = None
-
-
-def _synchronize() -> None:
-    if torch.cuda.is_initialized():
-        torch.cuda.synchronize()

@@ -6,15 +6,15 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.reports import as_png, command_line, describe_machine, markdown_table, progress_bar
-from lang3dxl_ns.numerics.catalog import all_cases
+from lang3dxl_ns.numerics.catalog import all_cases, optimizations
 from lang3dxl_ns.numerics.measure import Case, Row, measure
-from lang3dxl_ns.numerics.optimization import Run, runs
 
 HEADER = "component", "case", "mode", "output", "gradient", "bounds", "flipped", "ms", "verdict"
 SMALLEST = 1e-18
@@ -41,15 +41,16 @@ class Numerics:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # the timer measures processor time
         try:
-            rows = measure_all(list(all_cases(self.quick, device)), self.quick, device)
-            optimizations = runs(self.quick)
+            repeats = 1 if self.quick else 3
+            rows = measure_all(list(all_cases(self.quick, device)), self.quick, device, repeats)
+            runs = optimizations(self.quick)
             heading = f"`{command_line('lang3dxl numerics', self)}`\n{describe_machine(device)}."
         finally:
             torch.set_num_threads(threads)
-        all_rows: list[Row | Run] = [*rows, *optimizations]
-        misses = [f"{row.name}: {'; '.join(row.misses)}" for row in all_rows if row.misses]
-        verdict = f"{len(all_rows) - len(misses)} of {len(all_rows)} rows pass"
-        write_atomically(self.out / "numerics.md", _markdown(rows, optimizations, heading, verdict))
+        misses = [f"{row.name}: {'; '.join(row.misses)}" for row in (*rows, *runs) if row.misses]
+        total = len(rows) + len(runs)
+        verdict = f"{total - len(misses)} of {total} rows pass"
+        write_atomically(self.out / "numerics.md", _markdown(rows, runs, heading, verdict))
         write_atomically(self.out / "numerics.png", _plot(rows))
         for miss in misses:
             print(f"MISS {miss}")
@@ -58,8 +59,9 @@ class Numerics:
             sys.exit(1)
 
 
-def measure_all(cases: Sequence[Case], quick: bool, device: str) -> list[Row]:
-    """A row for every case and mode; `quick` skips float64 where there is another mode."""
+def measure_all(cases: Sequence[Case], quick: bool, device: str, repeats: int = 0) -> list[Row]:
+    """A row for every case and mode; `quick` skips float64 where there is another mode. repeats: see
+    `measure`."""
     pairs = [
         (case, mode)
         for case in cases
@@ -67,15 +69,13 @@ def measure_all(cases: Sequence[Case], quick: bool, device: str) -> list[Row]:
         if not (quick and mode == "float64" and len(case.bounds) > 1)
     ]
     with progress_bar() as bar:
-        return [
-            measure(case, mode, device, repeats=1 if quick else 3)
-            for case, mode in bar.track(pairs, description="numerics")
-        ]
+        watched = bar.track(pairs, description="numerics")
+        return [measure(case, mode, device, repeats) for case, mode in watched]
 
 
-def _markdown(rows: Sequence[Row], optimizations: Sequence[Run], heading: str, verdict: str) -> str:
+def _markdown(rows: Sequence[Row], runs: Sequence[Any], heading: str, verdict: str) -> str:
     notes = dict.fromkeys(f"- {row.component}, {row.case}: {row.note}" for row in rows if row.note)
-    table = markdown_table(HEADER, [*map(_cells, rows), *map(_optimization, optimizations)])
+    table = markdown_table(HEADER, [*map(_cells, rows), *map(_optimization, runs)])
     return f"""# Numerics: error against run time on stiff and extreme cases
 
 {heading}
@@ -102,28 +102,16 @@ def _cells(row: Row) -> list[str | None]:
     if row.gradient_max is not None:
         slopes = f"{row.gradient_max:.0e} / {row.gradient_rms:.0e}"
         bounds += f" · {b.gradient_max:.0e} / {b.gradient_rms:.0e}"
-    output, flipped = f"{row.output_max:.0e} / {row.output_rms:.0e}", f"{row.flipped:.1%}"
-    return [
-        row.component,
-        row.case,
-        row.mode,
-        output,
-        slopes,
-        bounds,
-        flipped,
-        f"{row.ms:.2g}",
-        _verdict(row),
-    ]
+    output, shares = f"{row.output_max:.0e} / {row.output_rms:.0e}", [f"{row.flipped:.1%}", f"{row.ms:.2g}"]
+    return [row.component, row.case, row.mode, output, slopes, bounds, *shares, _verdict(row)]
 
 
-def _optimization(run: Run) -> list[str | None]:
-    ms = f"{1e3 * run.seconds:.0f}"
-    return [
-        "optimization", f"{run.case}, {run.steps:,} steps", "float32", *[None] * 4, ms, _verdict(run)
-    ]  # fmt: skip
+def _optimization(run: Any) -> list[str | None]:
+    case, ms = f"{run.case}, {run.steps:,} steps", f"{1e3 * run.seconds:.0f}"
+    return ["optimization", case, "float32", *[None] * 4, ms, _verdict(run)]
 
 
-def _verdict(row: Row | Run) -> str:
+def _verdict(row: Any) -> str:
     return f"**miss**: {'; '.join(row.misses)}" if row.misses else "pass"
 
 

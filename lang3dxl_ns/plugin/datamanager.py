@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 import tyro
@@ -32,18 +32,15 @@ from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.common.timing import part
-from lang3dxl_ns.plugin.data_folder import parser_for
-from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-from lang3dxl_ns.plugin.eval_photos import EvalPhotos
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for, recorded_scene
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
-from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
-from lang3dxl_ns.plugin.run_dataparser import recorded_scene
+from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
 from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.handover import Batch, SceneFacts
-from lang3dxl_ns.preparation.model_files import BUILTIN
+from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.prepare import prepare
@@ -52,6 +49,7 @@ from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.scene.camera import scaled_size
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.novel_views import NovelViews, read_novel_views
@@ -103,6 +101,8 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
             self.dense = BUILTIN if self.clip == BUILTIN else DENSE_MODEL
 
 
+_IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regions": torch.int64}
+"""Number types of targets in a step; kept in memory they are half as wide."""
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
 
 
@@ -298,6 +298,36 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """A photo's foreground, at training resolution; None if it is the whole photo."""
         return self._working.mask(self.photos[name], self.config.camera_res_scale_factor)
 
+    def scene_file(self) -> SceneFile:
+        """Description of the scene for the run's folder: photos, cameras, the CLIP."""
+        outputs, clip = self.train_dataparser_outputs, self.config.clip
+        known = None if clip == "none" else find_model(clip, CLIP_OPTION)
+        local, trained = expanded(clip), self._described(self.train_dataset, "train")
+        names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are held out
+        held_out = self._described(self.eval_dataset, "eval")
+        return SceneFile(
+            photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
+            clip=None if known is None else str(local.absolute()) if local.is_dir() else clip,
+            clip_identity=None if known is None else known.identity,
+            scale=float(outputs.dataparser_scale),
+            transform=outputs.dataparser_transform.tolist(),
+            data=str(expanded(self.config.dataparser.data).absolute()),
+        )
+
+    def _described(self, dataset: PhotoDataset, split: Literal["train", "eval"]) -> list[ScenePhoto]:
+        poses, photos = dataset.cameras.camera_to_worlds.tolist(), self.photos
+        return [
+            ScenePhoto(
+                name=photo.name,
+                split=split,
+                camera_to_world=pose,
+                lens=photo.lens.scaled(dataset.scale),
+                mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
+                size=(photo.lens.width, photo.lens.height),
+            )
+            for photo, pose in zip((photos[p.name] for p in dataset.photos), poses, strict=True)
+        ]
+
     @property
     def data_folder(self) -> Path:
         """Folder of the scene."""
@@ -404,15 +434,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def train_photos(self) -> Iterator[tuple[Cameras, Batch]]:
         """Camera and batch of every training photo once, without the damaged ones."""
-        for index, photo in enumerate(self.train_dataset.photos):
-            if index in self._left_out:
-                continue
-            try:
-                camera, batch = self.read(self.train_dataset, index)
-            except UserError as reason:
-                CONSOLE.log(f"[yellow]{photo.name} is left out: {reason}")
-                continue
-            camera.metadata = {"cam_idx": index}
+        photos = enumerate(self.train_dataset.photos)
+        usable = {photo.name for index, photo in photos if index not in self._left_out}
+        for camera, batch in self.evaluated(self.train_dataset, usable):
+            camera.metadata = {"cam_idx": batch["image_idx"]}
             yield camera, batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
@@ -421,12 +446,24 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def _eval_rounds(self) -> Iterator[tuple[Cameras, Batch]]:
-        return chain.from_iterable(repeat(EvalPhotos(self)))
+        return chain.from_iterable(repeat(self.evaluated()))
 
     @property
     def fixed_indices_eval_dataloader(self) -> EvalPhotos:  # type: ignore[override]
         """All held-out photos, read one at a time."""
-        return EvalPhotos(self)
+        return self.evaluated()
+
+    def evaluated(
+        self, dataset: PhotoDataset | None = None, names: Collection[str] | None = None
+    ) -> EvalPhotos:
+        """Photos of a dataset (default: the held-out ones) to evaluate; names: by default all of them."""
+        dataset = dataset or self.eval_dataset
+
+        def ready() -> Callable[[int], tuple[Cameras, Batch]]:
+            _ = self.targets  # errors in preparing them must not be blamed on a photo
+            return partial(self.read, dataset)
+
+        return EvalPhotos(dataset, ready, names)
 
     def read(self, dataset: PhotoDataset, index: int) -> tuple[Cameras, Batch]:
         """Camera and batch of a photo. Raises UserError if it can't be read."""
@@ -460,18 +497,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, Batch]:
         """A photo's data for a step, on the device, with `name` and `image_idx`. The camera stays on the CPU:
         the host reads its size, and would wait for a GPU."""
-        batch: dict[str, Any] = {
-            key: to_device(value, self.device) if isinstance(value, Tensor) else value
-            for key, value in data.items()
-        }
-        for key, number in (
-            ("clip_target", torch.float32),
-            ("dense_target", torch.float32),
-            ("regions", torch.int64),
-        ):
-            if key in batch:
-                batch[key] = batch[key].to(number)
-        batch |= {"image_idx": index, "name": dataset.photos[index].name}
+        batch: dict[str, Any] = {"image_idx": index, "name": dataset.photos[index].name}
+        for key, value in data.items():
+            if isinstance(value, Tensor):
+                value = to_device(value, self.device)
+                value = value.to(_IN_A_STEP.get(key, value.dtype))
+            batch[key] = value
         return dataset.cameras[index : index + 1], cast(Batch, batch)
 
 

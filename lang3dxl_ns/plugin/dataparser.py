@@ -1,4 +1,4 @@
-"""Dataparser for photo collections with a COLMAP model: a lens per photo, masks, the original scale."""
+"""Dataparsers: photo collections with a COLMAP model, the cameras of a finished run; choice of one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
@@ -18,12 +20,22 @@ from lang3dxl_ns.common.console import silence_libraries, some
 from lang3dxl_ns.common.errors import UserError, printable
 from lang3dxl_ns.common.files import expanded, read_names
 from lang3dxl_ns.common.settings_help import without
+from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.plugin.inert_settings import OF_COLMAP
 from lang3dxl_ns.preparation.foreground import find_mask
-from lang3dxl_ns.preparation.photo_collection import MODEL_FOLDERS, OWN_MODEL, images_path, usable_photos
+from lang3dxl_ns.preparation.photo_collection import (
+    MODEL_FOLDERS,
+    OWN_MODEL,
+    TRANSFORMS,
+    images_path,
+    usable_photos,
+)
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.photo import Photo
-from lang3dxl_ns.scene.photo_folder import photos_below
+from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
+from lang3dxl_ns.scene.reconstruct import reconstruct_scene
+from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 
 @without(*OF_COLMAP)
@@ -257,6 +269,92 @@ def _models_beside(model: Path) -> list[Path]:
 def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Path:
     """The first of the folders (relative to `data`) that exists and holds files; otherwise the first."""
     return next((c for c in candidates if any(p.is_file() for p in (data / c).glob(contents))), candidates[0])
+
+
+# ── a run whose photos are gone ───────────────────────────────────────────────────────────────────────────
+
+
+@dataclass
+class RecordedSceneDataParserConfig(DataParserConfig):
+    """The scene recorded in a run's folder."""
+
+    _target: type = field(default_factory=lambda: RecordedSceneDataParser)
+    run: Path = Path()
+    """Folder of the run."""
+
+
+class RecordedSceneDataParser(DataParser):
+    """Cameras at training resolution. Reads nothing outside the run's folder."""
+
+    config: RecordedSceneDataParserConfig
+
+    def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
+        scene = SceneFile.read(self.config.run / SCENE_FILE)
+        chosen = [photo for photo in scene.photos if (photo.split == "train") == (split == "train")]
+        photos = [photo.photo(Path(scene.data)) for photo in chosen]
+        poses = torch.tensor([photo.camera_to_world for photo in chosen], dtype=torch.float32)
+        cameras = to_nerfstudio([photo.lens for photo in photos], poses)
+        return DataparserOutputs(
+            image_filenames=[photo.path for photo in photos],
+            cameras=cameras,
+            scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
+            metadata={
+                "photos": photos,
+                # The checkpoint brings its own Gaussians: start with the fewest possible.
+                "points3D_xyz": torch.eye(4)[:, :3],
+                "points3D_rgb": torch.zeros(4, 3),
+            },
+            dataparser_transform=torch.tensor(scene.transform, dtype=torch.float32),
+            dataparser_scale=scene.scale,
+        )
+
+
+def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
+    """The recorded scene of a run's folder, if there is one."""
+    if run is None or not (run / SCENE_FILE).is_file():
+        return None
+    return RecordedSceneDataParserConfig(run=run)
+
+
+# ── the choice for --data ─────────────────────────────────────────────────────────────────────────────────
+
+
+def check_data(data: Path | None) -> None:
+    """Raises UserError for a place that does not exist, before encoders are looked for. None passes."""
+    place = None if data is None else expanded(data)
+    if place is not None and not place.exists() and not frames_folder(place).is_dir():
+        raise UserError(f"{data} is not a folder: pass the one that holds your photos as --data, or a video")
+
+
+def parser_for(
+    parser: PhotoCollectionDataParserConfig, cache_dir: Path | None, may_reconstruct: bool
+) -> DataParserConfig:
+    """The dataparser for `parser.data`: photos without a model are reconstructed, if allowed; a video
+    becomes a folder of frames; a folder with only a transforms.json gets nerfstudio's own parser.
+
+    Raises UserError if the photos don't make a scene.
+    """
+    data = expanded(parser.data).absolute()
+    if is_video(data) or (not data.exists() and frames_folder(data).is_dir()):
+        data = parser.data = extract_frames(data) if may_reconstruct else frames_folder(data)
+    named = parser.colmap_path
+    folders: tuple[Path, ...] = (named, *MODEL_FOLDERS, OWN_MODEL)
+    if cache_dir is not None:
+        folders = (*folders, expanded(cache_dir).absolute() / "reconstruction/sparse/0")
+    known = next((f for f in folders if any((data / f).glob("images.*"))), None)
+    if known is not None:
+        parser.colmap_path = known
+    elif (data / TRANSFORMS).is_file():
+        CONSOLE.log(f"{data} has a {TRANSFORMS} and no COLMAP model: read as nerfstudio-data")
+        return NerfstudioDataParserConfig(data=data)
+    elif (
+        may_reconstruct and named == type(parser)().colmap_path and data.is_dir() and find_photos(data).names
+    ):
+        data, model = reconstruct_scene(data, cache_dir)
+        parser.colmap_path = model.relative_to(data) if model.is_relative_to(data) else model
+    elif may_reconstruct and data.is_dir() and not any(data.iterdir()):
+        raise UserError(f"{data} is empty: give the folder with your photos")
+    return parser
 
 
 silence_libraries()  # nerfstudio imports this module before those that warn

@@ -28,9 +28,9 @@ from lang3dxl_ns.evaluation.score_scene import truths_of
 from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resized
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
-from lang3dxl_ns.plugin.eval_photos import EvalPhotos
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
 from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.plugin.photo_dataset import EvalPhotos
 from lang3dxl_ns.preparation.handover import Batch
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
@@ -158,14 +158,14 @@ class Evaluation:
         if split == "held-out":
             return self._data.fixed_indices_eval_dataloader
         if split == "test":
-            return EvalPhotos(self._data, self._data.test_dataset)
+            return self._data.evaluated(self._data.test_dataset)
         if self.scorer is None:
             raise UserError("seen photos can be evaluated only with ground truth and CLIP")
         seen = self._data.train_dataset
         labeled = [photo.name for photo in seen.photos if self.scorer.truth.key(photo.name) is not None]
         if not labeled:
             raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
-        return EvalPhotos(self._data, seen, labeled)
+        return self._data.evaluated(seen, labeled)
 
     def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Camera], Maps]:
         """Maps of the labels themselves, lifted from the photos to the Gaussians."""

@@ -19,12 +19,11 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.evaluation.ground_truth import Layout
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
-from lang3dxl_ns.plugin.describe_scene import describe_scene
 from lang3dxl_ns.plugin.evaluation import Evaluation, Split
 from lang3dxl_ns.plugin.lift_features import learn_from_photos
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
+from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
-from lang3dxl_ns.plugin.viewer.panel import AskPanel
 from lang3dxl_ns.query.answer import pictures
 from lang3dxl_ns.query.match import Match
 from lang3dxl_ns.query.question import Question
@@ -118,7 +117,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         run = self.datamanager.config.run
         if run is not None and (run / SCENE_FILE).is_file():
             return SceneFile.read(run / SCENE_FILE)
-        return describe_scene(self.datamanager)
+        return self.datamanager.scene_file()
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint; for rendering, also prepare to answer the configured prompts."""

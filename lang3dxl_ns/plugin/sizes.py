@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
 from lang3dxl_ns.common.memory import machine_memory
-
-if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.plugin.model import Lang3DXLModel
 
 PER_PARAMETER = 16.0
 """Bytes per parameter: its value, its gradient, and Adam's two moments."""

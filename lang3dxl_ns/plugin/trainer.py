@@ -34,7 +34,6 @@ from lang3dxl_ns.common.stages import Stages, roughly
 from lang3dxl_ns.components.step_guard import StepGuard
 from lang3dxl_ns.plugin.checkpoint import restore_run_state, run_state
 from lang3dxl_ns.plugin.datamanager import PhotosGoneError
-from lang3dxl_ns.plugin.describe_scene import describe_scene
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.sizes import plan
@@ -131,7 +130,7 @@ class Lang3DXLTrainer(Trainer):
         for optimizer in self.optimizers.optimizers.values():
             add_rows_to_state(optimizer)
         if self.local_rank == 0:
-            describe_scene(self.pipeline.datamanager).write(self.base_dir / SCENE_FILE)
+            self.pipeline.datamanager.scene_file().write(self.base_dir / SCENE_FILE)
             if test_mode == "val":
                 write_needs(self.pipeline.datamanager.needs, self.base_dir)
         self._limit_gaussians()

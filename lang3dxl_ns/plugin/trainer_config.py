@@ -1,4 +1,4 @@
-"""Settings of a training run, fitted to its length, its data and the run that it resumes."""
+"""Settings of a training run, fitted to its length, its data and the run that it resumes; opening of runs."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.utils.rich_utils import CONSOLE
 
 from lang3dxl_ns.common.checks import check_address, check_numbers
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.device import unused_gpu, warn_of_unused_gpu
+from lang3dxl_ns.common.device import best_device, unused_gpu, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import roughly
-from lang3dxl_ns.plugin.data_folder import check_data
-from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
+from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, check_data
 from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
-from lang3dxl_ns.query.run_checkpoint import check_checkpoint
+from lang3dxl_ns.query.find_run import find_config
+from lang3dxl_ns.query.run_checkpoint import check_checkpoint, latest_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.query.run_settings import load_configs, no_config, read_settings
 from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
@@ -202,6 +203,30 @@ def read_config(path: Path) -> TrainerConfig:
     if not isinstance(config, TrainerConfig):
         raise no_config(path)
     return config
+
+
+def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPipeline, int]:
+    """Settings, pipeline (in evaluation mode) and iteration of a run's latest checkpoint, without executing
+    code; nerfstudio's own `eval_setup` trusts config.yml.
+
+    run: as for `find_config`. Raises UserError for a config.yml that is damaged, asks for more than settings,
+    or is of another method; and for a checkpoint that is missing, damaged, or does not fit the settings.
+    """
+    config_path = find_config(run).absolute()
+    config = read_config(config_path)
+    if not isinstance(config, Lang3DXLTrainerConfig):
+        raise UserError(f"{config_path} is a run of another method: use nerfstudio's own commands")
+    folder = config_path.parent
+    path, state = latest_checkpoint(folder / config.relative_model_dir)
+    # The folder may have moved: nerfstudio composes its path from these.
+    config.output_dir, config.experiment_name, config.method_name = folder.parent, "", ""
+    config.timestamp, config.load_dir, config.pipeline.datamanager.run = folder.name, path.parent, folder
+    pipeline = config.pipeline.setup(device=best_device(), test_mode="test")
+    assert isinstance(pipeline, Lang3DXLPipeline)
+    pipeline.eval()
+    pipeline.load_pipeline(state["pipeline"], state["step"])
+    CONSOLE.log(f"Loaded {path}")
+    return config, pipeline, state["step"]
 
 
 def _torch_rendering_seconds(count: int = 50_000, size: tuple[int, int] = (1000, 700)) -> float:

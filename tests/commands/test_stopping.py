@@ -91,13 +91,13 @@ def test_a_stopped_comparison_ends_its_runs(tmp_path):
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, **sizes))
     words = [sys.executable, "-m", "lang3dxl_ns.cli", "benchmark", "ablation", "--scene", str(scene)]
     words += ["--out", str(tmp_path), "--rows", "full", "hash", "--workers", "2"]
-    words += ["--ns-train=--pipeline.datamanager.dense-tokens 8"]
+    words += ["--dense", "none"]
     # Started truly: all that belongs to it is a process group of its own.
     command = subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
     )
     try:
-        wait_for(lambda: len(list(tmp_path.glob("work-*/runs/**/events.*"))) == 2)
+        wait_for(lambda: len(list(tmp_path.glob("work-*/runs/*/lang3dxl/*"))) == 2)
         command.send_signal(signal.SIGTERM)  # to the command alone, which passes it on to its runs
         said, _ = command.communicate(timeout=60)
         assert command.returncode == 130 and b"Stopped; finished work is kept." in said, said

@@ -4,12 +4,12 @@ import pytest
 import torch
 from numerics import compression, gathering, physical_scale, principal_basis, sharpening
 
+from lab.numerics.optimization import Run, runs
 from lang3dxl_ns import cli
 from lang3dxl_ns.numerics import catalog, command
 from lang3dxl_ns.numerics.catalog import groups
 from lang3dxl_ns.numerics.command import measure_all
 from lang3dxl_ns.numerics.measure import Bounds, Case, Problem, measure
-from lang3dxl_ns.numerics.optimization import Run, runs
 
 BOUNDS = {"float32": Bounds(), "bf16": Bounds(1e-2, 1e-2, 1e-2, 1e-2)}
 
@@ -106,7 +106,7 @@ def test_a_miss_is_reported_in_words_and_makes_the_exit_code_1(tmp_path, monkeyp
     wrong = squares(lambda out: out * torch.where(out > 0.9, torch.inf, 1.001))
     monkeypatch.setattr(command, "all_cases", lambda quick, device: [wrong, squares()])
     broken = Run("fast", 30, True, losses=[1.0] * 10, codes=[1.0] * 10, finite=False)
-    monkeypatch.setattr(command, "runs", lambda quick: [broken])
+    monkeypatch.setattr(command, "optimizations", lambda quick: [broken])
     with pytest.raises(SystemExit) as stop:
         cli.main(["numerics", "--out", str(tmp_path), "--quick"])
     assert stop.value.code == 1

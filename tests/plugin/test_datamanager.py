@@ -82,26 +82,6 @@ def test_several_photos_are_read_at_once():
     assert int(cache.get(0, [1, 2])["image"][0, 0]) == 0
 
 
-def test_two_thousand_unusable_photos_in_a_row_are_passed_over():
-    manager = Lang3DXLDataManager.__new__(Lang3DXLDataManager)
-    torch.nn.Module.__init__(manager)
-    last = 2000
-
-    def read(index):
-        if index != last:
-            raise UserError("torn")
-        return photo(0)
-
-    manager.config = SimpleNamespace(read_ahead=2)
-    manager.train_dataset = SimpleNamespace(photos=[SimpleNamespace(name=str(i)) for i in range(last + 1)])
-    manager.__dict__["_train_cache"] = PhotoCache(read, 0)
-    manager._batch = lambda dataset, index, data: (SimpleNamespace(), {"name": str(index)})
-    manager._leave_out = lambda index, reason: None
-    manager.sample_train_cameras = lambda: [last]
-    manager.train_unseen_cameras = list(range(last + 1))
-    assert manager.next_train(0)[1]["name"] == str(last)
-
-
 @pytest.mark.parametrize(("scale", "exif"), [(1.0, 1), (0.37, 1), (1.0, 6), (0.37, 8), (1.0, 3)])
 def test_points_project_to_their_observations_through_the_whole_chain(scene, scale, exif, tmp_path):
     """COLMAP pose and lens → upright photo → dataparser's frame → scaled pinhole: pixels agree with the

@@ -79,7 +79,7 @@ def test_in_another_light_colors_are_compared_once_matched(pipeline, data):
 
 
 def test_the_split_is_asked_for_by_name(pipeline, data, tmp_path, monkeypatch):
-    monkeypatch.setattr("lang3dxl_ns.plugin.open_run.open_run", lambda path: (None, pipeline, 0))
+    monkeypatch.setattr("lang3dxl_ns.plugin.trainer_config.open_run", lambda path: (None, pipeline, 0))
     (tmp_path / "config.yml").touch()
     command = ["evaluate", "run", str(tmp_path / "config.yml"), "--split", "test"]
     monkeypatch.setattr("sys.argv", ["lang3dxl", *command, "--out", str(tmp_path / "out")])

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import make_trainer
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
@@ -16,6 +17,17 @@ from lang3dxl_ns.common.errors import UserError
 def train(train):
     """With codes that are trained with the scene."""
     return partial(train, pipeline__model__decoder__name="paper")
+
+
+@pytest.fixture(scope="module")
+def finished(scene, tiny_clip, tiny_dense, tmp_path_factory):
+    """A finished run of six steps, to look at."""
+    folder = tmp_path_factory.mktemp("finished")
+    changes = {"pipeline__model__decoder__name": "paper"}
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, iterations=6, **changes)
+    trainer.setup()
+    trainer.train()
+    return trainer
 
 
 def parameters(trainer) -> dict[str, torch.Tensor]:
@@ -47,18 +59,10 @@ def test_semantics_leave_colors_and_geometry_as_they_are(train, scene):
         torch.testing.assert_close(joint[f"gauss_params.{name}"], alone[f"gauss_params.{name}"])
 
 
-def test_feature_gradient_reaches_geometry_only_on_request(train, scene):
-    plain = parameters(train(scene, iterations=6))
+def test_feature_gradient_reaches_geometry_only_on_request(train, scene, finished):
+    plain = parameters(finished)
     coupled = parameters(train(scene, iterations=6, pipeline__model__feature_gradient_to_geometry=True))
     assert not torch.equal(plain["gauss_params.means"], coupled["gauss_params.means"])
-
-
-def test_two_runs_with_one_seed_agree(train, scene, tmp_path):
-    """Whether or not the targets already existed."""
-    runs = [train(scene, iterations=4, pipeline__datamanager__cache_dir=tmp_path / "cache") for _ in range(2)]
-    first, second = (parameters(run) for run in runs)
-    for name in first:
-        assert torch.equal(first[name], second[name]), name
 
 
 def test_torch_trains_what_the_compiled_kernels_train(train, scene, monkeypatch):
@@ -103,16 +107,14 @@ def test_resume_goes_on_where_the_run_stopped_and_ends_at_the_asked_iteration(tr
         assert not torch.equal(before[key], after[key][: len(before[key])])
 
 
-def test_resuming_a_finished_run_says_so(train, scene):
-    first = train(scene, iterations=3)
+def test_resuming_a_finished_run_says_so(train, scene, finished):
     with pytest.raises(UserError, match="max-num-iterations"):
-        train(scene, iterations=3, load_dir=first.checkpoint_dir)
+        train(scene, iterations=6, load_dir=finished.checkpoint_dir)
 
 
-def test_evaluation_of_a_checkpoint_gives_what_the_trainer_gave(train, scene):
-    trainer = train(scene, iterations=6)
-    expected = trainer.pipeline.get_average_eval_image_metrics()
-    _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml")
+def test_evaluation_of_a_checkpoint_gives_what_the_trainer_gave(finished):
+    expected = finished.pipeline.get_average_eval_image_metrics()
+    _, pipeline, _, _ = eval_setup(finished.base_dir / "config.yml")
     metrics = pipeline.get_average_eval_image_metrics(get_std=True)
     for name in ("psnr", "ssim", "clip_l1", "clip_psnr", "clip_cosine", "clip_l1_of_mean", "dense_l1"):
         assert metrics[name] == pytest.approx(expected[name], rel=1e-4), name
@@ -120,20 +122,18 @@ def test_evaluation_of_a_checkpoint_gives_what_the_trainer_gave(train, scene):
     json.dumps(metrics, allow_nan=False)
 
 
-def test_checkpoint_of_another_clip_is_refused(train, scene, tmp_path):
+def test_checkpoint_of_another_clip_is_refused(train, scene, finished, tmp_path):
     from tiny_models import make_tiny_clip
 
-    first = train(scene, iterations=2)
     other = make_tiny_clip(tmp_path / "other_clip", dim=48)
     with pytest.raises(UserError, match="width 64, but the prepared targets have 48"):
-        train(scene, iterations=4, load_dir=first.checkpoint_dir, pipeline__datamanager__clip=str(other))
+        train(scene, iterations=8, load_dir=finished.checkpoint_dir, pipeline__datamanager__clip=str(other))
 
 
-def test_config_is_complete_and_readable_from_any_folder(train, scene, tmp_path, monkeypatch):
-    trainer = train(scene, iterations=2)
+def test_config_is_complete_and_readable_from_any_folder(finished, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    config, pipeline, _, step = eval_setup(Path(trainer.base_dir / "config.yml"), test_mode="inference")
-    assert step == 1
+    config, pipeline, _, step = eval_setup(Path(finished.base_dir / "config.yml"), test_mode="inference")
+    assert step == 5
     assert config.pipeline.model.semantic_field.preset == "short"
     assert pipeline.model.num_points > 0
 
@@ -145,8 +145,8 @@ def first_batch(trainer):
     return batch, model, model.get_outputs(camera)
 
 
-def test_regions_are_a_loss_where_they_are_asked_for_and_nothing_at_all_elsewhere(train, scene):
-    batch, model, outputs = first_batch(train(scene, iterations=2))
+def test_regions_are_a_loss_where_they_are_asked_for_and_nothing_at_all_elsewhere(train, scene, finished):
+    batch, model, outputs = first_batch(finished)
     assert "regions" not in batch
     assert "regions" not in model.get_loss_dict(outputs, batch)
     batch, model, outputs = first_batch(

@@ -16,7 +16,6 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.plugin.viewer.frame_size import keep_frames_recognizable
 from lang3dxl_ns.query.conversation import Conversation, plain
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.overview import overview
@@ -34,6 +33,8 @@ INVITATION = (
     "A finished run has a richer page: `lang3dxl view`."
 )
 NO_SEMANTICS = "This run has no semantics (it was trained with clip none)."
+LEAST = (320, 180)
+"""Fewest pixels of a frame while the camera moves: on a CPU the time budget alone would leave 30 rows."""
 _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""
 
@@ -235,3 +236,33 @@ def _place_camera(client: viser.ClientHandle, camera: Camera, target: tuple[floa
     with client.atomic():
         client.camera.position, client.camera.look_at = stand.position * SCALE, stand.look_at * SCALE
         client.camera.fov = stand.fov
+
+
+# ── sizes of frames ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def keep_frames_recognizable() -> None:
+    """Applies to all further viewers of this process."""
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine  # imports the models
+
+    chosen = RenderStateMachine._calculate_image_res
+    if getattr(chosen, "has_least", False):
+        return
+
+    def at_least(self: RenderStateMachine, aspect_ratio: float) -> tuple[int, int]:
+        # At rest the full size follows directly, without another small frame.
+        self.transitions["low_move"]["static"] = "high"
+        height, width = chosen(self, aspect_ratio)
+        if self.state == "high":
+            return height, width
+        return least_size(height, width, aspect_ratio, self.viewer.control_panel.max_res)
+
+    at_least.has_least = True  # type: ignore[attr-defined]
+    RenderStateMachine._calculate_image_res = at_least  # type: ignore[method-assign]
+
+
+def least_size(height: int, width: int, aspect_ratio: float, most: int) -> tuple[int, int]:
+    """Height and width enlarged to `LEAST`, if the longer side stays within `most`."""
+    rows = max(height, LEAST[1], round(LEAST[0] / aspect_ratio))
+    rows = min(rows, most, int(most / aspect_ratio))
+    return (rows, int(rows * aspect_ratio)) if rows > height else (height, width)

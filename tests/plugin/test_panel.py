@@ -15,9 +15,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
 from scenes import view_of, write_scene
 
+from lang3dxl_ns.plugin.panel import INVITATION, least_size
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
-from lang3dxl_ns.plugin.viewer.frame_size import least_size
-from lang3dxl_ns.plugin.viewer.panel import INVITATION
 from lang3dxl_ns.query import conversation as session
 from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.query_config import QueryConfig

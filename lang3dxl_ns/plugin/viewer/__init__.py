@@ -1,1 +1,0 @@
-"""The panel "Ask the scene" in nerfstudio's viewer."""
