@@ -123,7 +123,6 @@ class PatchReading:
     recipe: str
     tokens: int
     """Patches per side of its own input."""
-    patch_size: int
 
 
 def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
@@ -136,7 +135,7 @@ def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> Pat
     if (family.features if features == "auto" else features) == "crops":
         return None
     vision = read_config(files).vision_config
-    return PatchReading(family.recipe, input_side(vision) // vision.patch_size, vision.patch_size)
+    return PatchReading(family.recipe, input_side(vision) // vision.patch_size)
 
 
 def _family(files: ModelFiles) -> Family:

@@ -146,7 +146,7 @@ def _prompted(
             masked.append(photo)  # reading it later reports the reason
             continue
         masked.append(replace(photo, mask_path=path))
-        if kept_picture(path, settings, "1") is None:
+        if kept_picture(path, settings) is None:
             missing.append((photo, path, settings))
     if missing:
         log(f"looking for {', '.join(config.foreground_prompts)} in {len(missing)} of {len(photos)} photos")

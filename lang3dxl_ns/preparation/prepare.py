@@ -22,7 +22,7 @@ from torch import Tensor
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.stages import roughly
-from lang3dxl_ns.preparation.crop_budget import Crops, choose_crops, input_side
+from lang3dxl_ns.preparation.crop_budget import USUAL_INPUT, Crops, choose_crops
 from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import (
     DenseEncoder,
@@ -31,7 +31,14 @@ from lang3dxl_ns.preparation.encoders import (
     load_image_text_encoder,
     patch_reading,
 )
-from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, DENSE_OPTION, find_model, spoken
+from lang3dxl_ns.preparation.model_files import (
+    BUILTIN,
+    CLIP_OPTION,
+    DENSE_OPTION,
+    find_model,
+    read_config,
+    spoken,
+)
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
@@ -160,8 +167,8 @@ def _plan(
 ) -> tuple[list[_Task], dict[str, str]]:
     """A task per photo, and reasons for the photos that can't be read."""
     clip_model = find_model(config.clip, CLIP_OPTION)
-    input_pixels = input_side(clip_model.folder)
     patches = patch_reading(config.clip, config.clip_features)
+    input_pixels = getattr(read_config(clip_model).vision_config, "image_size", USUAL_INPUT)
     dense_model = find_model(config.dense, DENSE_OPTION).identity if config.makes_dense else None
     tasks, left_out = [], {}
     for photo, content in zip(photos, store.photo_hashes(photos).values(), strict=True):

@@ -22,7 +22,7 @@ from lang3dxl_ns.scene.photo import Photo
 PHOTOS, PHOTO_MASKS = "photos", "photo_masks"
 """Kinds of entries in the store."""
 _QUALITY = 95
-"""Of JPEG: 46 dB, a tenth of the bytes of the pixels, 12 ms to decode 1,600 × 1,200 of them on one core."""
+"""JPEG quality: 46 dB, a tenth of the bytes, 12 ms to decode 1,600 × 1,200 pixels on one core."""
 _SMALL = 1_000_000
 """Pixels of a file that is decoded as fast as a copy."""
 _RULE = 1
@@ -83,8 +83,11 @@ def mask_png(mask: Bool[Tensor, "h w"], made_with: str) -> bytes:
     return content.getvalue()
 
 
-def kept_picture(path: Path, made_with: str, mode: str) -> Image.Image | None:
-    """The pixels of a `mask_png`, or of a JPEG with such a comment, if it is whole and was made like this."""
+def kept_picture(path: Path, made_with: str, mode: str | None = None) -> Image.Image | None:
+    """A `mask_png`, or a JPEG with such a comment, if it is whole and was made like this.
+
+    mode: of the pixels; None checks the file and decodes nothing.
+    """
     if not path.is_file():
         return None
     try:
@@ -93,6 +96,9 @@ def kept_picture(path: Path, made_with: str, mode: str) -> Image.Image | None:
             written = written.decode(errors="replace") if isinstance(written, bytes) else written
             if written != made_with:
                 return None
+            if mode is None:
+                copy.verify()  # reads all of it
+                return copy
             copy.load()
             return copy if copy.mode == mode else copy.convert(mode)
     except (OSError, NoPictureError):

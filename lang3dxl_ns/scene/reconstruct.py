@@ -79,17 +79,14 @@ def reconstruct(
         image.name = names[image.name]
     best = models[0]
     report = ReconstructionReport(
-        photos=len(photos.names),
-        registered=best.num_reg_images(),
-        points=best.num_points3D(),
+        photos=len(photos.names), registered=best.num_reg_images(), points=best.num_points3D(),
         error=float(best.compute_mean_reprojection_error()),
         cameras=len({image.camera_id for image in best.images.values() if image.has_pose}),
-        mapper=settings.mapper,
-        doubtful=doubtful,
+        mapper=settings.mapper, doubtful=doubtful,
         left_out=left_out | {names[number]: why for number, why in reasons.items()},
         other_models=tuple(other.num_reg_images() for other in models[1:]),
         seconds={stage: round(seconds, 1) for stage, seconds in clock.items()},
-    )
+    )  # fmt: skip
     _publish(models, work, model)
     write_atomically(work / "report.json", json.dumps(asdict(report), indent=2))
     return report
