@@ -59,6 +59,9 @@ class ModelSettings(SplatfactoModelConfig):
     """Fraction of the run over which the weight of the CLIP and dense losses rises from 0.1 to 1."""
     warm_up: float = 0.0
     """Fraction of the run that trains colors only, before the semantic losses start."""
+    codes_from: Literal["noise", "photos"] = "noise"
+    """What codes and field start from when the warm-up is over: noise, as published, or the photos' features,
+    gathered onto the Gaussians."""
     feature_gradient_to_geometry: bool = False
     """Let the semantic losses also move Gaussians, as in the authors' code; opacities belong to the colors
     alone. Costs a second rendering."""

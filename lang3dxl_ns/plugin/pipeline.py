@@ -103,7 +103,9 @@ class Lang3DXLPipeline(VanillaPipeline):
         return results
 
     def get_train_loss_dict(self, step: int):
-        """Outputs, losses and metrics of the next photo."""
+        """Outputs, losses and metrics of the next photo; words are learned first where codes start."""
+        if step == self.model.codes_start:
+            self.learn_words()
         outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
         return outputs, self.last_losses, metrics
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -246,6 +247,13 @@ class RenderingModel(SplatfactoModel):
     @property
     def _warm_up_is_over(self) -> bool:
         return self.step >= self.config.warm_up * self.config.total_steps
+
+    @property
+    def codes_start(self) -> int | None:
+        """The iteration before which codes are learned from photos, to be trained on; None without."""
+        if self.config.codes_from == "noise" or not self.learns_from_renderings:
+            return None
+        return math.ceil(self.config.warm_up * self.config.total_steps)
 
     def _pose(self, camera: Cameras) -> Float[Tensor, "3 4"]:
         """Camera → world, refined in training. It stays where it is, on the CPU, unless it is refined."""

@@ -90,6 +90,19 @@ def test_warm_up_trains_no_code(train, scene):
     assert float(warm.pipeline.model.gauss_params["codes"].std()) > 2 * initial
 
 
+def test_codes_from_photos_say_at_once_what_noise_has_to_learn(train, scene):
+    options = {"pipeline__model__warm_up": 0.9, "pipeline__model__semantic_ramp": 0.0}
+    losses = [
+        float(
+            train(scene, iterations=20, pipeline__model__codes_from=start, **options).pipeline.last_losses[
+                "clip"
+            ]
+        )
+        for start in ("photos", "noise")
+    ]
+    assert losses[0] < 0.8 * losses[1]
+
+
 def test_resume_goes_on_where_the_run_stopped_and_ends_at_the_asked_iteration(train, scene):
     first = train(scene, iterations=12, pipeline__model__densify_grad_thresh=1e-7)
     before = parameters(first)
