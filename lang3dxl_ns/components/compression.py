@@ -141,6 +141,7 @@ def fit(
             optimizer.step()
             schedule.step()
             advance()
+    optimizer.zero_grad()  # training may go on with this field
     return codes.detach()
 
 
@@ -318,7 +319,20 @@ class JointField(SemanticField):
     the Gaussians."""
 
     gathered_channels = 128
-    learning_steps = CompressionConfig().steps
+
+    def __init__(
+        self,
+        config: SemanticFieldConfig,
+        clip_dim: int,
+        dense_dim: int = 0,
+        compression: CompressionConfig | None = None,
+    ) -> None:
+        super().__init__(config, clip_dim, dense_dim)
+        self.compression = compression or CompressionConfig()
+
+    @property
+    def learning_steps(self) -> int:  # type: ignore[override]
+        return self.compression.steps
 
     def learn_gaussians(
         self,
@@ -328,8 +342,9 @@ class JointField(SemanticField):
         basis: PrincipalBasis | None = None,
     ) -> Float[Tensor, "n code"]:
         """Codes from which training goes on, and a field that decodes them."""
-        generator, whole = torch.Generator().manual_seed(0), CompressionConfig()
-        config, step = whole.grown(len(features)), _every(whole.growth(len(features)), advance)
+        generator = torch.Generator().manual_seed(0)
+        config = self.compression.grown(len(features))
+        step = _every(self.compression.growth(len(features)), advance)
         sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
         codes = fit(sample, self, config, generator, step)
         return assign(features, mass, self, codes, basis)

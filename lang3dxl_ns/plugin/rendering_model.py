@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from copy import deepcopy
@@ -73,6 +72,8 @@ class RenderingModel(SplatfactoModel):
     sky: Sky | None
     """The first Gaussians' colors; None: there is no sky, or it was trained like all Gaussians."""
     answers: Answers | None = None
+    codes_have_begun = False
+    """Whether training has come to the codes; part of a checkpoint's run state."""
 
     @property
     def facts(self) -> SceneFacts:
@@ -249,11 +250,10 @@ class RenderingModel(SplatfactoModel):
         return self.step >= self.config.warm_up * self.config.total_steps
 
     @property
-    def codes_start(self) -> int | None:
-        """The iteration before which codes are learned from photos, to be trained on; None without."""
-        if self.config.codes_from == "noise" or not self.learns_from_renderings:
-            return None
-        return math.ceil(self.config.warm_up * self.config.total_steps)
+    def codes_begin(self) -> bool:
+        """Whether codes are about to be trained for the first time: once in a run, also if it is resumed or
+        prolonged."""
+        return self.learns_from_renderings and self._warm_up_is_over and not self.codes_have_begun
 
     def _pose(self, camera: Cameras) -> Float[Tensor, "3 4"]:
         """Camera → world, refined in training. It stays where it is, on the CPU, unless it is refined."""
