@@ -91,16 +91,13 @@ def test_warm_up_trains_no_code(train, scene):
 
 
 def test_codes_from_photos_say_at_once_what_noise_has_to_learn(train, scene):
-    options = {"pipeline__model__warm_up": 0.9, "pipeline__model__semantic_ramp": 0.0}
-    losses = [
-        float(
-            train(scene, iterations=20, pipeline__model__codes_from=start, **options).pipeline.last_losses[
-                "clip"
-            ]
-        )
-        for start in ("photos", "noise")
-    ]
-    assert losses[0] < 0.8 * losses[1]
+    def clip_loss(start: str) -> float:
+        settings = {"codes_from": start, "warm_up": 0.9, "semantic_ramp": 0.0}
+        changes = {f"pipeline__model__{name}": value for name, value in settings.items()}
+        return float(train(scene, iterations=20, **changes).pipeline.last_losses["clip"])
+
+    # After two steps noise decodes to little but the mean feature.
+    assert clip_loss("photos") < 0.95 * clip_loss("noise")
 
 
 def test_resume_goes_on_where_the_run_stopped_and_ends_at_the_asked_iteration(train, scene):
