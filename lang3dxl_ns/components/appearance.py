@@ -45,8 +45,9 @@ class AppearanceConfig:
     use: Literal["auto", "on", "off"] = "auto"
     """`auto`: on, unless the scene's measured needs show that its photos share one lighting. If off, the
     component is not built and has no parameters or cost."""
-    preset: Literal["coarse", "paper"] = "coarse"
-    """Hash grid over positions: `coarse`, or as published."""
+    preset: Literal["auto", "coarse", "paper"] = "coarse"
+    """Hash grid over positions: `coarse`, or as published; `auto`: the latter in runs of 5,000 iterations and
+    more."""
     vector_dim: int = 24
     """Size of a photo's vector."""
     unseen: Literal["nearest", "mean"] = "nearest"

@@ -67,10 +67,11 @@ class _Interpolate(torch.autograd.Function):
         grad, levels = upstream.contiguous().numpy(), len(ctx.lattices.cells)
         grad_table = np.zeros_like(table)
         # A thread per range of levels: no two of them add to the same rows.
-        shared = (*ctx.arrays, ctx.lattices, grad, grad_table)
+        shared = (*ctx.arrays, ctx.lattices, grad, grad_table, ctx.needs_input_grad[0])
         parts = in_threads(_gradients, [(*part, *shared) for part in ranges(levels)])
         grad_x = sum(parts) if parts else np.zeros_like(x)
-        return torch.from_numpy(grad_x), torch.from_numpy(grad_table), None, None
+        moved = torch.from_numpy(grad_x) if ctx.needs_input_grad[0] else None
+        return moved, torch.from_numpy(grad_table), None, None
 
 
 @numba.njit(forceinline=True)
@@ -131,8 +132,9 @@ def _features(first, last, x, table, level_weights, lattices, features):
 
 
 @kernel
-def _gradients(first, last, x, table, level_weights, lattices, grad, grad_table):
-    """Adds to the table's gradient; returns the points', as far as it comes from these levels."""
+def _gradients(first, last, x, table, level_weights, lattices, grad, grad_table, of_points):
+    """Adds to the table's gradient; returns the points', as far as it comes from these levels (0 unless
+    `of_points`: it is two thirds of the work)."""
     dimensions, width = x.shape[1], table.shape[1]
     entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
     grad_x = np.zeros_like(x)
@@ -149,8 +151,11 @@ def _gradients(first, last, x, table, level_weights, lattices, grad, grad_table)
                 row, grad_row = table[entries[corner]], grad_table[entries[corner]]
                 product = x.dtype.type(0)
                 for f in range(width):
-                    product += above[f] * row[f]
                     grad_row[f] += weight * above[f]
+                if not of_points:
+                    continue
+                for f in range(width):
+                    product += above[f] * row[f]
                 for axis in range(dimensions):
                     slope = product * scale
                     for other in range(dimensions):
