@@ -91,7 +91,8 @@ def _paper_config() -> Lang3DXLTrainerConfig:
     model.densify_from, model.densify_until, model.densify_every = 2_000 * x, 15_000 * x, 2_000 * x
     model.densify_size_thresh = 0.2 * EXTENT
     model.view_dependence, model.camera_optimization = "on", "off"
-    model.appearance.use, model.appearance.preset, model.appearance.opacity_shift = "on", "paper", True
+    model.appearance.use, model.appearance.preset, model.appearance.opacity_shift = "on", "auto", True
+    model.codes_from = "auto"
     data.scale_mode, data.pixel_distance, data.camera_res_scale_factor = "physical", "mean-inner", 0.5
     data.regions, data.sam = "sam", "facebook/sam-vit-huge"
     groups["means"] = {

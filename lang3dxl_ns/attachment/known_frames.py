@@ -125,11 +125,9 @@ def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[s
     return frames
 
 
-def registered_frames(
-    points: Float[Array, "m 3"], means: Float[Array, "n 3"], most: int = 3
-) -> dict[str, Similarity]:
+def registered_frames(points: Float[Array, "m 3"], means: Float[Array, "n 3"]) -> dict[str, Similarity]:
     """Similarities that lay the photos' points onto the Gaussians, by iterated closest points from many
-    rotations, the closest first; none with fewer than 50 points."""
+    rotations, the three closest; none with fewer than 50 points."""
     if len(points) < 50 or len(means) < 50:
         return {}
     chosen = np.random.default_rng(0)
@@ -139,7 +137,7 @@ def registered_frames(
     )
     tree, starts = KDTree(target), Rotation.create_group("O").as_matrix()
     fits = sorted((_closest(source, target, tree, start) for start in starts), key=lambda fit: fit[0])
-    return {f"by its shape, {i + 1}": fit for i, (_, fit) in enumerate(fits[:most])}
+    return {f"by its shape, {i + 1}": fit for i, (_, fit) in enumerate(fits[:3])}
 
 
 def _typical(points: Float[Array, "m 3"]) -> Float[Array, "k 3"]:

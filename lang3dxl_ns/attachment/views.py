@@ -92,12 +92,12 @@ class Extent:
         return cls(center, radius, direction, float(heights[near].quantile(0.05)))
 
 
-def solids(splats: Splats, most: int = 200_000) -> Splats:
-    """Opaque Gaussians, at most so many of them. Raises UserError if there are hardly any."""
+def solids(splats: Splats) -> Splats:
+    """Opaque Gaussians, at most 200,000 of them. Raises UserError if there are hardly any."""
     rows = (splats.opacities > _OPAQUE).nonzero()[:, 0]
     if len(rows) < 10:
         raise UserError("this splat has hardly an opaque Gaussian: nothing can be seen in it")
-    return splats.select(rows[:: -(-len(rows) // most)])
+    return splats.select(rows[:: -(-len(rows) // 200_000)])
 
 
 def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:

@@ -15,9 +15,9 @@ from lang3dxl_ns.baselines.langsplat import LangSplat
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.components.compression import CompressedField, CompressionConfig
+from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, JointField
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
 DecoderName = Literal["gathered", "paper", "feature3dgs", "fmgs", "langsplat", "direct", "lifting"]
 
@@ -75,7 +75,7 @@ def make_decoder(
     elif config.name == "lifting":
         decoder = LiftedFeatures(clip_dim, dense_dim)
     elif config.name == "paper":
-        decoder = SemanticField(settings, clip_dim, dense_dim)
+        decoder = JointField(settings, clip_dim, dense_dim, config.compression)
     elif config.name == "gathered":
         decoder = CompressedField(settings, clip_dim, config.compression)
     else:

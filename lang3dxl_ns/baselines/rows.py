@@ -55,6 +55,8 @@ ROWS = (
     Row(FULL, "method", "Lang3D-XL", published="mAP .59; windows AP .69; L1 .146, PSNR 13.9"),
     Row(PAPER_METHOD, "method", "the paper's method, with regions of one color for SAM's",
         {f"{_DATA}regions": "felzenszwalb"}, PAPER_METHOD),
+    Row(f"{PAPER_METHOD}-noise", "method", "the same, its codes from noise, as published",
+        {f"{_DATA}regions": "felzenszwalb", "pipeline.model.codes_from": "noise"}, PAPER_METHOD),
     Row(TEACHER, "2-D", "the crop pyramid itself, in the scored picture"),
     Row(LIMIT, "2-D", "exact labels, lifted to the Gaussians and rendered back"),
     Row(CHANCE, "2-D", "a map without information"),
@@ -117,5 +119,5 @@ def choose_rows(names: Iterable[str], short_run: bool, has_regions: bool) -> lis
         raise UserError(f"there is no row {', '.join(unknown)}: choose of systems, {choices}")
     same = {"both" if short_run else "hash", "regions" if has_regions else "no-regions"}
     # The paper's networks take a CPU ten times as long: only on request.
-    wanted = set(names) or known - same - {PAPER_METHOD}
+    wanted = set(names) or {row.name for row in ROWS if row.method != PAPER_METHOD} - same
     return [row for row in ROWS if row.name in wanted]

@@ -31,24 +31,10 @@ FIRST_DEVIATION = 0.1
 differ in exposure and white balance, the error after 300 steps is twice that with 0.1."""
 FIRST_LOGIT = -4.0
 """Log odds that an untrained opacity shift removes a Gaussian from a training step: about 2 %."""
-GRIDS: dict[str, dict[str, int]] = {
-    # Light changes smoothly over a building, from wall to wall. Finer grids take longer, and learn a photo's
-    # patches instead of its light.
-    "coarse": {
-        "levels": 2,
-        "features_per_level": 4,
-        "log2_table_size": 14,
-        "min_resolution": 6,
-        "max_resolution": 12,
-    },
-    "paper": {
-        "levels": 12,
-        "features_per_level": 2,
-        "log2_table_size": 19,
-        "min_resolution": 16,
-        "max_resolution": 2048,
-    },
-}
+# Light changes smoothly over a building, from wall to wall. Finer grids take longer, and learn a photo's
+# patches instead of its light.
+GRIDS = {"coarse": (2, 4, 14, 6, 12), "paper": (12, 2, 19, 16, 2048)}
+"""Levels, features per level, log2 of the table's size, and lowest and highest resolution: see `HashGrid`."""
 
 
 @showing("use", "preset")
@@ -57,10 +43,11 @@ class AppearanceConfig:
     """Settings of the appearance field."""
 
     use: Literal["auto", "on", "off"] = "auto"
-    """`auto`: on, unless the scene's measured needs show that its photos share one light. Off means absent:
-    no parameters, no cost."""
-    preset: Literal["coarse", "paper"] = "coarse"
-    """Hash grid over positions: `coarse`, or as published."""
+    """`auto`: on, unless the scene's measured needs show that its photos share one lighting. If off, the
+    component is not built and has no parameters or cost."""
+    preset: Literal["auto", "coarse", "paper"] = "coarse"
+    """Hash grid over positions: `coarse`, or as published; `auto`: the latter in runs of 5,000 iterations and
+    more."""
     vector_dim: int = 24
     """Size of a photo's vector."""
     unseen: Literal["nearest", "mean"] = "nearest"
@@ -95,7 +82,7 @@ class AppearanceField(nn.Module):
     ):
         super().__init__()
         self.config = config
-        self.grid = HashGrid(3, **GRIDS[config.preset], generator=generator)
+        self.grid = HashGrid(3, *GRIDS[config.preset], generator=generator)
         inputs = self.grid.output_dim + 3 + config.vector_dim
         # The first layer is split in two: the photo's part is the same for all Gaussians, and computed once.
         self.from_gaussian = linear(inputs - config.vector_dim, HIDDEN, generator, fan_in=inputs)

@@ -114,7 +114,8 @@ def fit(
     if not len(sample.mass):
         return place.new_empty(0, field.code_dim)
     basis, weight = None if sample.basis is None else sample.basis.to(place), sample.mass.sqrt()
-    field.set_output_statistics(*_statistics(sample.features, weight, basis))
+    if not field.dense_dim:  # otherwise it knows those of its targets, dense features among them
+        field.set_output_statistics(*_statistics(sample.features, weight, basis))
     codes = nn.Parameter(_principal_codes(sample.features, sample.mass, field.code_dim).to(place))
     groups = [
         {"params": [codes], "lr": config.code_rate},
@@ -140,6 +141,7 @@ def fit(
             optimizer.step()
             schedule.step()
             advance()
+    optimizer.zero_grad()  # training may go on with this field
     return codes.detach()
 
 
@@ -273,14 +275,9 @@ class CompressedField(SemanticField):
     ) -> Float[Tensor, "n code"]:
         """Codes of three numbers; of more if those lose too much and the settings leave it open."""
         generator = torch.Generator().manual_seed(0)
-        config, steps = self.compression.grown(len(features)), count(1)
+        config = self.compression.grown(len(features))
         sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
-
-        def step() -> None:
-            """The bar has as many steps whatever the number of Gaussians."""
-            if next(steps) % self.compression.growth(len(features)) == 0:
-                advance()
-
+        step = _every(self.compression.growth(len(features)), advance)
         state = generator.get_state()
         dims = CODE_DIMS if self.config.code_dim is None else (self.config.code_dim,)
         lost = ""
@@ -315,6 +312,48 @@ class CompressedField(SemanticField):
         wide = codes.shape[1] if codes.dim() == 2 else 0
         if wide != self.code_dim and 2 <= wide <= MOST_DIMENSIONS:
             self.take(SemanticField(replace(self.config, code_dim=codes.shape[1]), self.clip_dim))
+
+
+class JointField(SemanticField):
+    """The semantic field whose codes are trained with the scene. They may start from features gathered onto
+    the Gaussians."""
+
+    gathered_channels = 128
+
+    def __init__(
+        self,
+        config: SemanticFieldConfig,
+        clip_dim: int,
+        dense_dim: int = 0,
+        compression: CompressionConfig | None = None,
+    ) -> None:
+        super().__init__(config, clip_dim, dense_dim)
+        self.compression = compression or CompressionConfig()
+
+    @property
+    def learning_steps(self) -> int:  # type: ignore[override]
+        return self.compression.steps
+
+    def learn_gaussians(
+        self,
+        features: Float[Tensor, "n clip"],
+        mass: Float[Tensor, " n"],
+        advance: Callable[[], None] = lambda: None,
+        basis: PrincipalBasis | None = None,
+    ) -> Float[Tensor, "n code"]:
+        """Codes from which training goes on, and a field that decodes them."""
+        generator = torch.Generator().manual_seed(0)
+        config = self.compression.grown(len(features))
+        step = _every(self.compression.growth(len(features)), advance)
+        sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
+        codes = fit(sample, self, config, generator, step)
+        return assign(features, mass, self, codes, basis)
+
+
+def _every(factor: int, advance: Callable[[], None]) -> Callable[[], None]:
+    """Advances at every so many calls: a bar has as many steps whatever the number of Gaussians."""
+    calls = count(1)
+    return lambda: advance() if next(calls) % factor == 0 else None
 
 
 def _nothing() -> None: ...

@@ -100,11 +100,11 @@ class AttenuatedDownsampler(nn.Module):
         (see `forward`)."""
         inside = features.new_ones(features.shape[:2]) if mask is None else mask.to(features.dtype)
         if self.config.match == "resize-target":
-            return features, upsample_target(target, (features.shape[0], features.shape[1])), inside
+            return features, _resized(target, (features.shape[0], features.shape[1])), inside
         grid = (target.shape[0], target.shape[1])
         if self.config.match == "resize-features":
-            share = resize_features_down(inside[..., None], grid)[..., 0]
-            return _divide(resize_features_down(features * inside[..., None], grid), share), target, share
+            share = _resized(inside[..., None], grid)[..., 0]
+            return _divide(_resized(features * inside[..., None], grid), share), target, share
         predicted, share = self(features, grid, crop_sides, mask)
         return predicted, target, share
 
@@ -243,14 +243,9 @@ def separable_kernel(
     return SeparableKernel(rows.to(device, dtype), columns.to(device, dtype))
 
 
-def resize_features_down(features: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
-    """The paper's ablation "w/o AD (LR)": features resized bilinearly to the target grid."""
-    return F.interpolate(features.permute(2, 0, 1)[None], grid, mode="bilinear")[0].permute(1, 2, 0)
-
-
-def upsample_target(target: Float[Tensor, "hd wd c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:
-    """The paper's ablation "w/o AD (HR)": the target resized bilinearly to the features' size."""
-    return F.interpolate(target.permute(2, 0, 1)[None], size, mode="bilinear")[0].permute(1, 2, 0)
+def _resized(values: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
+    """As the paper's ablations resize: bilinear, from the nearest pixels alone."""
+    return F.interpolate(values.permute(2, 0, 1)[None], grid, mode="bilinear")[0].permute(1, 2, 0)
 
 
 def _nested_rows(size: int, cells: int, sides: Sequence[float]) -> Float[Tensor, "j n a"]:

@@ -56,7 +56,7 @@ class _Interpolate(torch.autograd.Function):
         ctx.arrays = [tensor.numpy() for tensor in (x, table, level_weights)]
         ctx.lattices = lattices
         features = x.new_empty(len(x), len(lattices.cells) * table.shape[1])
-        shared = (*ctx.arrays, *lattices, features.numpy())
+        shared = (*ctx.arrays, lattices, features.numpy())
         in_threads(_features, [(*part, *shared) for part in ranges(len(x), _POINTS)])
         return features
 
@@ -67,17 +67,18 @@ class _Interpolate(torch.autograd.Function):
         grad, levels = upstream.contiguous().numpy(), len(ctx.lattices.cells)
         grad_table = np.zeros_like(table)
         # A thread per range of levels: no two of them add to the same rows.
-        shared = (*ctx.arrays, *ctx.lattices, grad, grad_table)
+        shared = (*ctx.arrays, ctx.lattices, grad, grad_table, ctx.needs_input_grad[0])
         parts = in_threads(_gradients, [(*part, *shared) for part in ranges(levels)])
         grad_x = sum(parts) if parts else np.zeros_like(x)
-        return torch.from_numpy(grad_x), torch.from_numpy(grad_table), None, None
+        moved = torch.from_numpy(grad_x) if ctx.needs_input_grad[0] else None
+        return moved, torch.from_numpy(grad_table), None, None
 
 
 @numba.njit(forceinline=True)
-def _look_up(point, level, cells, offsets, dense_levels, mask, primes, entries, sides):
+def _look_up(point, level, lattices, entries, sides):
     """Table rows of the corners of a point's cell, and along every axis the weights of its two sides. Bit k
     of a corner's number is its side along axis k."""
-    count, stride, one = cells[level], 1, sides.dtype.type(1)
+    count, stride, one = lattices.cells[level], 1, sides.dtype.type(1)
     resolution = count + 2
     entries[0] = 0
     for axis in range(len(point)):
@@ -87,47 +88,53 @@ def _look_up(point, level, cells, offsets, dense_levels, mask, primes, entries, 
         sides[axis, 0], sides[axis, 1] = one - (position - lower), position - lower
         vertex = np.int64(lower) + np.int64(whole) * count
         bit = 1 << axis
-        if level < dense_levels:
+        if level < lattices.dense_levels:
             low, high = vertex % resolution * stride, (vertex + 1) % resolution * stride
             stride *= resolution
             for corner in range(bit):
                 entries[corner + bit] = entries[corner] + high
                 entries[corner] += low
         else:
-            low, high = vertex * primes[axis] & mask, (vertex + 1) * primes[axis] & mask
+            low = vertex * lattices.primes[axis] & lattices.mask
+            high = (vertex + 1) * lattices.primes[axis] & lattices.mask
             for corner in range(bit):
                 entries[corner + bit] = entries[corner] ^ high
                 entries[corner] ^= low
     for corner in range(1 << len(point)):
-        entries[corner] += offsets[level]
+        entries[corner] += lattices.offsets[level]
+
+
+@numba.njit(forceinline=True)
+def _weight(sides, corner, weight):
+    """A corner's weight, beginning with its level's."""
+    for axis in range(len(sides)):
+        weight *= sides[axis, corner >> axis & 1]
+    return weight
 
 
 @kernel
-def _features(first, last, x, table, level_weights, cells, offsets, dense_levels, mask, primes, features):
+def _features(first, last, x, table, level_weights, lattices, features):
     dimensions, width = x.shape[1], table.shape[1]
     entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
     for n in range(first, last):
         if np.isnan(x[n].sum()):
             features[n] = np.nan
             continue
-        for level in range(len(cells)):
-            _look_up(x[n], level, cells, offsets, dense_levels, mask, primes, entries, sides)
+        for level in range(len(lattices.cells)):
+            _look_up(x[n], level, lattices, entries, sides)
             found = features[n, level * width : (level + 1) * width]
             found[:] = 0
             for corner in range(1 << dimensions):
-                weight = level_weights[level]
-                for axis in range(dimensions):
-                    weight *= sides[axis, corner >> axis & 1]
+                weight = _weight(sides, corner, level_weights[level])
                 row = table[entries[corner]]
                 for f in range(width):
                     found[f] += weight * row[f]
 
 
 @kernel
-def _gradients(
-    first, last, x, table, level_weights, cells, offsets, dense_levels, mask, primes, grad, grad_table
-):
-    """Adds to the table's gradient; returns the points', as far as it comes from these levels."""
+def _gradients(first, last, x, table, level_weights, lattices, grad, grad_table, of_points):
+    """Adds to the table's gradient; returns the points', as far as it comes from these levels (0 unless
+    `of_points`: it is two thirds of the work)."""
     dimensions, width = x.shape[1], table.shape[1]
     entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
     grad_x = np.zeros_like(x)
@@ -136,18 +143,19 @@ def _gradients(
             grad_x[n] = np.nan
             continue
         for level in range(first, last):
-            _look_up(x[n], level, cells, offsets, dense_levels, mask, primes, entries, sides)
+            _look_up(x[n], level, lattices, entries, sides)
             above = grad[n, level * width : (level + 1) * width]
-            scale = level_weights[level] * x.dtype.type(cells[level])
+            scale = level_weights[level] * x.dtype.type(lattices.cells[level])
             for corner in range(1 << dimensions):
-                weight = level_weights[level]
-                for axis in range(dimensions):
-                    weight *= sides[axis, corner >> axis & 1]
+                weight = _weight(sides, corner, level_weights[level])
                 row, grad_row = table[entries[corner]], grad_table[entries[corner]]
                 product = x.dtype.type(0)
                 for f in range(width):
-                    product += above[f] * row[f]
                     grad_row[f] += weight * above[f]
+                if not of_points:
+                    continue
+                for f in range(width):
+                    product += above[f] * row[f]
                 for axis in range(dimensions):
                     slope = product * scale
                     for other in range(dimensions):

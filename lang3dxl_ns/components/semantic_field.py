@@ -166,14 +166,9 @@ class SemanticField(Decoder):
         self.settings = s = config.resolved()
         self.code_dim = s.code_dim
         self.grid = HashGrid(
-            s.code_dim + s.indexed,
-            s.levels,
-            s.features_per_level,
-            s.log2_table_size,
-            s.min_resolution,
-            s.max_resolution,
-            generator=generator,
-        )
+            s.code_dim + s.indexed, s.levels, s.features_per_level, s.log2_table_size, s.min_resolution,
+            s.max_resolution, generator=generator,
+        )  # fmt: skip
         grid_dim = clip_dim if s.indexed else self.grid.output_dim
         fourier_dim = s.code_dim * (1 + 2 * s.fourier_frequencies) if s.fourier_frequencies else 0
         self.layers = _hidden_layers(grid_dim + fourier_dim, s, generator)

@@ -14,15 +14,15 @@ from lang3dxl_ns.rendering.gaussians import Gaussians
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 
 DEGREE = 2
-"""Of the spherical harmonics."""
+"""Degree of the spherical harmonics."""
 OPACITY = 0.98
-"""Of the sky's Gaussians: nothing else is behind them."""
+"""Opacity of the sky's Gaussians. It is high, since nothing lies behind them."""
 
 
 class Sky(nn.Module):
     """The first Gaussians of a scene. In training they stay where they are, and share nine colors.
 
-    Outside training they are Gaussians like any others, with the colors that `paint` wrote last.
+    Outside training they are Gaussians like any others, with the colors that they had last.
 
     Args:
         directions: of the Gaussians from the scene's center, of any length.

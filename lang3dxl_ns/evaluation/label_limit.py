@@ -28,11 +28,24 @@ def label_limit(
     categories: list[str],
     backend: Backend = "auto",
 ) -> Callable[[Camera], Maps]:
-    """Returns a function from a view to its maps by category, at the size of the rendering.
+    """Returns a function from a view to its maps by category, at the size of the rendering."""
+    shares = lifted_labels(splats, views, categories, backend)
 
-    Each Gaussian gets the mean label of the pixels it contributes to, weighted by compositing
-    weight, over all `views`; a category uses those with a label of it.
-    """
+    def maps(camera: Camera) -> Maps:
+        found = composite(splats, camera, shares, backend)
+        return dict(zip(categories, found.permute(2, 0, 1), strict=True))
+
+    return maps
+
+
+def lifted_labels(
+    splats: Splats,
+    views: Iterable[tuple[Camera, Masks]],
+    categories: list[str],
+    backend: Backend = "auto",
+) -> Float[Tensor, "n categories"]:
+    """Each Gaussian's mean label of the pixels that it contributes to, weighted by compositing weight, over
+    all `views`; a category uses those with a label of it. 0 for Gaussians that none of these shows."""
 
     def probes():
         for camera, masks in views:
@@ -42,13 +55,7 @@ def label_limit(
 
     lifted, _ = gather(len(splats), probes(), 2 * len(categories), splats.means)
     labels, labeled = lifted.chunk(2, dim=1)
-    shares = torch.where(labeled > 0, labels / labeled, 0.0)
-
-    def maps(camera: Camera) -> Maps:
-        found = composite(splats, camera, shares, backend)
-        return dict(zip(categories, found.permute(2, 0, 1), strict=True))
-
-    return maps
+    return torch.where(labeled > 0, labels / labeled, 0.0)
 
 
 def _labels(masks: Masks, categories: list[str], size: tuple[int, int]) -> Float[Tensor, "h w channels"]:

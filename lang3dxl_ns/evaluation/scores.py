@@ -130,9 +130,9 @@ def resized(maps: Maps, size: tuple[int, int]) -> Maps:
     return {name: resize_map(scores[None], size)[0] for name, scores in maps.items()}
 
 
-def blurred(maps: Maps, sigma: float = BLUR) -> Maps:
-    """Every map blurred by a Gaussian of `sigma` pixels."""
-    return _each(maps, lambda score: gaussian_filter(score, sigma))
+def blurred(maps: Maps) -> Maps:
+    """Every map blurred by a Gaussian of `BLUR` pixels."""
+    return _each(maps, lambda score: gaussian_filter(score, BLUR))
 
 
 def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.label_limit import Masks, lifted_labels
 from lang3dxl_ns.evaluation.score_scene import truths_of
 from lang3dxl_ns.evaluation.scores import overlap
 from lang3dxl_ns.query.places import Box, groups
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.rendering.gathering import Pixels, gather
-from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.scene.camera import Camera
 
 _LEAST_SHARE = 0.03
 """Share of all that is labeled with a word, below which a group is no thing of its own."""
-Labels = list[tuple[Camera, Bool[Tensor, "h w"]]]
 
 
 def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePhoto]) -> dict[str, float]:
@@ -39,43 +34,31 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
         truth: labels of its photos.
         photos: the labeled photos to use.
     """
-    prompts = [Prompt(category) for category in truth.categories]
-    question = scene.ask(prompts)
-    labels: dict[str, Labels] = {category: [] for category in truth.categories}
+    question = scene.ask([Prompt(category) for category in truth.categories])
+    labels: list[tuple[Camera, Masks]] = []
     ious: dict[str, list[float]] = {category: [] for category in truth.categories}
     for photo in photos:
         camera = photo.camera
         truths = truths_of(truth, photo.photo(), (camera.height, camera.width))
-        longest = max(camera.height, camera.width)
-        for category, match in zip(
-            truth.categories, scene.matches(question, photo.name, longest), strict=True
-        ):
-            if category in truths:
-                labels[category].append((camera, torch.from_numpy(truths[category].mask).to(scene.device)))
-                if truths[category].mask.any():
-                    ious[category].append(overlap(match.mask, truths[category].mask)["iou"])
+        labels.append((camera, {category: found.mask for category, found in truths.items()}))
+        matches = scene.matches(question, photo.name, max(camera.height, camera.width))
+        for category, match in zip(truth.categories, matches, strict=True):
+            if category in truths and truths[category].mask.any():
+                ious[category].append(overlap(match.mask, truths[category].mask)["iou"])
+    shares = lifted_labels(scene.splats, labels, truth.categories, scene.backend)
     figures: dict[str, float] = {}
-    for category, found in zip(truth.categories, scene.places(question), strict=True):
-        marked = _marked(scene, labels[category])
+    for category, found, share in zip(truth.categories, scene.places(question), shares.T, strict=True):
+        marked, mass = share > 0.5, scene.mass
         if not ious[category] or not marked.any():
             continue
-        chosen, mass = torch.from_numpy(found.gaussians).to(marked.device), scene.mass
+        chosen = torch.from_numpy(found.gaussians).to(marked.device)
         figures[f"mask_iou_{category}"] = float(np.mean(ious[category]))
-        figures[f"selection_iou_{category}"] = float(
-            mass[chosen & marked].sum() / mass[chosen | marked].sum()
-        )
+        both, either = mass[chosen & marked].sum(), mass[chosen | marked].sum()
+        figures[f"selection_iou_{category}"] = float(both / either)
         things = groups(scene.splats.means[marked], mass[marked], scene.gap)
         fits = [box_iou(found.box, box) for box in things if box.share >= _LEAST_SHARE] if found.box else []
         figures[f"box_iou_{category}"] = max(fits, default=0.0)
     return figures
-
-
-def _marked(scene: Scene, labels: Labels) -> Bool[Tensor, " n"]:
-    """Gaussians most of whose pixels have the label."""
-    like = scene.splats.means
-    drawn = [partial(composite, scene.splats, camera, backend=scene.backend) for camera, _ in labels]
-    pixels = [Pixels.of([mask[..., None].to(like)], (mask.shape[0], mask.shape[1])) for _, mask in labels]
-    return gather(len(scene.splats), zip(drawn, pixels, strict=True), 1, like)[0][:, 0] > 0.5
 
 
 def box_iou(a: Box, b: Box) -> float:

@@ -11,13 +11,15 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 
 
 def run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
-    """Densification statistics, the current round through the photos, and the random generators' states.
+    """Densification statistics, whether codes have begun, the current round through the photos, and the
+    random generators' states.
 
     Only tensors and plain values, which torch's weights-only loader accepts.
     """
     model = pipeline.model
     return {
         "strategy": dict(model.strategy_state),
+        "codes_have_begun": model.codes_have_begun,
         "photos": pipeline.datamanager.round_state(),
         "random": torch.get_rng_state(),
         "random_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
@@ -31,6 +33,7 @@ def restore_run_state(pipeline: Lang3DXLPipeline, state: dict[str, Any]) -> None
         name: value.to(model.device) if isinstance(value, Tensor) else value
         for name, value in state["strategy"].items()
     }
+    model.codes_have_begun = state.get("codes_have_begun", False)  # absent from earlier checkpoints
     pipeline.datamanager.restore_round(state["photos"])
     torch.set_rng_state(state["random"])
     if torch.cuda.is_available() and len(state["random_cuda"]) == torch.cuda.device_count():

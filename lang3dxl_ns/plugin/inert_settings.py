@@ -28,7 +28,7 @@ OF_COLMAP = (
 """nerfstudio's reader of COLMAP models; this package's reads points always, and depths never."""
 _OF_RENDERINGS = (
     *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up", "semantic_ramp"),
-    *("dense_compare", "mask_dense", "feature_gradient_to_geometry", "downsampler"),
+    *("codes_from", "dense_compare", "mask_dense", "feature_gradient_to_geometry", "downsampler"),
 )
 """Settings of semantics that are trained with the scene."""
 

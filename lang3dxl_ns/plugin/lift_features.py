@@ -35,7 +35,11 @@ def learn_from_photos(
     codes = learn_codes(
         decoder, views, model.means.detach(), facts.clip_targets, facts.dense_targets, advance
     )
-    model.gauss_params["codes"] = Parameter(codes.to(model.device), requires_grad=False)
+    if model.learns_from_renderings:
+        with torch.no_grad():
+            model.gauss_params["codes"].copy_(codes.nan_to_num(0.0))
+    else:
+        model.gauss_params["codes"] = Parameter(codes.to(model.device), requires_grad=False)
 
 
 def _view(model: Lang3DXLModel, camera: Cameras, batch: Batch) -> TargetView:

@@ -20,7 +20,9 @@ from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
 
 SHORT_FIELD_RUN = 5_000
 """Runs with fewer iterations use the field's `short` preset, if they train it with the scene: the grid as
-printed has learned no words after 300."""
+printed has learned no words after 300. Theirs are also the `auto` of `codes_from` and of the looks' grid."""
+START_OF_CODES = 0.25
+"""Fraction of the run after which codes start from photos: the paper's densification is over by then."""
 
 
 @without(*OF_SPLATFACTO)
@@ -59,6 +61,10 @@ class ModelSettings(SplatfactoModelConfig):
     """Fraction of the run over which the weight of the CLIP and dense losses rises from 0.1 to 1."""
     warm_up: float = 0.0
     """Fraction of the run that trains colors only, before the semantic losses start."""
+    codes_from: Literal["auto", "noise", "photos"] = "noise"
+    """What codes and field start from when the warm-up is over: noise, as published, or the photos' features,
+    gathered onto the Gaussians; then a warm-up of 0 becomes a quarter of the run. `auto`: photos in runs of
+    under 5,000 iterations."""
     feature_gradient_to_geometry: bool = False
     """Let the semantic losses also move Gaussians, as in the authors' code; opacities belong to the colors
     alone. Costs a second rendering."""
@@ -114,6 +120,12 @@ class ModelSettings(SplatfactoModelConfig):
                     f"Semantic field: preset {preset} (short in runs of under {SHORT_FIELD_RUN:,} "
                     "iterations, paper, as printed, in longer ones)"
                 )
+        if self.codes_from == "auto":
+            self.codes_from = "photos" if iterations < SHORT_FIELD_RUN else "noise"
+        if self.codes_from == "photos" and not self.warm_up:
+            self.warm_up = START_OF_CODES
+        if self.appearance.preset == "auto":
+            self.appearance.preset = "coarse" if iterations < SHORT_FIELD_RUN else "paper"
         self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
         if self.densify_grad_thresh is None:
             self.densify_grad_thresh = schedules.log_linear(x, 2e-3, 2e-4)

@@ -92,7 +92,11 @@ class Lang3DXLPipeline(VanillaPipeline):
         return results
 
     def get_train_loss_dict(self, step: int):
-        """Outputs, losses and metrics of the next photo."""
+        """Outputs, losses and metrics of the next photo. Codes that start from photos are learned first."""
+        if self.model.codes_begin:
+            if self.model.config.codes_from == "photos":
+                self.learn_words()
+            self.model.codes_have_begun = True
         outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
         return outputs, self.last_losses, metrics
 

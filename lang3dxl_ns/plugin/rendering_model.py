@@ -72,6 +72,8 @@ class RenderingModel(SplatfactoModel):
     sky: Sky | None
     """The first Gaussians' colors; None: there is no sky, or it was trained like all Gaussians."""
     answers: Answers | None = None
+    codes_have_begun = False
+    """Whether training has come to the codes; part of a checkpoint's run state."""
 
     @property
     def facts(self) -> SceneFacts:
@@ -246,6 +248,12 @@ class RenderingModel(SplatfactoModel):
     @property
     def _warm_up_is_over(self) -> bool:
         return self.step >= self.config.warm_up * self.config.total_steps
+
+    @property
+    def codes_begin(self) -> bool:
+        """Whether codes are about to be trained for the first time: once in a run, also if it is resumed or
+        prolonged."""
+        return self.learns_from_renderings and self._warm_up_is_over and not self.codes_have_begun
 
     def _pose(self, camera: Cameras) -> Float[Tensor, "3 4"]:
         """Camera → world, refined in training. It stays where it is, on the CPU, unless it is refined."""

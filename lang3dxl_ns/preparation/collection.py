@@ -59,8 +59,7 @@ def plan_crops(
             "pass --pipeline.datamanager.scale-mode auto"
         )
     if config.scale_mode == "relative" or not len(reconstruction.points):
-        scales = relative_scales() if config.scale_range is None else relative_scales(7, *config.scale_range)
-        scales = _resampled(scales, config)
+        scales = _resampled(relative_scales(7, *(config.scale_range or ())), config)
         reasons = [f"crops of {_listed(scales)} of the photo's width"]
         if config.scale_mode != "relative":
             reasons.insert(0, "the scene has no 3D points: crop sizes are relative to the photo")
@@ -116,16 +115,11 @@ def _scale_range(
         if "scale_range" not in settings:
             raise UserError(f"the preset {config.scale_preset} has no scale-range: choose a scene's")
         smallest, largest = settings["scale_range"]
-        return ScaleRange(
-            smallest, largest, f"crops of {smallest}–{largest} world units ({config.scale_preset})"
-        )
+        reason = f"crops of {smallest}–{largest} world units ({config.scale_preset})"
+        return ScaleRange(smallest, largest, reason)
     if config.scale_range is None:
         return propose_scale_range(reconstruction, sizes)
     smallest, largest = config.scale_range
-    if not 0 < smallest <= largest:
-        raise UserError(
-            f"the scale range {smallest} {largest} is not a range: give the smallest crop first, both above 0"
-        )
     return ScaleRange(smallest, largest, f"crops of {smallest:.3g}–{largest:.3g} world units, as configured")
 
 
@@ -133,10 +127,6 @@ def _resampled(scales: list[float], config: PreparationConfig) -> list[float]:
     """The configured number of sizes, evenly spaced over the same range (by ratio); if one, the middle."""
     if config.scales is None:
         return scales
-    if config.scales < 1:
-        raise UserError(
-            f"{config.scales} crop sizes are too few: pass --pipeline.datamanager.scales 1 or more"
-        )
     if config.scales == 1:
         return [math.sqrt(scales[0] * scales[-1])]
     return np.geomspace(scales[0], scales[-1], config.scales).tolist()

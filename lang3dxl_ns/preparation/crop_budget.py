@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.preparation.physical_scale import SMALLEST_CROP, crop_sides, fine_crops
 from lang3dxl_ns.preparation.pyramid import HALF, THIRD, crop_count
 from lang3dxl_ns.preparation.settings import Quality
@@ -16,7 +13,8 @@ from lang3dxl_ns.preparation.settings import Quality
 MOST_CROPS: dict[Quality, float] = {"fast": 700, "normal": 2_500, "fine": math.inf}
 """Crops of a photo for an encoder of 224 pixels. An encoder of half the side may have four times as many,
 which take about as long."""
-_USUAL_INPUT = 224
+USUAL_INPUT = 224
+"""Pixels of an encoder's input."""
 _LEAST_SHARE = 1 / 4
 """Side of the smallest crop, as a share of the encoder's input: enlarged more than that, a crop is a blur."""
 _GROWTH = 1.05
@@ -62,7 +60,7 @@ def choose_crops(
         quality: bound of the number; "fine" has none, and crops down to 32 pixels.
     """
     width, height = size
-    most = MOST_CROPS[quality] * (_USUAL_INPUT / input_side) ** 2
+    most = MOST_CROPS[quality] * (USUAL_INPUT / input_side) ** 2
     least = 0.0 if quality == "fine" else _LEAST_SHARE * input_side
     smallest = float(SMALLEST_CROP)
     while True:
@@ -77,15 +75,6 @@ def choose_crops(
         if smallest >= width:
             return Crops(sides, HALF)
         smallest = max(smallest, sides[-1] if is_fine else sides[0]) * _GROWTH
-
-
-def input_side(folder: Path) -> int:
-    """Pixels of the input of an encoder, by the configuration in its folder; 224 if that doesn't say."""
-    try:
-        side = json.loads((folder / "config.json").read_text())["vision_config"]["image_size"]
-        return side if isinstance(side, int) and side > 0 else _USUAL_INPUT
-    except DAMAGE:
-        return _USUAL_INPUT
 
 
 def _grid(height: int, width: int, side: int, steps: int) -> tuple[int, int]:

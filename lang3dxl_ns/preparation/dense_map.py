@@ -20,7 +20,7 @@ Grid = tuple[int, int]
 EncodePatches = Callable[[Float[Tensor, "n 3 h w"]], Float[Tensor, "n rows columns c"]]
 
 _FINER = 1.75
-"""Of the second size to the first: two windows a quarter of which overlaps."""
+"""Ratio of the second size to the first: two windows, a quarter of which overlaps."""
 _OVERLAP = 0.25
 
 

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.families import FAMILIES, Family, input_side, vision_inputs
 from lang3dxl_ns.preparation.light import in_known_light
@@ -122,7 +123,6 @@ class PatchReading:
     recipe: str
     tokens: int
     """Patches per side of its own input."""
-    patch_size: int
 
 
 def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
@@ -135,7 +135,7 @@ def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> Pat
     if (family.features if features == "auto" else features) == "crops":
         return None
     vision = read_config(files).vision_config
-    return PatchReading(family.recipe, input_side(vision) // vision.patch_size, vision.patch_size)
+    return PatchReading(family.recipe, input_side(vision) // vision.patch_size)
 
 
 def _family(files: ModelFiles) -> Family:
@@ -250,20 +250,16 @@ def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, toke
     if not isinstance(getattr(model.config, "patch_size", None), int):
         raise UserError(
             f"{files.name} is a {model.config.model_type} model without patch tokens: give "
-            f"{spoken(files.option)} "
-            'a vision transformer such as facebook/dinov2-small, or "none"'
+            f'{spoken(files.option)} a vision transformer such as facebook/dinov2-small, or "none"'
         )
     return DenseEncoder(model, tokens, files.identity)
 
 
 @lru_cache(maxsize=1)  # log once
 def _say_what_builtin_knows() -> None:
-    from rich import get_console
-
-    get_console().print(
+    say(
         "The built-in CLIP knows landmarks and street façades and nothing else; a real one knows more: "
-        f"{spoken(CLIP_OPTION)} openai/clip-vit-base-patch32",
-        soft_wrap=True,
+        f"{spoken(CLIP_OPTION)} openai/clip-vit-base-patch32"
     )
 
 

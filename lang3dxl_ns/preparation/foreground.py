@@ -6,25 +6,21 @@ is foreground. `Photo.read_mask` does the rest, for training, evaluation and que
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import torch
-from jaxtyping import Bool
-from PIL import Image, PngImagePlugin
-from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
-from lang3dxl_ns.preparation.segmentation import TextSegmenter, find_text_segmenter, load_text_segmenter
+from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.working_photos import kept_picture, mask_png
 from lang3dxl_ns.scene.companions import companion, named_folder
 from lang3dxl_ns.scene.photo import Photo
 
@@ -61,16 +57,27 @@ def with_foreground(
     if config.foreground == "auto":
         masked = list(photos)  # with the masks found by the dataparser
     else:
-        masked = _from_folder(photos, named_folder(config.foreground, data, "foreground"))
+        folder = named_folder(config.foreground, data, "foreground")
+        masked = [replace(photo, mask_path=find_mask(folder, photo.name)) for photo in photos]
+        if all(photo.mask_path is None for photo in masked):
+            raise UserError(
+                f"no mask in {folder} is named like a photo (the first is {photos[0].name}): name masks like "
+                "the photos, with .png or .jpg"
+            )
     masked = _checked(masked, config.skip_damaged_masks, log)
     without = [photo.name for photo in masked if photo.mask_path is None]
     if 0 < len(without) < len(masked):
         log(f"{len(without)} of {len(masked)} photos have no mask and are used whole: {some(without)}")
-    for path, names in _shared_masks(masked).items():
-        log(
-            f"{path} is the mask of {len(names)} photos, {some(names)}: if it belongs to one, name it "
-            f"like {path.parent / (PurePosixPath(names[0]).name + path.suffix)}"
-        )
+    sharing: dict[Path, list[str]] = {}
+    for photo in masked:
+        if photo.mask_path is not None:
+            sharing.setdefault(photo.mask_path, []).append(photo.name)
+    for path, names in sharing.items():
+        if len(names) > 1:  # photos whose names differ only in their suffix
+            log(
+                f"{path} is the mask of {len(names)} photos, {some(names)}: if it belongs to one, name it "
+                f"like {path.parent / (PurePosixPath(names[0]).name + path.suffix)}"
+            )
     return masked
 
 
@@ -112,28 +119,9 @@ def _state(photo: Photo) -> bool | str:
         return f"{photo.mask_path} ({error})"
 
 
-def _shared_masks(photos: Sequence[Photo]) -> dict[Path, list[str]]:
-    """Masks used by several photos, whose names differ only in their suffix, with these photos."""
-    names: dict[Path, list[str]] = {}
-    for photo in photos:
-        if photo.mask_path is not None:
-            names.setdefault(photo.mask_path, []).append(photo.name)
-    return {path: sharing for path, sharing in names.items() if len(sharing) > 1}
-
-
 def find_mask(folder: Path, name: str, follow_links: bool = False) -> Path | None:
     """A photo's mask in a folder: named like the photo, as PNG or JPEG."""
     return companion(folder, name, MASK_SUFFIXES, follow_links)
-
-
-def _from_folder(photos: Sequence[Photo], folder: Path) -> list[Photo]:
-    masked = [replace(photo, mask_path=find_mask(folder, photo.name)) for photo in photos]
-    if all(photo.mask_path is None for photo in masked):
-        raise UserError(
-            f"no mask in {folder} is named like a photo (the first is {photos[0].name}): name masks like the "
-            "photos, with .png or .jpg"
-        )
-    return masked
 
 
 def _prompted(
@@ -153,60 +141,29 @@ def _prompted(
     for photo in photos:
         path = store.path(FOREGROUND, photo.name).with_suffix(".png")
         try:
-            settings = {**made_with, "photo": photo.content_hash()}
+            settings = json.dumps({**made_with, "photo": photo.content_hash()})
         except UserError:
             masked.append(photo)  # reading it later reports the reason
             continue
         masked.append(replace(photo, mask_path=path))
-        if _settings(path) != settings:
+        if kept_picture(path, settings) is None:
             missing.append((photo, path, settings))
     if missing:
         log(f"looking for {', '.join(config.foreground_prompts)} in {len(missing)} of {len(photos)} photos")
-        empty = _make(missing, load_text_segmenter(files, device), config.foreground_prompts, store)
-        if empty:
-            log(f"found nothing in {len(empty)} photos, which are used whole: {some(empty)}")
-    return masked
-
-
-def _make(
-    missing: list[tuple[Photo, Path, dict[str, Any]]],
-    segmenter: TextSegmenter,
-    prompts: Sequence[str],
-    store: FeatureStore,
-) -> list[str]:
-    """Write the masks; returns the names of the photos in which nothing was found."""
-    store.remove_leftovers()
-    empty = []
-    with progress("finding the foreground", len(missing)) as advance:
-        for photo, path, settings in missing:
-            try:
-                image = photo.read_file(_LONGER_SIDE)
-            except UserError:
-                pass  # as above
-            else:
-                mask = segmenter.segment(image, prompts)
+        segmenter, empty = load_text_segmenter(files, device), []
+        store.remove_leftovers()
+        with progress("finding the foreground", len(missing)) as advance:
+            for photo, path, settings in missing:
+                advance()
+                try:
+                    image = photo.read_file(_LONGER_SIDE)
+                except UserError:
+                    continue  # as above
+                mask = segmenter.segment(image, config.foreground_prompts)
                 if not mask.any():
                     empty.append(photo.name)
                     mask = torch.ones_like(mask)
-                store.write_bytes(path, _png(mask, settings), f"the mask of {photo.name}")
-            advance()
-    return empty
-
-
-def _png(mask: Bool[Tensor, "h w"], settings: dict[str, Any]) -> bytes:
-    """A black-and-white PNG that contains the settings, so that no mask is ever without them."""
-    text, content = PngImagePlugin.PngInfo(), io.BytesIO()
-    text.add_text("settings", json.dumps(settings))
-    Image.fromarray(mask.numpy()).save(content, "PNG", pnginfo=text)
-    return content.getvalue()
-
-
-def _settings(path: Path) -> dict[str, Any] | None:
-    """The settings that made a mask; None if there is no complete mask of ours."""
-    try:
-        with open_picture(path) as image:
-            settings = json.loads(image.info.get("settings", "null"))
-            image.verify()  # reads all of it
-            return settings
-    except (OSError, NoPictureError):
-        return None
+                store.write_bytes(path, mask_png(mask, settings), f"the mask of {photo.name}")
+        if empty:
+            log(f"found nothing in {len(empty)} photos, which are used whole: {some(empty)}")
+    return masked

@@ -1,4 +1,4 @@
-"""What the data manager hands to the model: facts of the scene before training, a photo in every step."""
+"""Data passed from the data manager to the model: scene facts once, one photo per step."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Batch(_Photo, total=False):
     clip_target: Float[Tensor, "hd wd c"]
     """As `preparation.targets.StoredClipTarget.features`."""
     crop_sides: list[float]
-    """Of the crops in the CLIP target, ascending, as fractions of the photo's width."""
+    """Sides of the crops in the CLIP target, ascending, as fractions of the photo's width."""
     dense_target: Float[Tensor, "t t d"]
     """Dense features of the photo squashed to a square."""
     regions: Int[Tensor, "hr wr"]
@@ -43,11 +43,11 @@ class SceneFacts:
     names: list[str] = field(default_factory=list)
     """Training photos, in the order of their cameras."""
     positions: Float[Tensor, "p 3"] | None = None
-    """Of these cameras, in the model's frame; None for a model that is loaded."""
+    """Positions of these cameras, in the model's frame; None for a model that is loaded."""
     needs: Mapping[str, bool] = field(default_factory=dict)
     """Whether the scene needs an optional component; empty if that wasn't measured."""
     statistics: FeatureStatistics | None = None
-    """Of the targets; None for a model without semantics, or one that is loaded."""
+    """Channel statistics of the targets; None for a model without semantics, or one that is loaded."""
     clip_targets: Callable[[], Iterator[Float[Tensor, "hd wd c"]]] | None = None
     """The CLIP targets of the training photos, one at a time."""
     dense_targets: Callable[[], Iterator[Float[Tensor, "t t d"]]] | None = None

@@ -43,7 +43,7 @@ class ModelFiles:
     name: str
     folder: Path
     identity: str
-    """Of configuration and weights, not of the name: targets stay valid if the model is moved."""
+    """Depends on configuration and weights, not on the name: targets stay valid if the model is moved."""
     option: str
     """The option that chose the model, for messages."""
 

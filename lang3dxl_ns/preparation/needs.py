@@ -19,7 +19,7 @@ from lang3dxl_ns.preparation.collection import SCALE_RATIO, CropPlan
 from lang3dxl_ns.preparation.physical_scale import crop_sides
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
-from lang3dxl_ns.scene.photometry import Photometry, measure_photometry
+from lang3dxl_ns.scene.photometry import measure_photometry
 
 LIGHT = 0.3
 """Spread of the photos' exposures, in natural logarithms of light: below half a stop, a camera's own metering
@@ -69,41 +69,43 @@ def scene_needs(
     sources: Sources,
 ) -> list[Need]:
     """Measure the need for every optional component; takes seconds for a hundred photos."""
-    photometry = measure_photometry(photos, reconstruction)
+    light = measure_photometry(photos, reconstruction)
+    # Levels are clipped to 32 pixels and to the photo; duplicates are never made.
+    sizes = {p.name: 1 / p.width for p in photos} if crops.pixel_sizes is None else crops.pixel_sizes
+    levels = float(np.mean([len(crop_sides(crops.scales, sizes[p.name], p.width)) for p in photos]))
+    errors = [error for photo in reconstruction.photos.values() if (error := _reprojection_error(photo))]
     return [
-        _appearance(photometry),
-        _view_dependence(photometry),
+        _measured(
+            "appearance", "spread of the photos' exposures along tracks (log of light)",
+            None if light is None else light.spread, LIGHT,
+        ),
+        _measured(
+            "view dependence", "share of the tracks' color residuals explained by the viewing direction",
+            None if light is None else light.view_dependence, SHEEN,
+        ),
         Need("physical scale", crops.pixel_sizes is not None, SPREAD_OF_SCALE, crops.spread, SCALE_RATIO),
-        _pyramid_levels(photos, crops),
+        _measured(
+            "pyramid levels",
+            f"distinct pyramid levels per photo, mean over the photos, of {len(crops.scales)}", levels, 1.0,
+        ),
         _foreground(photos),
         Need("regions", sources.regions, "a source of regions is given", None, None),
         Need("dense features", sources.dense, "a dense encoder is given: it sharpens words", None, None),
-        _camera_optimizer(reconstruction),
-    ]
+        _measured(
+            "camera optimizer", "reprojection error of the model (pixels, median over the photos)",
+            float(np.median(errors)) if errors else None, REPROJECTION, unmeasured=False,
+        ),
+    ]  # fmt: skip
 
 
-def _appearance(photometry: Photometry | None) -> Need:
-    measured = "spread of the photos' exposures along tracks (log of light)"
-    value = None if photometry is None else photometry.spread
-    return Need("appearance", value is None or value > LIGHT, measured, value, LIGHT)
-
-
-def _view_dependence(photometry: Photometry | None) -> Need:
-    measured = "share of the tracks' color residuals explained by the viewing direction"
-    value = None if photometry is None else photometry.view_dependence
-    return Need("view dependence", value is None or value > SHEEN, measured, value, SHEEN)
-
-
-def _pyramid_levels(photos: Sequence[Photo], crops: CropPlan) -> Need:
-    """Levels are clipped to 32 pixels and to the photo; duplicates are never made."""
-    measured = f"distinct pyramid levels per photo, mean over the photos, of {len(crops.scales)}"
-    sizes = {p.name: 1 / p.width for p in photos} if crops.pixel_sizes is None else crops.pixel_sizes
-    value = float(np.mean([len(crop_sides(crops.scales, sizes[p.name], p.width)) for p in photos]))
-    return Need("pyramid levels", value > 1, measured, value, 1.0)
+def _measured(
+    component: str, measured: str, value: float | None, threshold: float, unmeasured: bool = True
+) -> Need:
+    """A component that is needed above a threshold, or by default if nothing could be measured."""
+    return Need(component, unmeasured if value is None else value > threshold, measured, value, threshold)
 
 
 def _foreground(photos: Sequence[Photo], at_most: int = 20) -> Need:
-    measured = "share of the pixels removed by masks"
     masked = [photo for photo in photos if photo.mask_path is not None]
     if not masked:
         return Need("foreground", False, "no masks", None, None)
@@ -113,14 +115,7 @@ def _foreground(photos: Sequence[Photo], at_most: int = 20) -> Need:
         if mask is not None:
             cuts.append(1 - float(mask.float().mean()))
     value = float(np.mean(cuts)) * len(masked) / len(photos) if cuts else None
-    return Need("foreground", value is None or value > CUT, measured, value, CUT)
-
-
-def _camera_optimizer(reconstruction: Reconstruction) -> Need:
-    measured = "reprojection error of the model (pixels, median over the photos)"
-    errors = [error for photo in reconstruction.photos.values() if (error := _reprojection_error(photo))]
-    value = float(np.median(errors)) if errors else None
-    return Need("camera optimizer", value is not None and value > REPROJECTION, measured, value, REPROJECTION)
+    return _measured("foreground", "share of the pixels removed by masks", value, CUT)
 
 
 def _reprojection_error(photo: Any) -> float | None:

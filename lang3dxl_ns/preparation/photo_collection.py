@@ -40,7 +40,7 @@ class PhotoCollection:
     photos: list[Photo]
     """In the order of the reconstruction."""
     reconstruction: Reconstruction
-    """Of these photos, in the frame of the file that the poses come from."""
+    """Their poses and points, in the frame of the file that the poses come from."""
     left_out: dict[str, str]
     """Photos of the file that can't be used, with reasons."""
     reconstructed: bool = False
@@ -193,20 +193,13 @@ def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
             width, height = image.size
     angle = None if "fl_x" in frame else float(frame["camera_angle_x"])
     fx = float(frame["fl_x"]) if angle is None else width / 2 / math.tan(angle / 2)
-    names = ("k1", "k2", "k3", "k4") if model in _FISHEYES else ("k1", "k2", "p1", "p2")
-    distortion = tuple(float(frame.get(key, 0.0)) for key in names)
-    third = (float(frame["k3"]),) if model not in _FISHEYES and frame.get("k3") else ()
     fisheye = model in _FISHEYES
-    lens = Lens(
-        width,
-        height,
-        fx,
-        float(frame.get("fl_y", fx)),
-        float(frame.get("cx", width / 2)),
-        float(frame.get("cy", height / 2)),
-        (*distortion, *third) if fisheye or any((*distortion, *third)) else (),
-        fisheye,
+    names = ["k1", "k2", "k3", "k4"] if fisheye else ["k1", "k2", "p1", "p2", *["k3"] * bool(frame.get("k3"))]
+    distortion = tuple(float(frame.get(key, 0.0)) for key in names)
+    fy, cx, cy = (
+        float(frame.get(key, usual)) for key, usual in (("fl_y", fx), ("cx", width / 2), ("cy", height / 2))
     )
+    lens = Lens(width, height, fx, fy, cx, cy, distortion if fisheye or any(distortion) else (), fisheye)
     lens.check()
     return lens
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -100,15 +99,9 @@ def physical_scales(smallest: float, largest: float) -> list[float]:
     return np.geomspace(smallest, largest, count).tolist()
 
 
-def relative_scales(
-    count: int = 7,
-    smallest: float = 0.05,
-    largest: float = 0.5,
-    spacing: Literal["geometric", "linear"] = "geometric",
-) -> list[float]:
-    """Crop sides as fractions of the photo's width, as in LERF ("linear" is its own spacing)."""
-    space = np.geomspace if spacing == "geometric" else np.linspace
-    return space(smallest, largest, count).tolist()
+def relative_scales(count: int = 7, smallest: float = 0.05, largest: float = 0.5) -> list[float]:
+    """Crop sides as fractions of the photo's width, LERF's range."""
+    return np.geomspace(smallest, largest, count).tolist()
 
 
 def crop_sides(

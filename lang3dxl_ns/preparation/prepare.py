@@ -10,7 +10,7 @@ import math
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -21,20 +21,24 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.crop_budget import Crops, choose_crops, input_side
+from lang3dxl_ns.common.stages import roughly
+from lang3dxl_ns.preparation.crop_budget import USUAL_INPUT, Crops, choose_crops
 from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import (
-    CLIP_OPTION,
-    DENSE_OPTION,
     DenseEncoder,
     ImageTextEncoder,
-    find_model,
     load_dense_encoder,
     load_image_text_encoder,
     patch_reading,
+)
+from lang3dxl_ns.preparation.model_files import (
+    BUILTIN,
+    CLIP_OPTION,
+    DENSE_OPTION,
+    find_model,
+    read_config,
     spoken,
 )
-from lang3dxl_ns.preparation.model_files import BUILTIN
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
@@ -72,36 +76,40 @@ class PreparedTargets:
 
 @dataclass
 class _Task:
-    """A photo's targets to make, and their settings; None for what is up to date."""
+    """A photo, and what of its targets is to be made."""
 
     photo: Photo
     crops: Crops
     fast: int
     """Crops that `--quality fast` would take."""
-    clip: dict[str, Any] | None
-    dense: dict[str, Any] | None
-    regions: dict[str, Any] | None
-    has_dense: bool
-    has_regions: bool
-    is_fine: bool = False
-    """Whether the crops are small ones alone, on a finer grid."""
-    grids: tuple[Grid, Grid] | None = None
+    grids: tuple[Grid, Grid] | None
     """Grids of a map of patch features, which then takes the place of crops."""
+    kinds: set[str]
+    """All targets that the photo has."""
+    missing: dict[str, dict[str, Any]]
+    """Settings of those to make."""
 
     @property
-    def clip_kind(self) -> str:
-        return FINE if self.is_fine else CLIP
+    def clip(self) -> str | None:
+        """Kind of CLIP target to make."""
+        return next((kind for kind in (CLIP, FINE) if kind in self.missing), None)
 
     @property
-    def is_done(self) -> bool:
-        return self.clip is None and self.dense is None and self.regions is None
+    def count(self) -> int:
+        """Number of crops."""
+        return self.crops.count(self.photo.height, self.photo.width)
 
-    def drop_current(self, store: FeatureStore) -> None:
-        """Drop the entries that the store has by now."""
-        for field, kind in ((CLIP, self.clip_kind), (DENSE, DENSE), (REGIONS, REGIONS)):
-            settings = getattr(self, field)
-            if settings is not None and store.is_current(kind, self.photo.name, settings):
-                setattr(self, field, None)
+    def bytes(self, clip: ImageTextEncoder | None, dense: DenseEncoder | None) -> int:
+        """Size of the entries to make: two bytes per number."""
+        height, width, numbers = self.photo.height, self.photo.width, 0
+        if self.clip and clip:
+            grid = self.grids[-1] if self.grids else self.crops.grid(height, width)
+            numbers += math.prod(grid) * (clip.dim + 1)
+        if DENSE in self.missing and dense:
+            numbers += dense.tokens**2 * dense.dim
+        if REGIONS in self.missing:
+            numbers += math.prod(label_size(height, width))
+        return 2 * numbers
 
 
 def prepare(
@@ -124,21 +132,28 @@ def prepare(
     Photos that can't be read are left out with a warning. Raises UserError when none can be read, a model
     can't be loaded, or the disk is too small.
     """
-    left_out: dict[str, str] = {}
-    tasks = _plan(photos, pixel_sizes, config, scales, store, regions, left_out, frozenset(fine))
-    missing = [task for task in tasks if not task.is_done]
+    tasks, left_out = _plan(photos, pixel_sizes, config, scales, store, regions, frozenset(fine))
+    missing = [task for task in tasks if task.missing]
     if missing:
-        _make(missing, len(tasks), config, store, device, regions, left_out)
+        maker = _Maker(config, store, regions, missing)
+        store.remove_leftovers()
+        maker.announce(len(tasks), str(device))
+        workers = Workers(config.workers, config.engine, config.address)
+        with progress("encoding photos", len(missing)) as advance:
+            for task, trouble in workers.run(maker, missing, str(device)):
+                if trouble:
+                    left_out[task.photo.name] = trouble
+                advance()
     names = [task.photo.name for task in tasks if task.photo.name not in left_out]
     if not names:
         raise UserError("no photo can be prepared: " + ("; ".join(left_out.values()) or "the scene has none"))
     if left_out:
         say(f"left out {len(left_out)} of {len(photos)} photos:", *(f"  {why}" for why in left_out.values()))
     encoded = sum(task.photo.name not in left_out for task in missing)
-    with_dense = [task.photo.name for task in tasks if task.has_dense]
-    with_regions = [task.photo.name for task in tasks if task.has_regions]
-    reader = TargetReader(store, names, with_dense, with_regions, fine)
-    return PreparedTargets(reader, left_out, encoded)
+    with_dense, with_regions = (
+        [task.photo.name for task in tasks if kind in task.kinds] for kind in (DENSE, REGIONS)
+    )
+    return PreparedTargets(TargetReader(store, names, with_dense, with_regions, fine), left_out, encoded)
 
 
 def _plan(
@@ -148,82 +163,55 @@ def _plan(
     scales: Sequence[float],
     store: FeatureStore,
     regions: RegionSource | None,
-    left_out: dict[str, str],
     fine: Collection[str],
-) -> list[_Task]:
-    """A task per photo; unreadable photos go to `left_out`."""
+) -> tuple[list[_Task], dict[str, str]]:
+    """A task per photo, and reasons for the photos that can't be read."""
     clip_model = find_model(config.clip, CLIP_OPTION)
-    input_pixels = input_side(clip_model.folder)
     patches = patch_reading(config.clip, config.clip_features)
-    dense_model = None if not config.makes_dense else find_model(config.dense, DENSE_OPTION).identity
-
-    def crops_of(photo: Photo, quality: Quality) -> Crops:
-        pixel_size = 1 / photo.width if pixel_sizes is None else pixel_sizes[photo.name]
-        size = photo.width, photo.height
-        return choose_crops(scales, pixel_size, size, photo.name in fine, input_pixels, quality)
-
-    tasks = []
+    input_pixels = getattr(read_config(clip_model).vision_config, "image_size", USUAL_INPUT)
+    dense_model = find_model(config.dense, DENSE_OPTION).identity if config.makes_dense else None
+    tasks, left_out = [], {}
     for photo, content in zip(photos, store.photo_hashes(photos).values(), strict=True):
         if isinstance(content, UserError):
             left_out[photo.name] = str(content)
             continue
-        source, is_fine = _source(photo, content), photo.name in fine
-        crops = crops_of(photo, config.quality)
-        fast = crops_of(photo, "fast").count(photo.height, photo.width)
+        is_fine, size = photo.name in fine, (photo.width, photo.height)
+        pixel_size = 1 / photo.width if pixel_sizes is None else pixel_sizes[photo.name]
+        qualities: tuple[Quality, Quality] = config.quality, "fast"
+        crops, fast = (
+            choose_crops(scales, pixel_size, size, is_fine, input_pixels, quality) for quality in qualities
+        )
+        grids, source = None, _source(photo, content)
         clip = {**source, "encoder": clip_model.identity, "crop_sides": crops.sides, "rule": _CROP_RULE}
         if is_fine and crops.steps != THIRD:
             clip["steps"] = crops.steps
-        grids = None
         if patches is not None:
             grids = map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
             sides = sorted(math.ceil(photo.width / columns) for _, columns in grids)
             clip = {**source, "encoder": clip_model.identity, "crop_sides": sides}
             clip |= {"patches": patches.recipe, "grids": grids, "rule": RULE}
-        has_dense = dense_model is not None and (is_fine or not fine)
-        dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if has_dense else None
-        labels = None if regions is None else regions.settings(photo)
-        settings = None if labels is None else {**source, **labels}
-        has_regions = labels is not None
-        task = _Task(photo, crops, fast, clip, dense, settings, has_dense, has_regions, is_fine, grids)
-        task.drop_current(store)
-        tasks.append(task)
-    without = [task.photo.name for task in tasks if not task.has_regions]
+        settings = {FINE if is_fine else CLIP: clip}
+        if dense_model is not None and (is_fine or not fine):
+            settings[DENSE] = {**source, "encoder": dense_model, "tokens": config.dense_tokens}
+        if regions is not None and (labels := regions.settings(photo)) is not None:
+            settings[REGIONS] = {**source, **labels}
+        missing = {kind: s for kind, s in settings.items() if not store.is_current(kind, photo.name, s)}
+        fast_count = fast.count(photo.height, photo.width)
+        tasks.append(_Task(photo, crops, fast_count, grids, set(settings), missing))
+    without = [task.photo.name for task in tasks if REGIONS not in task.kinds]
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
-    return tasks
+    return tasks, left_out
 
 
 def _source(photo: Photo, content: str) -> dict[str, Any]:
     """Everything that determines the photo as it is read. The camera matters only if it undistorts."""
-    lens = photo.lens
-    camera = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion, lens.fisheye] if lens.distorts else None
-    source = {"photo": content, "size": [photo.width, photo.height], "undistorted": camera}
+    source = {
+        "photo": content,
+        "size": [photo.width, photo.height],
+        "undistorted": photo.lens.undistortion,
+    }
     return {**source, "turned": photo.quarter_turns} if photo.quarter_turns else source
-
-
-def _make(
-    missing: list[_Task],
-    photos: int,
-    config: PreparationConfig,
-    store: FeatureStore,
-    device: torch.device | str,
-    regions: RegionSource | None,
-    left_out: dict[str, str],
-) -> None:
-    """Write the missing entries, photo by photo, in the configured number of processes."""
-    with_clip, with_dense = any(task.clip for task in missing), any(task.dense for task in missing)
-    maker = _Maker(config, store, regions, with_clip, with_dense, missing)
-    store.remove_leftovers()
-    clip, dense = maker.models(str(device))
-    _announce(missing, photos, clip, dense, config, store)
-    if clip:
-        _announce_duration(missing, clip, dense, config, torch.device(device))
-    workers = Workers(config.workers, config.engine, config.address)
-    with progress("encoding photos", len(missing)) as advance:
-        for task, trouble in workers.run(maker, missing, str(device)):
-            if trouble:
-                left_out[task.photo.name] = trouble
-            advance()
 
 
 class _ReadAhead:
@@ -243,35 +231,38 @@ class _ReadAhead:
         return self._read(photo) if future is None else future.result()
 
 
-@dataclass
 class _Maker:
     """Setup of a worker that makes entries."""
 
-    config: PreparationConfig
-    store: FeatureStore
-    regions: RegionSource | None
-    with_clip: bool
-    with_dense: bool
-    tasks: list[_Task]
-    """In their order, to be read ahead; a worker process doesn't know which it gets."""
-    _models: tuple[ImageTextEncoder | None, DenseEncoder | None] | None = None
+    def __init__(
+        self,
+        config: PreparationConfig,
+        store: FeatureStore,
+        regions: RegionSource | None,
+        tasks: list[_Task],
+    ) -> None:
+        self._config, self._store, self._regions, self._tasks = config, store, regions, tasks
+        self._with_clip = any(task.clip for task in tasks)
+        self._with_dense = any(DENSE in task.missing for task in tasks)
+        self._models: tuple[ImageTextEncoder | None, DenseEncoder | None] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "tasks": [], "_models": None}  # every process loads its own
+        # A process loads its own networks, and doesn't know which photos it gets.
+        return {**self.__dict__, "_tasks": [], "_models": None}
 
     def models(self, device: str) -> tuple[ImageTextEncoder | None, DenseEncoder | None]:
         """The encoders needed; loaded once."""
         if self._models is None:
-            c = self.config
-            clip = load_image_text_encoder(c.clip, device) if self.with_clip else None
-            dense = load_dense_encoder(c.dense, device, c.dense_tokens) if self.with_dense else None
+            c = self._config
+            clip = load_image_text_encoder(c.clip, device) if self._with_clip else None
+            dense = load_dense_encoder(c.dense, device, c.dense_tokens) if self._with_dense else None
             self._models = clip, dense
         return self._models
 
     def start(self, device: str) -> Callable[[_Task], str | None]:
         """As `workers.Maker.start`. The work returns why a photo can't be used, or None."""
-        clip, dense = self.models(device)
-        photos = _ReadAhead(WorkingPhotos(self.store).read, self.tasks)
+        self.models(device)
+        photos = _ReadAhead(WorkingPhotos(self._store).read, self._tasks)
 
         def work(task: _Task) -> str | None:
             try:
@@ -279,94 +270,88 @@ class _Maker:
             except UserError as error:
                 return str(error)
             image = pixels.to(device).float() / 255  # a quarter of the bytes travel to a GPU
-            _encode(task, image, clip, dense, self.regions, self.config.crop_batch, self.store)
+            for kind, settings in task.missing.items():
+                self._store.write(kind, task.photo.name, self._made(kind, task, image), settings)
             return None
 
         return work
 
+    def _made(self, kind: str, task: _Task, image: Float[Tensor, "h w 3"]) -> dict[str, Tensor]:
+        """The tensors of an entry."""
+        assert self._models is not None
+        clip, dense = self._models
+        if kind == REGIONS:
+            assert self._regions is not None
+            return {"labels": stored_labels(self._regions.labels(task.photo, image))}
+        if kind == DENSE:
+            assert dense is not None
+            return {"features": dense.encode(image)}
+        assert clip is not None
+        lit, batch = clip.in_known_light(image), self._config.crop_batch
+        if task.grids:
+            tokens, windows = clip.crop_size // clip.patch_size, max(batch // _PATCHES_PER_CROP, 1)
+            features = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
+            return {"features": features, "valid": torch.ones_like(features[..., 0])}
+        crops = task.crops
+        target = build_clip_target(lit, crops.sides, clip.encode_images, clip.crop_size, batch, crops.steps)
+        return {"features": target.features, "valid": target.valid}
 
-def _encode(
-    task: _Task,
-    image: Float[Tensor, "h w 3"],
-    clip: ImageTextEncoder | None,
-    dense: DenseEncoder | None,
-    regions: RegionSource | None,
-    crop_batch: int,
-    store: FeatureStore,
-) -> None:
-    if task.clip and clip and task.grids:
-        tokens, windows = clip.crop_size // clip.patch_size, max(crop_batch // _PATCHES_PER_CROP, 1)
-        lit = clip.in_known_light(image)
-        features = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
-        tensors = {"features": features, "valid": torch.ones_like(features[..., 0])}
-        store.write(task.clip_kind, task.photo.name, tensors, task.clip)
-    elif task.clip and clip:
-        target = build_clip_target(
-            clip.in_known_light(image),
-            task.crops.sides,
-            clip.encode_images,
-            clip.crop_size,
-            crop_batch,
-            task.crops.steps,
-        )
-        tensors = {"features": target.features, "valid": target.valid}
-        store.write(task.clip_kind, task.photo.name, tensors, task.clip)
-    if task.dense and dense:
-        store.write(DENSE, task.photo.name, {"features": dense.encode(image)}, task.dense)
-    if task.regions and regions:
-        labels = stored_labels(regions.labels(task.photo, image))
-        store.write(REGIONS, task.photo.name, {"labels": labels}, task.regions)
-
-
-def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: DenseEncoder | None) -> int:
-    """Size of the entries to make: two bytes per number."""
-    total = 0
-    for task in tasks:
-        if task.clip and clip:
-            grid = task.grids[-1] if task.grids else task.crops.grid(task.photo.height, task.photo.width)
-            total += 2 * math.prod(grid) * (clip.dim + 1)
-        if task.dense and dense:
-            total += 2 * dense.tokens**2 * dense.dim
-        if task.regions:
-            total += 2 * math.prod(label_size(task.photo.height, task.photo.width))
-    return total
-
-
-def _announce_duration(
-    missing: list[_Task],
-    clip: ImageTextEncoder,
-    dense: DenseEncoder | None,
-    config: PreparationConfig,
-    device: torch.device,
-) -> None:
-    """Log how many crops are encoded, and for how long, by the time that noise takes."""
-    tasks = [task for task in missing if task.clip and not task.grids]
-    crops = sum(task.crops.count(task.photo.height, task.photo.width) for task in tasks)
-    if crops < _ANNOUNCED_CROPS:
-        return
-    noise = torch.rand(3, clip.crop_size, clip.crop_size, device=device)
-    of_crop = _seconds_each(
-        lambda batch: clip.encode_images(noise.expand(batch, -1, -1, -1)), config.crop_batch
-    )
-    rest = 0.0
-    if dense is not None:
-        encoder, photo = dense, noise.permute(1, 2, 0)
-        rest = sum(task.dense is not None for task in tasks) * _seconds_each(
-            lambda _: encoder.encode(photo), 1
-        )
-    takes, faster = ((n * of_crop + rest) / config.workers for n in (crops, sum(task.fast for task in tasks)))
-    quality = spoken("--pipeline.datamanager.quality")
-    hint = "" if faster > 0.9 * takes else f"; {quality} fast: {_duration(faster)}"
-    say(f"{len(tasks):,} photos, {crops:,} crops with {config.clip}: about {_duration(takes)}{hint}")
-    if device.type == "cpu" and takes > _LONG_S:
-        remedies = ["a GPU (some hundred times)", *([f"{quality} fast"] if hint else [])]
-        if config.clip != BUILTIN:
-            remedies.append(f"{spoken(CLIP_OPTION)} builtin if its words suffice")
-        remedies.append("fewer photos")
+    def announce(self, photos: int, device: str) -> None:
+        """Log the work ahead, and the disk, memory and time it needs. Raises UserError if the disk is too
+        small."""
+        (clip, dense), store, config, tasks = self.models(device), self._store, self._config, self._tasks
+        needed, crop_size = sum(task.bytes(clip, dense) for task in tasks), clip.crop_size if clip else 0
+        store.make_folder()
+        free = shutil.disk_usage(store.root).free
+        if needed > free:
+            raise UserError(
+                f"the targets of {len(tasks)} photos need {_gigabytes(needed)} in {store.root}, and "
+                f"{_gigabytes(free)} are free: free some space, or use a larger smallest crop "
+                f"(scale range) or fewer dense tokens"
+            )
+        # Per process: the largest photo in float32, thrice (as read, padded, in windows), and a batch of
+        # crops with the first layers' activations, a dozen times its size.
+        largest = max(task.photo.width * task.photo.height for task in tasks)
+        memory = config.workers * 3 * 4 * (3 * largest + 12 * config.crop_batch * crop_size**2)
         say(
-            f"That is long, since this runs on the CPU. What shortens it: {', '.join(remedies)}. It can be "
-            "stopped at any time and goes on where it was"
+            f"preparing {len(tasks)} photos ({photos - len(tasks)} of {photos} are ready): "
+            f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free",
+            f"memory beside the encoders: about {_gigabytes(memory)}"
+            + (f" in {config.workers} processes" if config.workers > 1 else "")
+            + ", whatever the number of photos",
         )
+        if clip:
+            self._announce_duration(clip, dense, torch.device(device))
+
+    def _announce_duration(
+        self, clip: ImageTextEncoder, dense: DenseEncoder | None, device: torch.device
+    ) -> None:
+        """Log how many crops are encoded, and for how long, by the time that noise takes."""
+        config, tasks = self._config, [task for task in self._tasks if task.clip and not task.grids]
+        crops = sum(task.count for task in tasks)
+        if crops < _ANNOUNCED_CROPS:
+            return
+        noise, rest = torch.rand(3, clip.crop_size, clip.crop_size, device=device), 0.0
+        of_crop = _seconds_each(
+            lambda batch: clip.encode_images(noise.expand(batch, -1, -1, -1)), config.crop_batch
+        )
+        if dense is not None:
+            of_photo = _seconds_each(lambda _: dense.encode(noise.permute(1, 2, 0)), 1)
+            rest = of_photo * sum(DENSE in task.missing for task in tasks)
+        fast = sum(task.fast for task in tasks)
+        takes, faster = ((n * of_crop + rest) / config.workers for n in (crops, fast))
+        quality = spoken("--pipeline.datamanager.quality")
+        hint = "" if faster > 0.9 * takes else f"; {quality} fast: {roughly(faster)}"
+        say(f"{len(tasks):,} photos, {crops:,} crops with {config.clip}: {roughly(takes)}{hint}")
+        if device.type == "cpu" and takes > _LONG_S:
+            remedies = ["a GPU (some hundred times)", *([f"{quality} fast"] if hint else [])]
+            if config.clip != BUILTIN:
+                remedies.append(f"{spoken(CLIP_OPTION)} builtin if its words suffice")
+            say(
+                "That is long, since this runs on the CPU. What shortens it: "
+                f"{', '.join([*remedies, 'fewer photos'])}. It can be stopped at any time and goes on where "
+                "it was"
+            )
 
 
 def _seconds_each(work: Callable[[int], Tensor], most: int) -> float:
@@ -383,54 +368,6 @@ def _seconds_each(work: Callable[[int], Tensor], most: int) -> float:
         if size == most or taken > _MEASURED_S:
             return seconds / size
         size = min(4 * size, most)
-
-
-def _duration(seconds: float) -> str:
-    """A duration to two digits at most."""
-    if seconds < 1.5:
-        return "a second"
-    if seconds < 90:
-        return f"{round(seconds)} seconds"
-    return f"{round(seconds / 60)} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"
-
-
-def _announce(
-    missing: list[_Task],
-    photos: int,
-    clip: ImageTextEncoder | None,
-    dense: DenseEncoder | None,
-    config: PreparationConfig,
-    store: FeatureStore,
-) -> None:
-    """Log the work ahead, and the disk and memory it needs. Raises UserError if the disk is too small."""
-    needed, crop_size = _bytes_needed(missing, clip, dense), clip.crop_size if clip else 0
-    store.make_folder()
-    free = shutil.disk_usage(store.root).free
-    if needed > free:
-        raise UserError(
-            f"the targets of {len(missing)} photos need {_gigabytes(needed)} in {store.root}, and "
-            f"{_gigabytes(free)} are free: free some space, or use a larger smallest crop "
-            f"(scale range) or fewer dense tokens"
-        )
-    say(
-        f"preparing {len(missing)} photos ({photos - len(missing)} of {photos} are ready): "
-        f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free"
-    )
-    memory = config.workers * _memory_needed(
-        [task.photo for task in missing], config.crop_batch * crop_size**2
-    )
-    say(
-        f"memory beside the encoders: about {_gigabytes(memory)}"
-        + (f" in {config.workers} processes" if config.workers > 1 else "")
-        + ", whatever the number of photos"
-    )
-
-
-def _memory_needed(photos: Sequence[Photo], crop_pixels: int) -> int:
-    """Approximate, per process: the largest photo in float32, thrice (as read, padded, in windows), and a
-    batch of crops with the first layers' activations, a dozen times its size."""
-    largest = max(photo.width * photo.height for photo in photos)
-    return 3 * 4 * (3 * largest + 12 * crop_pixels)
 
 
 def _gigabytes(size: int) -> str:

@@ -88,27 +88,44 @@ class FelzenszwalbRegions:
         return torch.from_numpy(felzenszwalb(_shrunk(image, LONGER_SIDE).numpy(), **_FELZENSZWALB))
 
 
-class SamRegions:
-    """Regions from SAM's automatic masks; the network is loaded when the first photo needs it."""
+class _MaskRegions:
+    """Regions from a network's masks, which may overlap. It is loaded when the first photo needs it."""
 
-    def __init__(self, files: ModelFiles, level: RegionLevel, device: torch.device | str) -> None:
-        self._files, self._level, self._device = files, level, device
+    def __init__(self, level: RegionLevel, device: torch.device | str, **made_with: Any) -> None:
+        self._level, self._device = level, device
+        self._made_with = {**made_with, "level": level, "rule": _RULE}
 
     def settings(self, photo: Photo) -> dict[str, Any]:
         """As `RegionSource.settings`."""
-        return {"regions": "sam", "model": self._files.identity, "level": self._level, "rule": _RULE}
+        return self._made_with
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
         """As `RegionSource.labels`."""
-        small = _bytes(_shrunk(image, _SAM_SIDE))
-        return _combined(self._sam.masks(small), small, self._level)
+        small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
+        size = label_size(*small.shape[:2])
+        masks = [_nearest(mask, size) for mask in self._masks(small)]
+        return label_map(torch.stack(masks), self._level) if masks else torch.full(size, -1)
+
+    def _masks(self, image: UInt8[Tensor, "h w 3"]) -> Sequence[Bool[Tensor, "h w"]]:
+        raise NotImplementedError
+
+
+class SamRegions(_MaskRegions):
+    """Regions from SAM's automatic masks."""
+
+    def __init__(self, files: ModelFiles, level: RegionLevel, device: torch.device | str) -> None:
+        super().__init__(level, device, regions="sam", model=files.identity)
+        self._files = files
+
+    def _masks(self, image: UInt8[Tensor, "h w 3"]) -> Sequence[Bool[Tensor, "h w"]]:
+        return self._sam.masks(image)
 
     @cached_property
     def _sam(self) -> AutomaticSam:
         return AutomaticSam(self._files, self._device)
 
 
-class TextRegions:
+class TextRegions(_MaskRegions):
     """Regions from SAM 3: one for each instance of what the prompts name. Raises UserError for another
     model."""
 
@@ -119,18 +136,11 @@ class TextRegions:
             raise UserError(
                 f"regions text needs a SAM 3, and {files.words.name} is none: {TEXT_OPTION} facebook/sam3"
             )
-        self._files, self._prompts, self._level, self._device = files, sorted(prompts), level, device
+        self._files, self._prompts = files, sorted(prompts)
+        super().__init__(level, device, regions="text", prompts=self._prompts, model=files.identity)
 
-    def settings(self, photo: Photo) -> dict[str, Any]:
-        """As `RegionSource.settings`."""
-        made_with = {"prompts": self._prompts, "model": self._files.identity, "level": self._level}
-        return {"regions": "text", **made_with, "rule": _RULE}
-
-    def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
-        """As `RegionSource.labels`."""
-        small = _bytes(_shrunk(image, _SAM_SIDE))
-        found = self._sam.instances(small, self._prompts)
-        return _combined([mask for masks, _ in found for mask in masks], small, self._level)
+    def _masks(self, image: UInt8[Tensor, "h w 3"]) -> Sequence[Bool[Tensor, "h w"]]:
+        return [mask for masks, _ in self._sam.instances(image, self._prompts) for mask in masks]
 
     @cached_property
     def _sam(self) -> Sam3:
@@ -156,15 +166,6 @@ class FolderRegions:
         path = companion(self._folder, photo.name, LABEL_SUFFIXES)
         assert path is not None, "settings() found it"
         return photo.undistort_labels(_numbered(_read_labels(path, photo.name)))
-
-
-def _combined(
-    masks: Sequence[Bool[Tensor, "h w"]], image: UInt8[Tensor, "h w 3"], level: RegionLevel
-) -> Int[Tensor, "hl wl"]:
-    """Labels of an image at the stored size, from its masks."""
-    size = label_size(*image.shape[:2])
-    small = [_nearest(mask, size) for mask in masks]
-    return label_map(torch.stack(small), level) if small else torch.full(size, -1)
 
 
 def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "h w"]:
@@ -228,7 +229,3 @@ def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
 def _shrunk(image: Float[Tensor, "h w 3"], longer_side: int) -> Float[Tensor, "hs ws 3"]:
     """The image on the CPU, averaged down to at most `longer_side` pixels."""
     return resize(image, fitted_size(image, longer_side)).contiguous().clamp(0, 1).cpu()
-
-
-def _bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Tensor, "h w 3"]:
-    return (image * 255).round().to(torch.uint8)

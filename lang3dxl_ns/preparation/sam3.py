@@ -16,7 +16,7 @@ from lang3dxl_ns.preparation.model_files import ModelFiles, load_processor, load
 MODEL_TYPES = ("sam3", "sam3_video")
 """In its configuration: published checkpoints hold the detector inside a video model."""
 _LEAST_SCORE = 0.5
-"""Of an instance, and of its mask at a pixel."""
+"""Lowest score of an instance, and of its mask at a pixel."""
 
 
 class Sam3:

@@ -80,19 +80,14 @@ class FeatureStore:
         try:
             yield
         except OSError as error:
-            if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise UserError(
-                    f"{self.root} can't be written to ({error.strerror}): keep the targets elsewhere with "
-                    "--pipeline.datamanager.cache-dir DIR (`lang3dxl prepare`: --cache-dir DIR)"
-                ) from error
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise UserError(
-                    f"{self.root} can't be used ({error.strerror or error}): name a folder with "
-                    "--pipeline.datamanager.cache-dir DIR (`lang3dxl prepare`: --cache-dir DIR)"
+                    f"no space left in {self.root} while writing {what}: free some space and run the same "
+                    "command again; what was already written is kept"
                 ) from error
             raise UserError(
-                f"no space left in {self.root} while writing {what}: free some space and run the "
-                "same command again; what was already written is kept"
+                f"{self.root} can't be written to ({error.strerror or error}): keep the targets elsewhere "
+                "with --pipeline.datamanager.cache-dir DIR (`lang3dxl prepare`: --cache-dir DIR)"
             ) from error
 
     def read(self, kind: str, name: str) -> dict[str, Tensor]:
@@ -100,8 +95,7 @@ class FeatureStore:
 
         Raises UserError if the entry is missing or damaged.
         """
-        path = self.path(kind, name)
-        with _opened(path, f"{kind} of {name}") as file:
+        with _opened(self.path(kind, name), f"{kind} of {name}") as file:
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 
     def shapes(self, kind: str, name: str) -> dict[str, tuple[int, ...]]:
@@ -145,23 +139,22 @@ class FeatureStore:
         """
         path = self.root / _HASHES
         known = _read_json(path)
-        found: dict[str, Any] = {}
 
-        def look(photo: Photo) -> str | UserError:
+        def look(photo: Photo) -> tuple[str | UserError, list[Any] | None]:
             try:
-                stamp = photo.stamp()
-                recorded = known.get(photo.name)
+                stamp, recorded = photo.stamp(), known.get(photo.name)
                 if not (isinstance(recorded, list) and len(recorded) == 2 and recorded[0] == stamp):
                     recorded = [stamp, photo.content_hash()]
-                found[photo.name] = recorded
-                return recorded[1]
+                return recorded[1], recorded
             except UserError as error:
-                return error
+                return error, None
 
+        hashes, found = {}, {}
         with ThreadPoolExecutor(_READERS) as pool, progress("checking photos", len(photos)) as advance:
-            hashes = {}
-            for photo, result in zip(photos, pool.map(look, photos), strict=True):
+            for photo, (result, recorded) in zip(photos, pool.map(look, photos), strict=True):
                 hashes[photo.name] = result
+                if recorded:
+                    found[photo.name] = recorded
                 advance()
         if any(known.get(name) != entry for name, entry in found.items()):
             with contextlib.suppress(OSError):  # a store that can't be written to can still be read

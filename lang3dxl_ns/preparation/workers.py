@@ -9,11 +9,12 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import torch
 
@@ -119,19 +120,20 @@ def _device(device: str, number: int, count: int) -> str:
 # --- a Ray cluster -----------------------------------------------------------------------------------------
 
 
-class _Actor(Generic[Item, Result]):
+class _Actor:
     """A worker on a cluster. If it dies, Ray starts another and repeats its item."""
 
-    def __init__(self, maker: Maker[Item, Result], device: str) -> None:
+    def __init__(self, maker: Maker, device: str) -> None:
         self._work = maker.start(device)
 
-    def do(self, item: Item) -> Result:
-        return self._work(item)
+    def do(self, item: Any) -> tuple[Any, Any]:
+        return item, self._work(item)
 
 
 def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[Item], device: str):
     try:
         import ray
+        from ray.util import ActorPool
     except ImportError as error:
         raise UserError("--engine ray needs Ray: pip install 'lang3dxl-ns[ray]'") from error
     started = not ray.is_initialized()
@@ -141,16 +143,8 @@ def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[It
         resources = {"num_gpus": 1} if device.startswith("cuda") else {"num_cpus": 1}
         remote: Any = ray.remote(_Actor)
         actor = remote.options(max_restarts=-1, max_task_retries=-1, **resources)
-        idle = [actor.remote(maker, device) for _ in range(workers.count)]
-        waiting, busy = list(reversed(items)), dict[Any, Any]()
-        while waiting or busy:
-            while waiting and idle:
-                item, worker = waiting.pop(), idle.pop()
-                busy[worker.do.remote(item)] = item, worker
-            (done,), _ = ray.wait(list(busy))
-            item, worker = busy.pop(done)
-            idle.append(worker)
-            yield item, ray.get(done)
+        pool: Any = ActorPool([actor.remote(maker, device) for _ in range(workers.count)])
+        yield from pool.map_unordered(lambda worker, item: worker.do.remote(item), items)
     finally:
         if started:
             ray.shutdown()
@@ -159,21 +153,19 @@ def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[It
 def _within(seconds: float, job: Callable[[], Any]) -> None:
     """Run a job with a time limit. Raises TimeoutError when it is reached (the job stays in a daemon
     thread), otherwise what the job raises."""
-    trouble: list[BaseException] = []
+    ended: Future[None] = Future()
 
     def run() -> None:
         try:
-            job()
-        except BaseException as error:  # raised below, in the waiting thread
-            trouble.append(error)
+            ended.set_result(job())
+        except BaseException as error:
+            ended.set_exception(error)  # raised below, in the waiting thread
 
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    thread.join(seconds)
-    if thread.is_alive():
-        raise TimeoutError(f"no answer within {seconds:.0f} s")
-    if trouble:
-        raise trouble[0]
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        ended.result(seconds)
+    except FutureTimeoutError as error:
+        raise TimeoutError(f"no answer within {seconds:.0f} s") from error
 
 
 def _connect(ray: Any, workers: Workers, attempts: int = 2) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +22,7 @@ from lang3dxl_ns.scene.photo import Photo
 PHOTOS, PHOTO_MASKS = "photos", "photo_masks"
 """Kinds of entries in the store."""
 _QUALITY = 95
-"""Of JPEG: 46 dB, a tenth of the bytes of the pixels, 12 ms to decode 1,600 × 1,200 of them on one core."""
+"""JPEG quality: 46 dB, a tenth of the bytes, 12 ms to decode 1,600 × 1,200 pixels on one core."""
 _SMALL = 1_000_000
 """Pixels of a file that is decoded as fast as a copy."""
 _RULE = 1
@@ -45,15 +43,14 @@ class WorkingPhotos:
         """As `Photo.read_uint8`; raises like it, also if a copy is there but the file is gone."""
         path = self._store.path(PHOTOS, photo.name).with_suffix(".jpg")
         made_with = _made_with(photo, photo.path)
-        image = _kept(path, made_with, lambda copy: copy.info.get("comment"), "RGB")
+        image = kept_picture(path, made_with, "RGB")
         if image is None:
             if not _is_slow(photo, photo.path):
                 return photo.read_uint8(scale)
-            image = Image.fromarray(photo.read_uint8().numpy())
-            content = io.BytesIO()
+            image, content = Image.fromarray(photo.read_uint8().numpy()), io.BytesIO()
             image.save(content, "JPEG", quality=_QUALITY, comment=made_with)
-            self._keep(path, content)
-        return torch.from_numpy(np.array(_resized(image, photo, scale, Image.Resampling.BILINEAR)))
+            self._keep(path, content.getvalue())
+        return _resized(image, photo, scale, Image.Resampling.BILINEAR)
 
     def mask(self, photo: Photo, scale: float = 1.0) -> Bool[Tensor, "h w"] | None:
         """As `Photo.read_mask`; raises like it."""
@@ -62,31 +59,57 @@ class WorkingPhotos:
             return photo.read_mask(scale)
         path = self._store.path(PHOTO_MASKS, photo.name).with_suffix(".png")
         made_with = _made_with(photo, source)
-        image = _kept(path, made_with, lambda copy: copy.info.get("settings"), "1")
+        image = kept_picture(path, made_with, "1")
         if image is None:
             mask = photo.read_mask()
             assert mask is not None
             image = Image.fromarray(mask.numpy())
-            text, content = PngImagePlugin.PngInfo(), io.BytesIO()
-            text.add_text("settings", made_with)
-            image.save(content, "PNG", pnginfo=text)
-            self._keep(path, content)
-        return torch.from_numpy(np.array(_resized(image, photo, scale, Image.Resampling.NEAREST)))
+            self._keep(path, mask_png(mask, made_with))
+        return _resized(image, photo, scale, Image.Resampling.NEAREST)
 
-    def _keep(self, path: Path, content: io.BytesIO) -> None:
+    def _keep(self, path: Path, content: bytes) -> None:
         """Write a copy; without room or permission, the photo is decoded anew each time."""
         try:
-            self._store.write_bytes(path, content.getvalue(), path.name)
+            self._store.write_bytes(path, content, path.name)
         except UserError:
             return
 
 
+def mask_png(mask: Bool[Tensor, "h w"], made_with: str) -> bytes:
+    """A black-and-white PNG that contains what made it, so that no mask is ever without it."""
+    text, content = PngImagePlugin.PngInfo(), io.BytesIO()
+    text.add_text("settings", made_with)
+    Image.fromarray(mask.numpy()).save(content, "PNG", pnginfo=text)
+    return content.getvalue()
+
+
+def kept_picture(path: Path, made_with: str, mode: str | None = None) -> Image.Image | None:
+    """A `mask_png`, or a JPEG with such a comment, if it is whole and was made like this.
+
+    mode: of the pixels; None checks the file and decodes nothing.
+    """
+    if not path.is_file():
+        return None
+    try:
+        with open_picture(path) as copy:
+            written = copy.info.get("settings", copy.info.get("comment"))
+            written = written.decode(errors="replace") if isinstance(written, bytes) else written
+            if written != made_with:
+                return None
+            if mode is None:
+                copy.verify()  # reads all of it
+                return copy
+            copy.load()
+            return copy if copy.mode == mode else copy.convert(mode)
+    except (OSError, NoPictureError):
+        return None
+
+
 def _made_with(photo: Photo, source: Path) -> str:
     """Everything that determines a copy. Raises UserError if the source is missing."""
-    lens = photo.lens
-    camera = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion, lens.fisheye] if lens.distorts else None
     size = [photo.width, photo.height, photo.quarter_turns]
-    return json.dumps({"file": photo.stamp(source), "size": size, "undistorted": camera, "rule": _RULE})
+    made_with = {"file": photo.stamp(source), "size": size, "undistorted": photo.lens.undistortion}
+    return json.dumps({**made_with, "rule": _RULE})
 
 
 def _is_slow(photo: Photo, source: Path) -> bool:
@@ -100,22 +123,6 @@ def _is_slow(photo: Photo, source: Path) -> bool:
     return pixels > _SMALL and (shrinks or photo.lens.distorts or photo.quarter_turns > 0)
 
 
-def _kept(path: Path, made_with: str, note: Callable[[Image.Image], Any], mode: str) -> Image.Image | None:
-    """A copy's pixels, if it is whole and was made like this."""
-    if not path.is_file():
-        return None
-    try:
-        with open_picture(path) as copy:
-            written = note(copy)
-            written = written.decode(errors="replace") if isinstance(written, bytes) else written
-            if written != made_with:
-                return None
-            copy.load()
-            return copy if copy.mode == mode else copy.convert(mode)
-    except (OSError, NoPictureError):
-        return None
-
-
-def _resized(image: Image.Image, photo: Photo, scale: float, method: Image.Resampling) -> Image.Image:
+def _resized(image: Image.Image, photo: Photo, scale: float, method: Image.Resampling) -> Tensor:
     size = scaled_size(photo.width, photo.height, scale)
-    return image if image.size == size else image.resize(size, method)
+    return torch.from_numpy(np.array(image if image.size == size else image.resize(size, method)))

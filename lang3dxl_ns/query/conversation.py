@@ -187,6 +187,6 @@ def plain(text: str) -> str:
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
-def shortened(text: str, most: int = 40) -> str:
-    """A text shortened to fit on a button."""
-    return text if len(text) <= most else text[: most - 1] + "…"
+def shortened(text: str) -> str:
+    """A text of at most 40 characters, to fit on a button."""
+    return text if len(text) <= 40 else text[:39] + "…"

@@ -14,6 +14,9 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 
+_OPACITY = 0.7
+"""Share of the heat in the color of a pixel that matches."""
+
 
 def heat(relevancy: Float[Tensor, "h w"], threshold: float = 0.5) -> Float[Tensor, "h w"]:
     """Relevancy above the threshold stretched to 0…1, which the map's highest is."""
@@ -31,7 +34,7 @@ def overlay(
     relevancy: Float[Tensor, "h w"],
     mask: Bool[Tensor, "h w"],
     threshold: float = 0.5,
-    opacity: float = 0.7,
+    opacity: float = _OPACITY,
     color_map: str = "turbo",
 ) -> Float[Tensor, "h w 3"]:
     """The heat map over matching pixels, the image elsewhere.
@@ -85,13 +88,12 @@ def tinted(
     maps: Float[Tensor, "q h w"],
     masks: Bool[Tensor, "q h w"],
     threshold: float,
-    opacity: float = 0.7,
 ) -> Float[Tensor, "h w 3"]:
     """The image with each prompt's matches in its own color: that of the most relevant where several match,
     stronger with relevancy above the threshold."""
     best, which = strongest(maps, masks)
     colors = torch.tensor([PROMPT_COLORS[i % len(PROMPT_COLORS)] for i in range(len(maps))]).to(image) / 255
-    strength = opacity * masks.any(0) * (0.5 + 0.5 * heat(best, threshold))
+    strength = _OPACITY * masks.any(0) * (0.5 + 0.5 * heat(best, threshold))
     return torch.lerp(image, colors[which], strength[..., None].to(image))
 
 

@@ -122,7 +122,7 @@ class Match:
         return path
 
 
-def together(matches: Sequence[Match], opacity: float = 0.7) -> UInt8[Array, "h+legend w 3"]:
+def together(matches: Sequence[Match]) -> UInt8[Array, "h+legend w 3"]:
     """Several prompts in one view: each in a color of its own, the strongest where they overlap, and a legend
     below. Raises UserError if there is none, or they are of different views."""
     if not matches or any(match.view.pixels.shape != matches[0].view.pixels.shape for match in matches):
@@ -130,7 +130,7 @@ def together(matches: Sequence[Match], opacity: float = 0.7) -> UInt8[Array, "h+
     maps = torch.stack([torch.from_numpy(match.relevancy) for match in matches])
     masks = torch.stack([torch.from_numpy(match.mask) for match in matches])
     lowest = min(match.threshold for match in matches)
-    picture = as_bytes(tinted(matches[0].view.rendering.rgb.cpu(), maps, masks, lowest, opacity))
+    picture = as_bytes(tinted(matches[0].view.rendering.rgb.cpu(), maps, masks, lowest))
     return with_legend(picture, [match.prompt.text for match in matches], PROMPT_COLORS)
 
 

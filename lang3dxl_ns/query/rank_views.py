@@ -29,6 +29,8 @@ class ViewRank:
     """Share of the view that matches."""
     peak: float
     """Mean relevancy of the most relevant thousandth of the view, 0…1."""
+    shown: bool
+    """Whether the match fills as much as a pixel."""
     rank: float
     """0…1: closeness of the peak to the scene's highest, times size, times centeredness."""
 
@@ -39,7 +41,8 @@ def rank_views(
     scores: Float[Tensor, " n"],
     threshold: float,
 ) -> dict[str, ViewRank]:
-    """The rank of every view, from the pixels that Gaussians fill in it (hidden ones fill none).
+    """The rank of every view, from the pixels that Gaussians fill in it (hidden ones fill none); those that
+    show the match first, best first.
 
     The peak comes first: only Gaussians half-way or more from the threshold to the highest peak of all views
     count as the match, so that four lukewarm windows don't outrank the one rose window. Where no peak
@@ -63,7 +66,11 @@ def rank_views(
         rows.append(torch.stack([((values > threshold) * shares).sum(), size * centered]))
     areas, fitness = torch.stack(rows).unbind(1)
     figures = torch.stack([areas, peaks, closeness * fitness], dim=1).tolist()
-    return {name: ViewRank(*row) for name, row in zip(views, figures, strict=True)}
+    ranks = {
+        name: ViewRank(area, peak, area * view.size >= 1, rank)
+        for (name, view), (area, peak, rank) in zip(views.items(), figures, strict=True)
+    }
+    return dict(sorted(ranks.items(), key=lambda item: (item[1].shown, item[1].rank), reverse=True))
 
 
 def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, ""]:

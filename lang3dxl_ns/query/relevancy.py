@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 import torch.nn.functional as F
@@ -12,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.memory import with_less_memory
+from lang3dxl_ns.query.teach import TaughtWord
 
 CANONICAL = ("object", "things", "stuff", "texture")
 """Phrases that fit anything (LERF): a prompt matches where it fits better than all of them."""
@@ -27,28 +27,12 @@ _CPU_CHUNK = 8192
 """Codes decoded at a time on a CPU."""
 
 
-class Learned(Protocol):
-    """A word learned from examples: a linear score of unit features, and a share of its text."""
-
-    @property
-    def vector(self) -> Float[Tensor, " c"]:
-        """Of any length."""
-
-    @property
-    def bias(self) -> float:
-        """Margin of a feature that is orthogonal to the vector."""
-
-    @property
-    def text(self) -> float:
-        """Weight of the text's own margin, from 0."""
-
-
 @dataclass(frozen=True)
 class Probe:
     """A linear score of features, learned from examples, that joins a prompt's own margin."""
 
     row: int
-    """Of its direction among the vectors."""
+    """Place of its direction among the vectors."""
     length: float
     """Margin per unit of the cosine with that direction."""
     bias: float
@@ -100,7 +84,7 @@ class Queries:
             rows += len(extra)
         return cls(F.normalize(torch.cat(blocks), dim=-1), tuple(positive), tuple(negative))
 
-    def taught(self, words: Sequence[Learned | None]) -> Queries:
+    def taught(self, words: Sequence[TaughtWord | None]) -> Queries:
         """The same prompts; those with a learned word have the margin vector · feature + bias + text · (their
         own margin).
 

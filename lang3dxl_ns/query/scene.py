@@ -43,8 +43,6 @@ from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, resized
 
-_LEAST_PIXELS = 1.0
-"""Pixels of a small view that a match must fill."""
 _ROWS = 65_536
 """Gaussians decoded at a time."""
 NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
@@ -249,8 +247,7 @@ class Scene(ViewedScene):
         """
         if not self.visible:
             raise UserError("this scene has no training photos to choose from: name a photo or a camera")
-        rows = range(len(question.prompts))
-        return [self._ranked(question, row)[0].name for row in rows]
+        return [self._views(question, row)[1][0].name for row in range(len(question.prompts))]
 
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
@@ -342,15 +339,14 @@ class Scene(ViewedScene):
         feature = self._feature_at(self.camera(place, size), x, y)
         if feature is None:
             return []
-        queries = self.text.plain_queries(words).to(self.device)
+        queries, negatives = self.text.plain_queries(words).to(self.device), self.text.config.negatives
         cosines = queries.cosines(feature)
-        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature)
-        negatives = self.text.config.negatives
-        clear = any(score > CLEAR for word, score in zip(words, scores, strict=True) if word != "sky")
+        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature).tolist()
+        named = sorted(zip(words, scores, strict=True), key=lambda pair: pair[1], reverse=True)
+        clear = any(score > CLEAR for word, score in named if word != "sky")
         if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
             return []
-        best = scores.topk(max(min(most, len(words)), 0))
-        return [(words[int(i)], float(score)) for score, i in zip(best.values, best.indices, strict=True)]
+        return named[: max(most, 0)]
 
     def _feature_at(self, camera: Camera, x: float, y: float) -> Float[Tensor, " c"] | None:
         """What a pixel shows, in CLIP's space, of any length; None where too little of it has a meaning."""
@@ -486,24 +482,19 @@ class Scene(ViewedScene):
             raise UserError(f"{text!r} are {len(question.prompts)} prompts: ask for one at a time")
         return question
 
-    def _ranked(self, question: Question, row: int) -> list[Viewpoint]:
-        """All training views, those that show a prompt first; best first."""
+    def _views(self, question: Question, row: int) -> tuple[list[Viewpoint], list[Viewpoint]]:
+        """Training views that show a prompt, and all of them, best first."""
         ranks = rank_views(self.visible, self.splats.means, question.relevancy[row], question.thresholds[row])
-        views = [
+        everything = [
             Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
             for name, found in ranks.items()
         ]
-        return sorted(views, key=lambda view: (self._shows(view), view.rank), reverse=True)
-
-    def _shows(self, view: Viewpoint) -> bool:
-        """Whether the match fills as much as a pixel of the small view."""
-        return view.area * self.visible[view.name].size >= _LEAST_PIXELS
+        return [view for view in everything if ranks[view.name].shown], everything
 
     def _found(self, question: Question, row: int, most: int) -> Found:
         scores, threshold = question.relevancy[row], question.thresholds[row]
-        means, closest = self.splats.means, self._ranked(question, row)
-        views = list(filter(self._shows, closest))
-        box = strongest_match(means, scores, self.mass, threshold, self.gap) if views else None
+        views, closest = self._views(question, row)
+        box = strongest_match(self.splats.means, scores, self.mass, threshold, self.gap) if views else None
         relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
         prompt, doubt = question.prompts[row], question.doubts[row]
         return Found(prompt, views[:most], box, relevancy, matching, doubt, threshold, closest[:most])

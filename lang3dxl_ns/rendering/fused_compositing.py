@@ -4,16 +4,25 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
 from lang3dxl_ns.rendering.fused_plan import LOG2_E, make_plan
-from lang3dxl_ns.rendering.fused_tiles import CHANNELS_FROM, PIXELS, WAVE, backward_tiles, composite_tiles
+from lang3dxl_ns.rendering.fused_tiles import (
+    CHANNELS_FROM,
+    PIXELS,
+    WAVE,
+    Maps,
+    Trace,
+    backward_tiles,
+    composite_tiles,
+)
 
 PARTS_PER_THREAD = 8
 """Tiles may stop early, by an unknown amount: small parts spread the rest over the threads."""
@@ -55,62 +64,61 @@ class FusedCompositing(torch.autograd.Function):
         height: int,
         absgrad: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        positions = means2d.view(-1, 2)
         plan = make_plan(
-            positions, conics, variances, depths, opacities, channels, detached_channels, width, height
-        )
-        sizes = (channels.shape[1], detached_channels.shape[1], 1)
-        image, features, alpha = (channels.new_empty(height, width, size) for size in sizes)
-        rows = np.diff(plan.starts)
-        keep = any(ctx.needs_input_grad)
+            means2d.view(-1, 2), conics, variances, depths, opacities, channels, detached_channels, width,
+            height,
+        )  # fmt: skip
+        ctx.sizes = channels.shape[1], detached_channels.shape[1], 1
+        maps = tuple(channels.new_empty(height, width, size) for size in ctx.sizes)
+        rows, keep = np.diff(plan.starts), any(ctx.needs_input_grad)
         waves = -(-rows // WAVE) if keep else np.zeros_like(rows)
         wave_starts = np.concatenate([np.zeros(1, np.int64), np.cumsum(waves)])
         records = np.empty((wave_starts[-1], PIXELS), plan.splats.dtype)
-        ends = np.zeros(len(rows), np.int64)
-        shared = (
-            plan.splats, plan.table, plan.attached, plan.starts, plan.ranks, width, height,
-            image.numpy(), features.numpy(), alpha.numpy(), keep, wave_starts, records, ends,
-        )  # fmt: skip
+        trace = Trace(wave_starts, records, np.zeros(len(rows), np.int64))
+        shared = plan, Maps(*(part.numpy() for part in maps)), trace, keep
         in_threads(composite_tiles, [(tiles, *shared) for tiles in _parts(rows)])
         ctx.save_for_backward(means2d, conics, opacities)
         ctx.set_materialize_grads(False)
-        ctx.plan, ctx.wave_starts, ctx.records, ctx.ends = plan, wave_starts, records, ends
-        ctx.width, ctx.height, ctx.sizes, ctx.absgrad = width, height, sizes, absgrad
-        return image, features, alpha
+        ctx.plan, ctx.trace, ctx.absgrad = plan, trace, absgrad
+        return maps[0], maps[1], maps[2]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> Any:  # type: ignore[override]
         means2d, conics, opacities = ctx.saved_tensors
-        plan = ctx.plan
-        slopes = tuple(
-            opacities.new_zeros(ctx.height, ctx.width, size) if slope is None else slope.contiguous()
+        plan, positions = ctx.plan, means2d.view(-1, 2)
+        slopes = (
+            opacities.new_zeros(plan.height, plan.width, size) if slope is None else slope.contiguous()
             for slope, size in zip(upstream, ctx.sizes, strict=True)
         )
+        maps = Maps(*(slope.numpy() for slope in slopes))
         threads = torch.get_num_threads()
-        parts = _parts(ctx.ends)
+        parts = _parts(ctx.trace.ends)
         # Every thread has fixed tiles and its own sums, so that the result doesn't depend on their order.
         dealt = [np.concatenate(parts[k::threads]) for k in range(min(threads, len(parts)))]
         columns = CHANNELS_FROM + plan.table.shape[1]
         sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
-        shared = (
-            plan.splats, plan.table, plan.attached, plan.starts, plan.ranks, ctx.width, ctx.height,
-            *(slope.numpy() for slope in slopes), ctx.wave_starts, ctx.records, ctx.ends, ctx.absgrad,
-        )  # fmt: skip
+        shared = plan, maps, ctx.trace, ctx.absgrad
         in_threads(backward_tiles, [(tiles, *shared, sums[k]) for k, tiles in enumerate(dealt)])
-        found = [
-            torch.zeros_like(part) for part in (means2d.view(-1, 2), conics, opacities, means2d.view(-1, 2))
-        ]
+        found = [torch.zeros_like(part) for part in (positions, conics, opacities, positions)]
         found += [opacities.new_zeros(len(opacities), size) for size in ctx.sizes[:2]]
-        arrays = (
-            plan.order, conics.numpy(), opacities.numpy(), plan.attached, sums,
-            *(part.numpy() for part in found),
-        )  # fmt: skip
+        arrays = plan, conics.numpy(), opacities.numpy(), sums, _Gradients(*(g.numpy() for g in found))
         in_threads(_collect, [(*part, *arrays) for part in ranges(len(plan.order), least=4096)])
         position, conic, opacity, absolutes, channels, detached = found
         if ctx.absgrad:
             means2d.absgrad = absolutes.view_as(means2d)
         return position.view_as(means2d), conic, opacity, channels, detached, *[None] * 5
+
+
+class _Gradients(NamedTuple):
+    """Gradients by Gaussian."""
+
+    position: Float[np.ndarray, "n 2"]
+    conic: Float[np.ndarray, "n 3"]
+    opacity: Float[np.ndarray, " n"]
+    absolutes: Float[np.ndarray, "n 2"]
+    channels: Float[np.ndarray, "n c"]
+    detached: Float[np.ndarray, "n d"]
 
 
 def _parts(work: np.ndarray) -> list[np.ndarray]:
@@ -123,24 +131,21 @@ def _parts(work: np.ndarray) -> list[np.ndarray]:
 
 
 @kernel
-def _collect(
-    first, last, order, conics, opacities, attached, sums, position, conic, opacity, absolutes, channels,
-    detached,
-) -> None:  # fmt: skip
+def _collect(first, last, plan, conics, opacities, sums, found) -> None:
     """Gradients of a range of Gaussians, from the sums of all threads."""
     row = np.empty(sums.shape[2], sums.dtype)
     for rank in range(first, last):
         row[:] = sums[0, rank]
         for part in range(1, len(sums)):
             row += sums[part, rank]
-        g = order[rank]
+        g = plan.order[rank]
         a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
-        conic[g, 0], conic[g, 1], conic[g, 2] = -0.5 * row[0], -row[1], -0.5 * row[2]
+        found.conic[g, 0], found.conic[g, 1], found.conic[g, 2] = -0.5 * row[0], -row[1], -0.5 * row[2]
         # dx and dy point from the center to the pixel.
-        position[g, 0], position[g, 1] = a * row[3] + b * row[4], b * row[3] + c * row[4]
-        opacity[g] = row[5] / opacities[g]
-        absolutes[g, 0], absolutes[g, 1] = row[6] * (2 / LOG2_E), row[7] * (2 / LOG2_E)
-        for k in range(channels.shape[1]):
-            channels[g, k] = row[CHANNELS_FROM + k]
-        for k in range(detached.shape[1]):
-            detached[g, k] = row[CHANNELS_FROM + attached + k]
+        found.position[g, 0], found.position[g, 1] = a * row[3] + b * row[4], b * row[3] + c * row[4]
+        found.opacity[g] = row[5] / opacities[g]
+        found.absolutes[g, 0], found.absolutes[g, 1] = row[6] * (2 / LOG2_E), row[7] * (2 / LOG2_E)
+        for k in range(found.channels.shape[1]):
+            found.channels[g, k] = row[CHANNELS_FROM + k]
+        for k in range(found.detached.shape[1]):
+            found.detached[g, k] = row[CHANNELS_FROM + plan.attached + k]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,8 +23,7 @@ UNROLL = 4
 """Channels are composited four at a time, so their number is rounded up to a multiple of four."""
 
 
-@dataclass
-class Plan:
+class Plan(NamedTuple):
     """The visible Gaussians in depth order and, for each tile, those that may touch it."""
 
     order: Int[np.ndarray, " v"]
@@ -39,6 +38,8 @@ class Plan:
     """First row of each tile."""
     ranks: Int[np.ndarray, " rows"]
     """Positions in the depth order, ascending within a tile."""
+    width: int
+    height: int
 
 
 def make_plan(
@@ -67,11 +68,8 @@ def make_plan(
     attached = _rounded_up(channels.shape[1] + 1)
     splats = np.empty((count, SPLAT_COLUMNS), positions.dtype)
     table = np.empty((count, attached + _rounded_up(detached.shape[1])), positions.dtype)
-    arrays = (
-        order, positions, form, spread, opacity, attached_channels, detached_channels, attached,
-        splats, table,
-    )  # fmt: skip
-    in_threads(_pack, [(*part, *arrays) for part in ranges(count, least=4096)])
+    arrays = order, positions, form, spread, opacity, attached_channels, detached_channels, attached
+    in_threads(_pack, [(*part, *arrays, splats, table) for part in ranges(count, least=4096)])
 
     sizes = np.zeros(columns * rows + 1, np.int64)
     bands = ranges(rows)
@@ -79,7 +77,7 @@ def make_plan(
     starts = np.cumsum(sizes)
     ranks = np.empty(starts[-1], np.int32)
     in_threads(_fill_rows, [(order, boxes, columns, *band, starts, ranks) for band in bands])
-    return Plan(order, splats, table, attached, starts, ranks)
+    return Plan(order, splats, table, attached, starts, ranks, width, height)
 
 
 def depth_order(depths: Float[Tensor, " v"]) -> Int[Tensor, " v"]:

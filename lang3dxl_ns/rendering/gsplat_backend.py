@@ -51,12 +51,9 @@ def rasterize_with_gsplat(
         black = background.new_zeros(features.shape[1])
         feature_map, _, _ = _render(gaussians.detach(), camera.detach(), features, black, **settings)
     return Raster(
-        image=image,
-        features=feature_map,
-        alpha=alpha,
-        depth=maps[..., -1:] if render_depth else None,
+        image=image, features=feature_map, alpha=alpha, depth=maps[..., -1:] if render_depth else None,
         info={key: info[key] for key in _STRATEGY_KEYS},
-    )
+    )  # fmt: skip
 
 
 def _render(
@@ -71,17 +68,10 @@ def _render(
 
     device = gaussians.means.device
     maps, alpha, info = rasterization(
-        means=gaussians.means.float(),
-        quats=gaussians.quats.float(),
-        scales=gaussians.scales.float(),
-        opacities=gaussians.opacities.float(),
-        colors=channels.float(),
+        means=gaussians.means.float(), quats=gaussians.quats.float(), scales=gaussians.scales.float(),
+        opacities=gaussians.opacities.float(), colors=channels.float(),
         viewmats=to_device(camera.view_matrix, device).float()[None],
-        Ks=to_device(camera.intrinsics, device).float()[None],
-        width=camera.width,
-        height=camera.height,
-        backgrounds=background.float()[None],
-        packed=False,
-        **settings,
-    )
+        Ks=to_device(camera.intrinsics, device).float()[None], width=camera.width, height=camera.height,
+        backgrounds=background.float()[None], packed=False, **settings,
+    )  # fmt: skip
     return maps[0], alpha[0], info

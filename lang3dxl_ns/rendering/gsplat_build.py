@@ -271,7 +271,7 @@ def make_ready() -> None:
     """Load gsplat's kernels for this machine's GPUs, building them first if need be.
 
     Raises:
-        UserError: they can't be had; says what is missing and how to get it.
+        UserError: they are not available; says what is missing and how to get it.
     """
     import gsplat
     import torch

@@ -53,17 +53,17 @@ def rasterize(
         absgrad: the backward pass sets `info["means2d"].absgrad` for gsplat's densification.
         near: Gaussians with centers nearer than this are left out, world units.
         eps2d: variance added on screen, pixels².
-        backend: "auto" uses gsplat for tensors on a GPU, or torch if gsplat can't be had; on the CPU numba,
-            if it is installed and the environment variable LANG3DXL_CPU_KERNELS is not torch; otherwise
-            torch (which works on any device).
+        backend: "auto" uses gsplat for tensors on a GPU, or torch if gsplat is not available; on the CPU it
+            uses numba, if it is installed and the environment variable LANG3DXL_CPU_KERNELS is not torch;
+            otherwise torch (which works on any device).
 
     Gaussians with a NaN or infinite value, in their channels and features too, are not rendered and get no
     gradient: one would spoil every pixel of its tiles.
 
     Raises:
-        ValueError: sizes that don't fit together, a camera (on the CPU: to look at one on a GPU means to wait
-            for it) with a NaN or infinite value.
-        UserError: gsplat was asked for and can't be had.
+        ValueError: sizes that don't fit together, a camera with a NaN or infinite value (checked on the CPU
+            only; on a GPU the check would force a synchronization).
+        UserError: gsplat was requested but is not available.
     """
     _check_sizes(gaussians, channels, background, features)
     parts = camera.view_matrix, camera.intrinsics
@@ -104,7 +104,7 @@ def _without_broken(
         if features is not None:
             total = total + features.sum(1)
         sound = torch.isfinite(total)
-    # To ask a GPU means to wait for it, which takes longer than to clean everything.
+    # On a GPU, checking would force a synchronization, which costs more than cleaning unconditionally.
     if not sound.is_cuda and bool(sound.all()):
         return gaussians, channels, features
 

@@ -50,15 +50,10 @@ def render(
         ValueError: as `rasterize` does.
     """
     raster = rasterize(
-        splats.gaussians.seen_from(camera),
-        camera,
-        splats.colors(camera.position),
-        None if background is None else background.to(splats.means),
-        features=channels,
-        render_depth=True,
-        antialiased=splats.antialiased,
-        backend=backend,
-    )
+        splats.gaussians.seen_from(camera), camera, splats.colors(camera.position),
+        None if background is None else background.to(splats.means), features=channels, render_depth=True,
+        antialiased=splats.antialiased, backend=backend,
+    )  # fmt: skip
     assert raster.depth is not None
     return Rendering(
         camera, raster.image.clamp(0.0, 1.0), raster.alpha[..., 0], raster.depth[..., 0], raster.features

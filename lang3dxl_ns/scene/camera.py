@@ -48,6 +48,11 @@ class Lens:
         return self.fisheye or any(self.distortion)
 
     @property
+    def undistortion(self) -> list[float] | None:
+        """Everything that an undistortion depends on; None where there is none."""
+        return [self.fx, self.fy, self.cx, self.cy, *self.distortion, self.fisheye] if self.distorts else None
+
+    @property
     def matrix(self) -> Float[Tensor, "3 3"]:
         """Intrinsic matrix in float64, pixels."""
         rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]

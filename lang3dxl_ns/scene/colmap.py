@@ -147,15 +147,9 @@ def _tracked_photo(
 ) -> TrackedPhoto:
     distortion, fisheye = _distortion(image.name, camera)
     lens = Lens(
-        width=camera.width,
-        height=camera.height,
-        fx=camera.focal_length_x,
-        fy=camera.focal_length_y,
-        cx=camera.principal_point_x,
-        cy=camera.principal_point_y,
-        distortion=distortion,
-        fisheye=fisheye,
-    )
+        width=camera.width, height=camera.height, fx=camera.focal_length_x, fy=camera.focal_length_y,
+        cx=camera.principal_point_x, cy=camera.principal_point_y, distortion=distortion, fisheye=fisheye,
+    )  # fmt: skip
     pose = image.cam_from_world().matrix()
     try:
         lens.check()

@@ -21,25 +21,18 @@ Descriptors = Callable[[str], UInt8[Array, "n 128"]]
 """SIFT descriptors of a photo."""
 
 
-def pairs_to_match(
-    names: Sequence[str], descriptors: Descriptors, step: Callable[[], None] = lambda: None
-) -> list[tuple[str, str]]:
+def pairs_to_match(names: Sequence[str], descriptors: Descriptors) -> list[tuple[str, str]]:
     """Pairs of photos that may overlap: all of them up to EXHAUSTIVE photos, beyond that those found by
-    `similar_pairs`, and neighbors in name order, which is the order of a video or a walk.
-
-    `step` is called for every photo described.
-    """
+    `similar_pairs`, and neighbors in name order, which is the order of a video or a walk."""
     if len(names) <= EXHAUSTIVE:
         return list(combinations(names, 2))
-    found = set(similar_pairs(names, descriptors, NEIGHBORS, step))
+    found = set(similar_pairs(names, descriptors, NEIGHBORS))
     for apart in (1, 2, 4, 8):
         found.update(zip(names[:-apart], names[apart:], strict=True))
     return sorted(found)
 
 
-def similar_pairs(
-    names: Sequence[str], descriptors: Descriptors, neighbors: int, step: Callable[[], None]
-) -> list[tuple[str, str]]:
+def similar_pairs(names: Sequence[str], descriptors: Descriptors, neighbors: int) -> list[tuple[str, str]]:
     """Each photo with the `neighbors` whose aggregated descriptors (VLAD, Jégou et al. 2010) are nearest."""
     from sklearn.cluster import MiniBatchKMeans
 
@@ -50,7 +43,6 @@ def similar_pairs(
     vectors = np.zeros((len(names), words.size), np.float32)
     for vector, name in zip(vectors, names, strict=True):
         vector[:] = _aggregate(_rows(descriptors(name), _PER_PHOTO, rng), words)
-        step()
     pairs: set[tuple[str, str]] = set()
     for start in range(0, len(names), 256):
         likeness = vectors[start : start + 256] @ vectors.T

@@ -44,18 +44,18 @@ class Photo:
     mask_path: Path | None
     """A picture of any size, bright on the foreground."""
     lens: Lens
-    """Of the upright photo."""
+    """Intrinsics of the upright photo."""
     quarter_turns: int = 0
     """Clockwise, from the file's pixels as stored to upright ones."""
 
     @property
     def width(self) -> int:
-        """Of the lens, in pixels."""
+        """Pixels."""
         return self.lens.width
 
     @property
     def height(self) -> int:
-        """Of the lens, in pixels."""
+        """Pixels."""
         return self.lens.height
 
     @classmethod

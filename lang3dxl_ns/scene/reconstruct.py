@@ -12,7 +12,8 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -22,13 +23,13 @@ import numpy as np
 
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError, is_plain
-from lang3dxl_ns.common.files import expanded, open_file, write_atomically
+from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
-from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs, rotations_of
+from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruction_report import ReconstructionReport
 from lang3dxl_ns.scene.reconstruction_settings import ReconstructionSettings
 from lang3dxl_ns.scene.video import extract_frames, is_video
@@ -55,25 +56,22 @@ def reconstruct(
     settings = settings or ReconstructionSettings()
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
-    good, left_out = readable(photos)
-    good, unnamed = _with_names(good)
-    good, twins = _without_twins(good)
-    left_out |= unnamed | twins
-    _check_count(photos, good, left_out)
+    good, left_out = _usable(photos)
     clock: dict[str, float] = {}
     with _quiet():
         with _timed(clock, "features"):
-            database = _database(good, work, settings)
             copies = _numbered(good, work)
+            database = _database(good, copies, work, settings)
             _extract(database, copies, settings)
         with _timed(clock, "matching"):
             _match(database, copies.names)
         with _timed(clock, "mapping"):
             models = _map(database, copies, work, settings.mapper)
+    features, partners = _features_and_partners(database)
     if not models:
-        raise UserError(_why_no_model(database, copies.names))
+        raise UserError(_why_no_model(features, partners))
     names = dict(zip(copies.names, good.names, strict=True))
-    reasons = _reasons(database, copies.names, models)
+    reasons = _reasons(copies.names, models, features, partners)
     with _opened(database) as db:
         doubts = doubtful_placements(rotations_of(models[0]), matched_pairs(db, models[0]))
     doubtful = {names[models[0].images[i].name]: why for i, why in sorted(doubts.items())}
@@ -81,17 +79,14 @@ def reconstruct(
         image.name = names[image.name]
     best = models[0]
     report = ReconstructionReport(
-        photos=len(photos.names),
-        registered=best.num_reg_images(),
-        points=best.num_points3D(),
+        photos=len(photos.names), registered=best.num_reg_images(), points=best.num_points3D(),
         error=float(best.compute_mean_reprojection_error()),
         cameras=len({image.camera_id for image in best.images.values() if image.has_pose}),
-        mapper=settings.mapper,
-        doubtful=doubtful,
+        mapper=settings.mapper, doubtful=doubtful,
         left_out=left_out | {names[number]: why for number, why in reasons.items()},
         other_models=tuple(other.num_reg_images() for other in models[1:]),
         seconds={stage: round(seconds, 1) for stage, seconds in clock.items()},
-    )
+    )  # fmt: skip
     _publish(models, work, model)
     write_atomically(work / "report.json", json.dumps(asdict(report), indent=2))
     return report
@@ -124,9 +119,21 @@ def model_in(folder: Path) -> bool:
     return any(folder.glob("images.*")) or any(folder.glob("*/images.*"))
 
 
-def _check_count(photos: PhotoFolder, good: PhotoFolder, left_out: dict[str, str]) -> None:
-    if len(good.names) >= 2:
-        return
+def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
+    """The photos that can be read, each file once, and the others with the reason. Raises UserError if they
+    are fewer than two."""
+    good, left_out = readable(photos)
+    first: dict[bytes, str] = {}
+    for name in good.names:
+        if not is_plain(name):  # a COLMAP model can't hold it
+            left_out[name] = "its name is not plain text: rename the file"
+            continue
+        content = hashlib.blake2b((photos.folder / name).read_bytes()).digest()
+        if content in first:
+            left_out[name] = f"the same file as {first[content]}"
+        first.setdefault(content, name)
+    if len(first) >= 2:
+        return PhotoFolder(photos.folder, tuple(first.values())), left_out
     if not photos.names:
         raise UserError(
             f"{photos.folder} holds neither photos nor a COLMAP model: give the folder with your photos "
@@ -138,15 +145,9 @@ def _check_count(photos: PhotoFolder, good: PhotoFolder, left_out: dict[str, str
         )
     name, why = next(iter(left_out.items()))
     raise UserError(
-        f"of the {len(photos.names)} photos in {photos.folder} {len(good.names)} are usable, but a scene "
+        f"of the {len(photos.names)} photos in {photos.folder} {len(first)} are usable, but a scene "
         f"needs at least three different ones: {name}: {why}"
     )
-
-
-def _with_names(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
-    """The photos whose names a COLMAP model can hold, and the others with the reason."""
-    odd = {name: "its name is not plain text: rename the file" for name in photos.names if not is_plain(name)}
-    return PhotoFolder(photos.folder, tuple(name for name in photos.names if name not in odd)), odd
 
 
 def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
@@ -163,36 +164,15 @@ def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
             with open_picture(source) as image:
                 image.convert("RGB").save(folder / number)
         else:
-            _link(source.absolute(), folder / number)
+            try:
+                (folder / number).symlink_to(source.absolute())
+            except OSError:  # a disk or system without links
+                shutil.copyfile(source, folder / number)
         numbers.append(number)
     return PhotoFolder(folder, tuple(numbers))
 
 
-def _link(source: Path, target: Path) -> None:
-    try:
-        target.symlink_to(source)
-    except OSError:  # a disk or system without links
-        shutil.copyfile(source, target)
-
-
-def _without_twins(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
-    """The photos without duplicate files."""
-    first: dict[str, str] = {}
-    twins = {}
-    for name in photos.names:
-        with open_file(photos.folder / name) as file:
-            content = (
-                hashlib.file_digest(file, "blake2b").hexdigest()
-                if hasattr(hashlib, "file_digest")
-                else (hashlib.blake2b(file.read()).hexdigest())
-            )
-        if content in first:
-            twins[name] = f"the same file as {first[content]}"
-        first.setdefault(content, name)
-    return PhotoFolder(photos.folder, tuple(first.values())), twins
-
-
-def _database(photos: PhotoFolder, work: Path, settings: ReconstructionSettings) -> Path:
+def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: ReconstructionSettings) -> Path:
     """The database of photos and cameras: an earlier attempt's, if photos and settings are the same."""
     pycolmap = load_pycolmap()
     states = [(photos.folder / name).stat() for name in photos.names]
@@ -205,7 +185,6 @@ def _database(photos: PhotoFolder, work: Path, settings: ReconstructionSettings)
     database, stamped = work / "database.db", work / "photos.json"
     if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
         return database
-    work.mkdir(parents=True, exist_ok=True)
     for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*")):
         old.unlink(missing_ok=True)
     importing = work / "importing.db"
@@ -213,7 +192,6 @@ def _database(photos: PhotoFolder, work: Path, settings: ReconstructionSettings)
     groups = shared_cameras(photos)
     if settings.one_camera is not None:
         groups = [list(photos.names)] if settings.one_camera else [[name] for name in photos.names]
-    copies = _numbered(photos, work)
     number = dict(zip(photos.names, copies.names, strict=True))
     for group in groups:
         numbers = [number[name] for name in group]
@@ -234,7 +212,8 @@ def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettin
     options.num_threads = _threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2)
     options.sift.max_num_features = settings.features
     with progress("features of photos", len(missing)) as advance:
-        for chunk in _chunks(missing, _CHUNK_PHOTOS):
+        for start in range(0, len(missing), _CHUNK_PHOTOS):
+            chunk = missing[start : start + _CHUNK_PHOTOS]
             pycolmap.extract_features(database, photos.folder, chunk, extraction_options=options)
             advance(len(chunk))
 
@@ -257,7 +236,8 @@ def _match(database: Path, names: Sequence[str]) -> None:
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = listed
     with progress("pairs of photos", len(missing)) as advance:
-        for chunk in _chunks(missing, _CHUNK_PAIRS):
+        for start in range(0, len(missing), _CHUNK_PAIRS):
+            chunk = missing[start : start + _CHUNK_PAIRS]
             listed.write_text("".join(f"{a} {b}\n" for a, b in chunk))
             pycolmap.match_image_pairs(database, options, pairing)
             advance(len(chunk))
@@ -272,14 +252,13 @@ def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pyc
         folder.mkdir(parents=True)
         with progress("photos with a pose", len(photos.names)) as advance:
             if kind == "global":
-                found = pycolmap.global_mapping(database, photos.folder, folder, _global_options())
+                options = pycolmap.GlobalPipelineOptions()
+                options.random_seed, options.num_threads = 0, os.cpu_count() or 1
+                found = pycolmap.global_mapping(database, photos.folder, folder, options)
             else:
+                options = _incremental_options(relaxed)
                 found = pycolmap.incremental_mapping(
-                    database,
-                    photos.folder,
-                    folder,
-                    _incremental_options(relaxed),
-                    next_image_callback=advance,
+                    database, photos.folder, folder, options, next_image_callback=advance
                 )
         shutil.rmtree(folder, ignore_errors=True)
         least = min(_SMALLEST_MODEL, len(photos.names))
@@ -290,23 +269,13 @@ def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pyc
 
 
 def _incremental_options(relaxed: bool) -> Any:
-    pycolmap = load_pycolmap()
-    options = pycolmap.IncrementalPipelineOptions()
+    options = load_pycolmap().IncrementalPipelineOptions()
     options.min_model_size = _SMALLEST_MODEL
-    options.random_seed = 0
-    options.num_threads = os.cpu_count() or 1
+    options.random_seed, options.num_threads = 0, os.cpu_count() or 1
     if relaxed:
         options.mapper.init_min_num_inliers = 30
         options.mapper.init_min_tri_angle = 4.0
         options.mapper.abs_pose_min_num_inliers = 15
-    return options
-
-
-def _global_options() -> Any:
-    pycolmap = load_pycolmap()
-    options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = 0
-    options.num_threads = os.cpu_count() or 1
     return options
 
 
@@ -327,59 +296,53 @@ def _publish(models: list[pycolmap.Reconstruction], work: Path, model: Path) -> 
         shutil.rmtree(complete, ignore_errors=True)
 
 
-def _reasons(database: Path, names: Sequence[str], models: list[pycolmap.Reconstruction]) -> dict[str, str]:
+def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:
+    """For every photo the number of its features, and of photos with which it has verified matches."""
+    with _opened(database) as db:
+        images = {image.image_id: image.name for image in db.read_all_images()}
+        features = {name: db.num_keypoints_for_image(number) for number, name in images.items()}
+        pairs, inliers = db.read_two_view_geometry_num_inliers()
+    matched = (pair for pair, count in zip(pairs, inliers, strict=True) if count >= LEAST_MATCHES)
+    to_images = load_pycolmap().pair_id_to_image_pair
+    return features, Counter(images[image] for pair in matched for image in to_images(pair))
+
+
+def _reasons(
+    names: Sequence[str],
+    models: list[pycolmap.Reconstruction],
+    features: Mapping[str, int],
+    partners: Mapping[str, int],
+) -> dict[str, str]:
     """Reasons for the photos without a pose in the largest model."""
     posed = [{image.name for image in model.images.values() if image.has_pose} for model in models]
-    with _opened(database) as db:
-        features = {image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()}
-    partners = _partners(database)
     reasons = {}
-    for name in names:
-        if name in posed[0]:
-            continue
+    for name in (name for name in names if name not in posed[0]):
         elsewhere = next((len(group) for group in posed[1:] if name in group), None)
         if elsewhere:
             reasons[name] = f"in a separate model of {elsewhere} photos"
         elif features.get(name, 0) < _FEW_FEATURES:
             reasons[name] = "hardly any detail to match (blurred, dark or blank), or not readable"
-        elif not partners.get(name):
+        elif name not in partners:
             reasons[name] = "matches no other photo"
         else:
             reasons[name] = "matches others too weakly, or contradicts them"
     return reasons
 
 
-def _partners(database: Path) -> dict[str, int]:
-    """Number of photos with which each has verified matches."""
-    pycolmap = load_pycolmap()
-    partners: dict[str, int] = {}
-    with _opened(database) as db:
-        names = {image.image_id: image.name for image in db.read_all_images()}
-        pairs, inliers = db.read_two_view_geometry_num_inliers()
-    for pair, count in zip(pairs, inliers, strict=True):
-        if count >= 15:
-            for image in pycolmap.pair_id_to_image_pair(pair):
-                partners[names[image]] = partners.get(names[image], 0) + 1
-    return partners
-
-
-def _why_no_model(database: Path, names: Sequence[str]) -> str:
+def _why_no_model(features: Mapping[str, int], partners: Mapping[str, int]) -> str:
     """Explanation why no two photos could start a model."""
-    partners = _partners(database)
-    with _opened(database) as db:
-        features = [db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()]
-    if sum(count >= _FEW_FEATURES for count in features) < 2:
+    if sum(count >= _FEW_FEATURES for count in features.values()) < 2:
         return (
-            f"the {len(names)} photos have hardly any detail to match (median {np.median(features):.0f} "
-            "features): take sharp, well-lit ones, or larger copies"
+            f"the {len(features)} photos have hardly any detail to match (median "
+            f"{np.median(list(features.values())):.0f} features): take sharp, well-lit ones, or larger copies"
         )
     if not partners:
         return (
-            f"no two of the {len(names)} photos show the same thing: take photos that overlap by half, a "
+            f"no two of the {len(features)} photos show the same thing: take photos that overlap by half, a "
             "step apart from each other"
         )
     return (
-        f"{len(partners)} of the {len(names)} photos match others, but no two of them start a model: they "
+        f"{len(partners)} of the {len(features)} photos match others, but no two of them start a model: they "
         "seem to be taken from one place, or show a flat picture. Take photos from places a step apart"
     )
 
@@ -389,15 +352,9 @@ def _threads(memory_each: float) -> int:
     return int(max(1, min(os.cpu_count() or 1, machine_memory() / 2 // memory_each)))
 
 
-def _chunks(items: Sequence[Any], size: int) -> Iterator[list[Any]]:
-    for start in range(0, len(items), size):
-        yield list(items[start : start + size])
-
-
 @contextmanager
 def _opened(database: Path) -> Iterator[Any]:
-    pycolmap = load_pycolmap()
-    db = pycolmap.Database.open(database)
+    db = load_pycolmap().Database.open(database)
     try:
         yield db
     finally:
@@ -407,13 +364,12 @@ def _opened(database: Path) -> Iterator[Any]:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Suppress COLMAP's log of thousands of lines; the report has what matters."""
-    pycolmap = load_pycolmap()
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    logging = load_pycolmap().logging
+    level, logging.minloglevel = logging.minloglevel, int(logging.FATAL)
     try:
         yield
     finally:
-        pycolmap.logging.minloglevel = level
+        logging.minloglevel = level
 
 
 @contextmanager

@@ -84,17 +84,9 @@ def _sharpness(video: Path) -> Float[Array, " n"]:
 
 
 def _duration(video: Path) -> float:
-    command = [
-        "ffprobe",
-        *_READING,
-        "-select_streams",
-        "v:0",
-        "-show_entries",
-        "stream=codec_type:format=duration",
-    ]
-    found = subprocess.run(
-        [*command, "-of", "json", _address(video)], capture_output=True, text=True, check=False
-    )
+    asked = ("-select_streams", "v:0", "-show_entries", "stream=codec_type:format=duration", "-of", "json")
+    command = ["ffprobe", *_READING, *asked, _address(video)]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
     try:
         answer = json.loads(found.stdout)
         if not answer["streams"]:

@@ -14,9 +14,7 @@ from lang3dxl_ns.components.downsampler import (
     DownsamplerConfig,
     mean_with_one_maximum,
     mean_with_window_maxima,
-    resize_features_down,
     separable_kernel,
-    upsample_target,
 )
 
 KERNELS = ["pyramid", "footprint", "box"]
@@ -116,15 +114,6 @@ def test_footprints_of_crops_that_do_not_tile_the_image_lie_at_the_middles_of_it
     torch.testing.assert_close(result[2, 1], photo[36:63, 10:38].mean((0, 1)), atol=0.05, rtol=0)
 
 
-def test_at_the_border_the_mean_lies_at_the_middle_of_what_the_window_still_covers():
-    x = (torch.arange(100, dtype=torch.float64) + 0.5) / 100
-    ramp = x.expand(80, 100)[..., None]
-    result, _ = downsampler("pyramid", channels=1)(ramp, (48, 60), [0.2])
-    ends = (torch.arange(60, dtype=torch.float64) + 0.5) / 60 + 0.1
-    start, end = (ends - 0.2).clamp(min=0), ends.clamp(max=1)
-    torch.testing.assert_close(result[24, :, 0], (start + end) / 2)
-
-
 def test_the_footprint_kernel_is_the_mean_over_scales_of_resized_grids_of_crop_means():
     height, width = 96, 120
     crops = [12, 16, 24]  # all tile the photo, so that none is rounded to a pixel
@@ -189,15 +178,6 @@ def test_unbounded_logits_of_any_size_give_the_float64_mean_and_gradient(name, s
     for a, b in zip(actual, expected, strict=True):
         assert a.isfinite().all()
         torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
-
-
-@pytest.mark.parametrize("mean", [mean_with_one_maximum, mean_with_window_maxima])
-def test_a_shift_of_all_logits_changes_nothing(mean):
-    size, grid, sides = CASES[0]
-    kernel = separable_kernel("pyramid", size, grid, sides, torch.float64, CPU)
-    inputs = seeded(*size, 3), seeded(*size, seed=1), torch.ones(size, dtype=torch.float64)
-    shifted = mean(kernel, inputs[0], inputs[1] + 500, inputs[2])
-    torch.testing.assert_close(mean(kernel, *inputs), shifted, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("bound", [10.0, 60.0, None])
@@ -343,10 +323,14 @@ def test_crop_sides_that_are_not_positive_and_ascending_are_refused(sides):
 
 def test_the_ablations_resize_to_the_other_grid_and_keep_a_ramp():
     ramp = ((torch.arange(40, dtype=torch.float64) + 0.5) / 40).expand(30, 40)[..., None]
-    low = resize_features_down(ramp, (15, 16))
+
+    def matched(match, target):
+        module = AttenuatedDownsampler(DownsamplerConfig(hidden=0, match=match), 1).double()
+        return module.match(ramp, target, (0.2,))
+
+    low = matched("resize-features", torch.zeros(15, 16, 1).double())[0]
     torch.testing.assert_close(low[3, :, 0], (torch.arange(16, dtype=torch.float64) + 0.5) / 16)
-    high = upsample_target(low, (30, 40))
-    assert high.shape == ramp.shape
+    high = matched("resize-target", low)[1]
     torch.testing.assert_close(high[:, 2:-2], ramp[:, 2:-2])
 
 

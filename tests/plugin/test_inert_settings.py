@@ -46,6 +46,7 @@ def test_the_help_does_not_offer_them(capsys):
         ("pipeline.model.dense_weight", 0.5),
         ("pipeline.model.decode_size", (80, 120)),
         ("pipeline.model.warm_up", 0.5),
+        ("pipeline.model.codes_from", "photos"),
         ("pipeline.model.feature_gradient_to_geometry", True),
         ("pipeline.model.downsampler", DownsamplerConfig(hidden=8)),
         ("pipeline.datamanager.regions", "felzenszwalb"),

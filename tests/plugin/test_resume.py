@@ -5,6 +5,7 @@ import torch
 from conftest import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
@@ -96,3 +97,29 @@ def test_a_damaged_photo_does_not_change_the_order_of_the_others(train, scene, w
     assert started + names(40) == whole_order
     datamanager._left_out.clear()
     datamanager.restore_round(state)
+
+
+FROM_PHOTOS = EVERYTHING | {"pipeline__model__codes_from": "photos", "pipeline__model__warm_up": 0.4}
+"""Codes start at iteration 9.6 of 24."""
+
+
+@pytest.mark.parametrize("step", [5, 10])
+def test_codes_start_from_photos_once_also_if_the_run_is_interrupted(
+    train, scene, tmp_path, monkeypatch, step
+):
+    changes = FROM_PHOTOS | {"steps_per_save": 5, "save_only_latest_checkpoint": False}
+    starts = []
+    learn = Lang3DXLPipeline.learn_words
+    monkeypatch.setattr(Lang3DXLPipeline, "learn_words", lambda self: starts.append(self) or learn(self))
+    whole = train(scene, iterations=24, output_dir=tmp_path / "whole", **changes)
+    assert len(starts) == 1
+    middle = whole.checkpoint_dir / f"step-{step:09d}.ckpt"
+    resumed = train(scene, iterations=24, load_checkpoint=middle, **FROM_PHOTOS)
+    assert len(starts) == (2 if step < 9.6 else 1)
+    assert same(last_checkpoint(whole), last_checkpoint(resumed)) == []
+
+
+def test_codes_that_were_trained_do_not_start_again_in_a_longer_run(train, scene, monkeypatch):
+    first = train(scene, iterations=6, **FROM_PHOTOS)
+    monkeypatch.setattr(Lang3DXLPipeline, "learn_words", lambda self: pytest.fail("started again"))
+    train(scene, iterations=20, load_dir=first.checkpoint_dir, **FROM_PHOTOS)

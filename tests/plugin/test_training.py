@@ -94,6 +94,16 @@ def test_warm_up_trains_no_code(train, scene):
     assert float(warm.pipeline.model.gauss_params["codes"].std()) > 2 * initial
 
 
+def test_codes_from_photos_say_at_once_what_noise_has_to_learn(train, scene):
+    def clip_loss(start: str) -> float:
+        settings = {"codes_from": start, "warm_up": 0.9, "semantic_ramp": 0.0}
+        changes = {f"pipeline__model__{name}": value for name, value in settings.items()}
+        return float(train(scene, iterations=20, **changes).pipeline.last_losses["clip"])
+
+    # After two steps noise decodes to little but the mean feature.
+    assert clip_loss("photos") < 0.95 * clip_loss("noise")
+
+
 def test_resume_goes_on_where_the_run_stopped_and_ends_at_the_asked_iteration(train, scene):
     first = train(scene, iterations=12, pipeline__model__densify_grad_thresh=1e-7)
     before = parameters(first)

@@ -4,13 +4,12 @@ import math
 
 import pytest
 
-from lang3dxl_ns.preparation.crop_budget import MOST_CROPS, choose_crops, input_side
-from lang3dxl_ns.preparation.encoders import BUILTIN, CLIP_OPTION, find_model
+from lang3dxl_ns.preparation.crop_budget import MOST_CROPS, choose_crops
+from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model, read_config
 from lang3dxl_ns.preparation.physical_scale import crop_sides, fine_crops
 from lang3dxl_ns.preparation.pyramid import HALF, THIRD, crop_centers
-from lang3dxl_ns.preparation.settings import PreparationConfig
 
-PACKAGED_CLIP = find_model(BUILTIN, CLIP_OPTION).folder
+PACKAGED_CLIP = find_model(BUILTIN, CLIP_OPTION)
 SCALES = [0.05, 0.07, 0.1, 0.14, 0.2]  # of a photo's width
 
 
@@ -46,17 +45,9 @@ def test_a_quality_bounds_the_pixels_that_an_encoder_sees(size, is_fine, input_p
 @pytest.mark.parametrize("size", [(480, 360), (360, 480), (320, 240), (200, 150)])
 @pytest.mark.parametrize("scale", [0.02, 0.05, 0.067, 0.1])
 def test_the_small_encoder_sees_the_demos_photos_as_without_a_budget(size, scale):
-    side = input_side(PACKAGED_CLIP)
+    side = read_config(PACKAGED_CLIP).vision_config.image_size
     fine = chosen(size, True, side, "normal", [scale, 2 * scale])
     sides = crop_sides([scale, 2 * scale], 1 / size[0], size[0])
     assert fine.sides == fine_crops(sides[0]) and fine.steps == THIRD
     pyramid = chosen(size, False, side, "normal", [scale, 2 * scale])
     assert pyramid.sides == sides
-
-
-def test_the_input_of_an_encoder_is_in_its_configuration(tmp_path):
-    assert input_side(PACKAGED_CLIP) == 48
-    assert input_side(tmp_path) == 224
-    (tmp_path / "config.json").write_text('{"vision_config": {"image_size": "large"}}')
-    assert input_side(tmp_path) == 224
-    assert PreparationConfig().quality == "normal"

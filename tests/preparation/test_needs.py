@@ -97,8 +97,8 @@ def test_a_number_of_crop_sizes_divides_the_same_range_evenly(scene):
     assert three[1] == pytest.approx((usual[0] * usual[-1]) ** 0.5)
     assert sizes(1) == pytest.approx([three[1]])
     assert sizes(len(usual)) == pytest.approx(usual)
-    with pytest.raises(UserError, match="scales 1 or more"):
-        sizes(0)
+    with pytest.raises(UserError, match="scales is 0: give a number from 1"):
+        PreparationConfig(scales=0).check()
 
 
 def seen_from_afar(reconstruction):

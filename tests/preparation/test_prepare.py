@@ -17,6 +17,7 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 from lang3dxl_ns.common import console as progress
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation import prepare as module
 from lang3dxl_ns.preparation.dense_map import build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
@@ -260,7 +261,7 @@ def test_an_announced_duration_is_that_of_large_batches_and_names_remedies_that_
     told = capsys.readouterr().out.replace("\n", " ")
     (crops,) = re.findall(r"([\d,]+) crops with", told)
     assert int(crops) > 64
-    assert f"about {module._duration(int(crops) * 0.5 / 64)}" in told
+    assert f"{roughly(int(crops) * 0.5 / 64)}" in told
     assert "clip builtin if its words suffice" in told
     assert "quality fast" not in told
 

@@ -91,19 +91,6 @@ def test_boxes_are_those_of_transformers_own_postprocessing(models):
     assert len(boxes) > 1
 
 
-def test_a_prompt_is_put_as_the_detector_was_trained_with(models, monkeypatch):
-    found = load_text_segmenter(find_text_segmenter(models["grounding"], models["sam"]), "cpu")
-    captions, processor = [], found._detector_processor
-
-    def listening(text, **rest):
-        captions.append(text)
-        return processor(text=text, **rest)
-
-    monkeypatch.setattr(found, "_detector_processor", listening)
-    found.segment(IMAGE, [" Main Tower. ", "sky"])
-    assert captions == ["main tower.", "sky."]
-
-
 def test_one_box_and_no_box_give_a_mask_too(models, monkeypatch):
     found = load_text_segmenter(find_text_segmenter(models["grounding"], models["sam"]), "cpu")
     monkeypatch.setattr(found, "boxes", lambda *_: (torch.tensor([[10.0, 10.0, 40.0, 50.0]]), torch.ones(1)))

@@ -153,24 +153,6 @@ def test_the_order_of_photos_does_not_matter_and_a_photo_that_counts_nowhere_add
     torch.testing.assert_close(there[1], back[1])
 
 
-def test_a_gaussians_feature_is_that_of_the_pixels_that_show_it():
-    generator = torch.Generator().manual_seed(3)
-    features = torch.rand(5, 3, generator=generator, dtype=torch.float64)
-    for index in range(4):
-        views = []
-        for camera in cameras():
-            alone = torch.zeros(5, 1, dtype=torch.float64)
-            alone[index] = 1
-            weight = composite(camera, alone)
-            everything = composite(camera, torch.ones(5, 1, dtype=torch.float64))
-            only = (weight > 0.5 * everything) & (weight > 1e-6)  # little else shows here
-            pixels = torch.cat([features[index].expand(SIZE, SIZE, 3), torch.ones(SIZE, SIZE, 1)], dim=-1)
-            views.append((lambda carried, camera=camera: composite(camera, carried), whole(only * pixels)))
-        found, mass = gather(5, views, 3, features)
-        assert mass[index] > 0
-        torch.testing.assert_close(found[index], features[index])
-
-
 def test_pixels_that_are_not_finite_do_not_count():
     target = torch.ones(4, 4, 2)
     target[0, 0, 1] = torch.nan
@@ -203,21 +185,3 @@ def test_pixels_that_a_gaussian_fills_are_its_weights():
         alone[index] = 1
         expected = (composite(camera, alone)[..., 0] * weight).sum()
         torch.testing.assert_close(filled[index], expected)
-
-
-def test_masks_vote_for_the_gaussians_that_they_show():
-    """A vote is the share of a Gaussian's pixels in masks, by sums over pixels; unseen ones get none."""
-    weights = torch.rand(2, 5, 7, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    weights[..., 3] = 0
-    masks = torch.rand(2, 5, 7, generator=torch.Generator().manual_seed(1)) > 0.6
-    drawn = [lambda carried, w=w: w @ carried for w in weights]
-
-    def votes_of(masks):
-        pixels = [Pixels.of([mask[..., None].double()], (5, 7)) for mask in masks]
-        return gather(4, zip(drawn, pixels, strict=True), 1, weights)[0][:, 0]
-
-    votes = votes_of(masks)
-    expected = (weights * masks[..., None]).sum((0, 1, 2)) / weights.sum((0, 1, 2)).clamp_min(1e-9)
-    torch.testing.assert_close(votes, expected)
-    assert votes[3] == 0 and (votes[:3] > 0).all()
-    torch.testing.assert_close(votes_of(torch.ones_like(masks))[:3], torch.ones(3, dtype=torch.float64))

@@ -235,27 +235,6 @@ def test_an_undistorted_point_lies_where_the_pinhole_projects_it(tmp_path, model
     assert max(shift) > 1.5  # else the distortion would prove nothing
 
 
-def test_distortion_is_removed_from_a_resized_copy_too(tmp_path):
-    camera = {"focal": 100.0, "distortion": (-0.3, 0.05, 0.0, 0.0)}
-    draw_spots([(60, 50), (200, 60), (250, 200)], 320, 240).save(tmp_path / "a.png")
-    large = make_photo(tmp_path / "a.png", 320, 240, focal=200.0, distortion=camera["distortion"])
-    small = make_photo(tmp_path / "a.png", 160, 120, **camera)
-    assert torch.equal(small.read(), large.read(0.5))
-
-
-def test_an_undistorted_scene_looks_like_the_pinholes(tmp_path):
-    size, bend = (240, 180), (-0.4, 0.1, 0.02, -0.02)
-    plain = write_scene(tmp_path / "plain", photos=3, size=size, points=50)
-    bent = write_scene(tmp_path / "bent", photos=3, size=size, points=50, distortion=bend)
-    geometry = read_reconstruction(bent / "sparse" / "0").photos["photo_001.jpg"]
-    photo = Photo.from_model(geometry, bent / "images" / geometry.name)
-    assert photo.lens.distortion == bend
-    pinhole = make_photo(plain / "images" / geometry.name, *size).read()
-    seen = photo.read_mask()
-    straight, untouched = photo.read(), with_lens(photo, distortion=()).read()
-    assert (straight - pinhole)[seen].abs().mean() < 0.3 * (untouched - pinhole)[seen].abs().mean()
-
-
 @pytest.mark.parametrize("bend", [None, (-0.4, 0.1, 0.02, -0.02)])
 def test_a_photo_shows_the_points_colors_where_the_pinhole_projects_them(tmp_path, bend):
     size = (320, 240)

@@ -84,7 +84,7 @@ def test_similar_photos_find_each_other():
         name: (places[int(name) % 4] + rng.normal(0, 20, (60, 128))).clip(0, 255).astype(np.uint8)
         for name in names
     }
-    pairs = similar_pairs(sorted(names), described.__getitem__, 5, lambda: None)
+    pairs = similar_pairs(sorted(names), described.__getitem__, 5)
     assert {(int(a) - int(b)) % 4 for a, b in pairs} == {0}
     assert len(pairs) == 4 * 15
 

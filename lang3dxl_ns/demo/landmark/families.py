@@ -63,25 +63,10 @@ def _aisles(b: Builder, width, length, height, aisle, aisle_height, bays) -> Non
     for facing, side in SIDES:
         y = side * (width / 2 + aisle / 2)
         b.box("wall", "wall", (-length / 2, y, 0), (length * 0.96, aisle, aisle_height))
-        b.gable(
-            "roof",
-            "roof",
-            (-length / 2, side * width / 2, aisle_height),
-            aisle * 2.1,
-            length * 0.97,
-            aisle * 0.45,
-            yaw=math.pi / 2,
-        )
-        above = aisle_height + aisle * 0.5
-        window_row(
-            b,
-            "wall",
-            (-length / 2, side * width / 2, above),
-            facing,
-            length * 0.94,
-            height - above - 0.4,
-            bays,
-        )
+        x, inside, above = -length / 2, side * width / 2, aisle_height + aisle * 0.5
+        roof = (aisle * 2.1, length * 0.97, aisle * 0.45)
+        b.gable("roof", "roof", (x, inside, aisle_height), *roof, yaw=math.pi / 2)
+        window_row(b, "wall", (x, inside, above), facing, length * 0.94, height - above - 0.4, bays)
         outside = (-length / 2, side * (width / 2 + aisle), aisle_height * 0.16)
         window_row(b, "wall", outside, facing, length * 0.92, aisle_height * 0.72, bays)
         if not buttresses:
@@ -99,14 +84,13 @@ def _transept(b: Builder, width, length, height, ridge, aisle) -> None:
     b.gable("roof", "roof", (x, 0, height), across * 1.05, reach, ridge * 0.9)
     rose = b.chance(0.5)
     for facing, side in SIDES:
+        y = side * reach / 2
         b.gable("wall", "wall", (x, side * (reach / 2 - 0.2), height), across, 0.9, ridge * 0.92)
         if rose:
-            rose_window(b, "wall", (x, side * reach / 2, height * 0.55), facing, across * 0.5)
+            rose_window(b, "wall", (x, y, height * 0.55), facing, across * 0.5)
         else:
-            window_row(
-                b, "wall", (x, side * reach / 2, height * 0.42), facing, across * 0.85, height * 0.5, 3
-            )
-        portal(b, "wall", (x, side * reach / 2, 0), facing, across * 0.32, height * 0.33)
+            window_row(b, "wall", (x, y, height * 0.42), facing, across * 0.85, height * 0.5, 3)
+        portal(b, "wall", (x, y, 0), facing, across * 0.32, height * 0.33)
     crossing = b.rng.random()
     if crossing < 0.4:
         dome(b, (x, 0, height + ridge * 0.3), width * 0.5, width * 0.55)
@@ -123,28 +107,19 @@ def _west_front(b: Builder, width, height, aisle, tower_width, tower_height) -> 
     if twin:
         beside = width / 2 + tower_width * 0.45
         for side in (-1, 1):
-            tower(
-                b, (-tower_width / 2 + 0.9, side * beside, 0), tower_width, tower_height, top, bare=(FRONT,)
-            )
+            foot = (-tower_width / 2 + 0.9, side * beside, 0)
+            tower(b, foot, tower_width, tower_height, top, bare=(FRONT,))
             portal(b, "tower", (0.9, side * beside, 0), FRONT, tower_width * 0.42, height * 0.3)
     if twin or arrangement >= 0.85:
         portal(b, "wall", (0.15, 0, 0), FRONT, width * b.between(0.34, 0.46), height * b.between(0.38, 0.46))
         if b.chance(0.7):
             rose_window(b, "wall", (0.15, 0, height * 0.58), FRONT, width * 0.55)
         else:
-            window_row(
-                b,
-                "wall",
-                (0.15, 0, height * 0.56),
-                FRONT,
-                width * 0.62,
-                height * 0.42,
-                int(b.rng.integers(1, 4)),
-            )
+            columns = int(b.rng.integers(1, 4))
+            window_row(b, "wall", (0.15, 0, height * 0.56), FRONT, width * 0.62, height * 0.42, columns)
         if b.chance(0.5):
-            niche_row(
-                b, (0.15, 0, height * 0.485), FRONT, width * 0.8, height * 0.085, int(b.rng.integers(6, 11))
-            )
+            columns = int(b.rng.integers(6, 11))
+            niche_row(b, (0.15, 0, height * 0.485), FRONT, width * 0.8, height * 0.085, columns)
     else:
         across = tower_width * 1.15
         tower(b, (across * 0.3, 0, 0), across, tower_height * 1.1, top, bare=(FRONT,))
@@ -231,15 +206,10 @@ def _minarets(b: Builder, width, depth, height, front, court) -> None:
     count = int(b.rng.choice([1, 2, 2, 4, 4, 6]))
     tall, radius = height * b.between(2.6, 3.8), width * b.between(0.028, 0.044)
     aside = width / 2 + radius * 1.5
-    rear, middle, fore = (
-        [(x, side * aside, 0.0) for side in (1, -1)] for x in (-depth / 2, depth / 2, front + 0.5)
-    )
-    places = {
-        1: middle[:1],
-        2: fore,
-        4: middle + (fore if court else rear),
-        6: rear + middle + (fore if court else []),
-    }
+    lines = (-depth / 2, depth / 2, front + 0.5)
+    rear, middle, fore = ([(x, side * aside, 0.0) for side in (1, -1)] for x in lines)
+    four, six = middle + (fore if court else rear), rear + middle + (fore if court else [])
+    places = {1: middle[:1], 2: fore, 4: four, 6: six}
     octagonal, balconies = b.chance(0.4), int(b.rng.integers(1, 4))
     cap = str(b.rng.choice(["cone", "dome", "lantern"]))
     for place in places[count]:
@@ -285,40 +255,29 @@ def _two_towers(b: Builder, width, depth, height) -> None:
     if b.chance(0.6):
         dome(b, (-depth * 0.1, 0, height), width * 0.29, width * 0.12)
     else:
-        b.gable("roof", "roof", (0, 0, height), width, depth, width * 0.35, yaw=math.pi / 2)
-        b.gable(
-            "wall", "wall", (depth / 2 - 0.4, 0, height), width * 0.94, 0.9, width * 0.35, yaw=math.pi / 2
-        )
+        rise, gable = width * 0.35, (depth / 2 - 0.4, 0, height)
+        b.gable("roof", "roof", (0, 0, height), width, depth, rise, yaw=math.pi / 2)
+        b.gable("wall", "wall", gable, width * 0.94, 0.9, rise, yaw=math.pi / 2)
 
 
 def _hall_front(b: Builder, width, depth, height) -> None:
-    front = (depth / 2, 0.0, 0.0)
-    tall = height * b.between(0.3, 0.38)
-    portal(b, "wall", front, FRONT, width * b.between(0.14, 0.2), tall)
+    x, tall = depth / 2, height * b.between(0.3, 0.38)
+    portal(b, "wall", (x, 0.0, 0.0), FRONT, width * b.between(0.14, 0.2), tall)
     if b.chance(0.55):
         for side in (-1, 1):
-            portal(b, "wall", (front[0], side * width * 0.22, 0), FRONT, width * 0.11, tall * 0.75)
-    upper = (front[0], 0.0, height * 0.5)
+            portal(b, "wall", (x, side * width * 0.22, 0), FRONT, width * 0.11, tall * 0.75)
+    upper = (x, 0.0, height * 0.5)
     if b.chance(0.3):
         rose_window(b, "wall", upper, FRONT, height * 0.3)
         for side in (-1, 1):
-            window_row(
-                b,
-                "wall",
-                (front[0], side * width * 0.25, height * 0.5),
-                FRONT,
-                width * 0.14,
-                height * 0.36,
-                1,
-            )
+            foot = (x, side * width * 0.25, height * 0.5)
+            window_row(b, "wall", foot, FRONT, width * 0.14, height * 0.36, 1)
     else:
         window_row(b, "wall", upper, FRONT, width * 0.62, height * 0.4)
     if b.chance(0.35):
-        colonnade(
-            b, (front[0] + 2.6, -width * 0.34, 0), (front[0] + 2.6, width * 0.34, 0), 6, height * 0.4, 0.42
-        )
-        b.box("roof", "trim", (front[0] + 1.5, 0, height * 0.4), (3.2, width * 0.76, 0.8))
+        ends = (x + 2.6, -width * 0.34, 0), (x + 2.6, width * 0.34, 0)
+        colonnade(b, *ends, 6, height * 0.4, 0.42)
+        b.box("roof", "trim", (x + 1.5, 0, height * 0.4), (3.2, width * 0.76, 0.8))
     elif b.chance(0.6):
-        niche_row(
-            b, (front[0], 0, height * 0.41), FRONT, width * 0.6, height * 0.09, int(b.rng.integers(5, 9))
-        )
+        columns = int(b.rng.integers(5, 9))
+        niche_row(b, (x, 0, height * 0.41), FRONT, width * 0.6, height * 0.09, columns)

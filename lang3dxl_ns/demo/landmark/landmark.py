@@ -34,7 +34,7 @@ class Landmark:
     radius: float
     """Half the horizontal diagonal of the building's bounds, meters."""
     height: float
-    """Of the building, meters."""
+    """Height of the building, meters."""
     obstacles: Float[Array, "n 2 3"]
     """Bounds (lower and upper corner) of everything but the ground, to keep cameras and people out."""
 
@@ -56,15 +56,9 @@ class Landmark:
         place_surroundings(builder, center, radius)
         standing = [_bounds([shape]) for shape in builder.shapes if PARTS[shape.part] != "ground"]
         return cls(
-            seed=seed,
-            family=family,
-            shapes=tuple(builder.shapes),
-            materials=tuple(builder.materials),
-            center=center,
-            radius=radius,
-            height=float(high[2]),
-            obstacles=np.array(standing),
-        )
+            seed=seed, family=family, shapes=tuple(builder.shapes), materials=tuple(builder.materials),
+            center=center, radius=radius, height=float(high[2]), obstacles=np.array(standing),
+        )  # fmt: skip
 
     def is_free(self, point, margin: float) -> bool:
         """Whether nothing is within `margin` meters of a point (by bounding boxes)."""

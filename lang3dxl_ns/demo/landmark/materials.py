@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,14 +44,8 @@ _KINDS: dict[str, tuple[tuple[float, float, float], str, float]] = {
 MATERIALS = ("sky", *_KINDS)
 """Index order of `Shot.materials`."""
 MASONRY = (
-    "limestone",
-    "sandstone",
-    "granite",
-    "marble",
-    "red brick",
-    "yellow brick",
-    "plaster",
-    "banded stone",
+    *("limestone", "sandstone", "granite", "marble"),
+    *("red brick", "yellow brick", "plaster", "banded stone"),
 )
 COVERING = ("slate", "clay tile", "glazed tile", "lead", "copper", "gold")
 
@@ -93,7 +88,7 @@ def colored(name: str, rng: np.random.Generator) -> Material:
     """Cloth or paint of a random color."""
     material = make_material(name, rng)
     r, g, b = rng.uniform(0.03, 0.75, 3).tolist()
-    return Material(name, (r, g, b), material.pattern, material.scale, material.seed, material.gloss)
+    return replace(material, color=(r, g, b))
 
 
 def _random_tables() -> tuple[np.ndarray, np.ndarray]:
@@ -158,23 +153,14 @@ def _slabs(s, t, footprint, seed) -> np.ndarray:
 
 
 def _bricks(s, t, footprint, seed) -> np.ndarray:
-    return _courses(s, t, footprint, seed, 0.4, 0.14, 0.025, 0.5) * (
-        1 + 0.2 * (_noise(s * 0.4, t * 0.4, seed) - 0.5)
-    )
-
-
-def _stains(s, t, footprint, seed) -> np.ndarray:
-    return 1 + 0.3 * (fractal_noise(s * 0.3, t * 0.2, seed, 3) - 0.5)
+    shades = 1 + 0.2 * (_noise(s * 0.4, t * 0.4, seed) - 0.5)
+    return _courses(s, t, footprint, seed, 0.4, 0.14, 0.025, 0.5) * shades
 
 
 def _bands(s, t, footprint, seed) -> np.ndarray:
     course = np.where(np.mod(t / 0.9, 2) < 1, np.float32(1.15), np.float32(0.62))
     resolved = _fade(0.9, footprint)
     return (course * resolved + 0.88 * (1 - resolved)) * _courses(s, t, footprint, seed, 1.4, 0.9, 0.04, 0.15)
-
-
-def _tiles(s, t, footprint, seed) -> np.ndarray:
-    return _courses(s, t, footprint, seed, 0.45, 0.4, 0.07, 0.5)
 
 
 def _seams(s, t, footprint, seed) -> np.ndarray:
@@ -191,25 +177,17 @@ def _panes(s, t, footprint, seed) -> np.ndarray:
     return 0.6 + 0.9 * _cell(np.floor(s / 0.4), np.floor(t / 0.4), seed) * _fade(0.4, footprint)
 
 
-def _leaves(s, t, footprint, seed) -> np.ndarray:
-    return 1 + 0.9 * (fractal_noise(s * 0.8, t * 0.8, seed, 4) - 0.5)
-
-
-def _plain(s, t, footprint, seed) -> np.ndarray:
-    return 1 + 0.1 * (_noise(s, t, seed) - 0.5)
-
-
-_PATTERNS = {
+_PATTERNS: dict[str, Callable[..., np.ndarray]] = {
     "blocks": _blocks,
     "slabs": _slabs,
     "bricks": _bricks,
-    "stains": _stains,
+    "stains": lambda s, t, _, seed: 1 + 0.3 * (fractal_noise(s * 0.3, t * 0.2, seed, 3) - 0.5),
     "bands": _bands,
-    "tiles": _tiles,
+    "tiles": lambda s, t, footprint, seed: _courses(s, t, footprint, seed, 0.45, 0.4, 0.07, 0.5),
     "seams": _seams,
     "planks": _planks,
     "panes": _panes,
     "stained": _panes,
-    "leaves": _leaves,
-    "plain": _plain,
+    "leaves": lambda s, t, _, seed: 1 + 0.9 * (fractal_noise(s * 0.8, t * 0.8, seed, 4) - 0.5),
+    "plain": lambda s, t, _, seed: 1 + 0.1 * (_noise(s, t, seed) - 0.5),
 }

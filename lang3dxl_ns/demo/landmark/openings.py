@@ -86,14 +86,9 @@ class Openings(Shape):
         corner = np.clip(0.6 + np.maximum(inset, 0) / max(1.5 * self.depth, 1e-3), 0, 1)
         shade = shade * np.where(open_, corner, np.where(band, 1.08, np.where(jamb, 0.7, 0.92)))
         return Surface(
-            normal=self._normal(u, v, jamb),
-            s=s,
-            t=np.where(jamb, v, t),
-            shade=shade,
-            sunlit=self._sunlit(s, t, depth, sun) * ~jamb,
-            trim=~filled,
-            element=~band,
-        )
+            normal=self._normal(u, v, jamb), s=s, t=np.where(jamb, v, t), shade=shade,
+            sunlit=self._sunlit(s, t, depth, sun) * ~jamb, trim=~filled, element=~band,
+        )  # fmt: skip
 
     def _tile(self, y, z):
         """Coordinates in the opening's own tile: u from its center line, v from its sill."""

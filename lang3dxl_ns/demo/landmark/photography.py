@@ -17,22 +17,8 @@ from lang3dxl_ns.demo.landmark.shading import ShadowMap, Weather, light, trace
 from lang3dxl_ns.demo.landmark.shapes import MISS, Shape, floats
 from lang3dxl_ns.demo.landmark.surroundings import passers_by
 
-__all__ = [
-    "MATERIALS",
-    "Lens",
-    "Shot",
-    "View",
-    "plain_view",
-    "random_camera",
-    "random_photo_size",
-    "random_view",
-    "take_photo",
-]
-
 SMALLEST_SHARE = 0.18
 """Share of the picture: photos with less of the building are not taken."""
-
-
 NARROWEST = 0.38
 """Least width that a picture shows, in radii of the landmark."""
 
@@ -86,12 +72,9 @@ def random_view(landmark: Landmark, rng: np.random.Generator, wild: bool = True)
     camera = random_camera(landmark, rng, wild)
     if not wild:
         return plain_view(camera)
-    crowd = passers_by(
-        rng,
-        lambda: _spot_in_front(landmark, camera, rng),
-        people=int(rng.integers(0, 10) * (rng.random() < 0.8)),
-        cars=int(rng.integers(0, 4) * (rng.random() < 0.5)),
-    )
+    people = int(rng.integers(0, 10) * (rng.random() < 0.8))
+    cars = int(rng.integers(0, 4) * (rng.random() < 0.5))
+    crowd = passers_by(rng, lambda: _spot_in_front(landmark, camera, rng), people, cars)
     return View(camera, _random_weather(rng), _random_lens(rng), tuple(crowd.shapes), tuple(crowd.materials))
 
 
@@ -105,7 +88,9 @@ def take_photo(landmark: Landmark, view: View, width: int, height: int, oversamp
 
     Colors are means of oversampling² rays per pixel; labels and depth are those of the pixel's central ray.
     """
-    shapes = landmark.shapes + _with_own_materials(view.passers_by, len(landmark.materials))
+    first = len(landmark.materials)
+    crowd = tuple(replace(shape, material=shape.material + first) for shape in view.passers_by)
+    shapes = landmark.shapes + crowd
     materials = landmark.materials + view.passers_by_materials
     reach = max(landmark.radius, landmark.height / 2) * 1.15
     shadows = ShadowMap.of(shapes, view.weather, landmark.center, reach)
@@ -133,33 +118,22 @@ def random_photo_size(rng: np.random.Generator, width: int, height: int) -> tupl
 
 
 _CALM_WEATHER = Weather(
-    sun_azimuth=0.7,
-    sun_elevation=0.85,
-    sun_color=(1.0, 0.94, 0.84),
-    sky_light=(0.44, 0.48, 0.56),
-    horizon=(0.74, 0.80, 0.88),
-    zenith=(0.25, 0.42, 0.72),
-    clouds=0.0,
-    cloud_seed=0,
-    haze=3000.0,
-)
+    sun_azimuth=0.7, sun_elevation=0.85, sun_color=(1.0, 0.94, 0.84), sky_light=(0.44, 0.48, 0.56),
+    horizon=(0.74, 0.80, 0.88), zenith=(0.25, 0.42, 0.72), clouds=0.0, cloud_seed=0, haze=3000.0,
+)  # fmt: skip
 _CALM_LENS = Lens(exposure=1.4, white_balance=(1.0, 1.0, 1.0), gamma=1.0, noise=0.0, noise_seed=0)
 
 
 def random_camera(landmark: Landmark, rng: np.random.Generator, wild: bool) -> Camera:
     """A camera for a photo: not inside an obstacle, and with enough of the building in view."""
-    best, best_share = None, -1.0
+    seen: list[tuple[float, Camera]] = []
     for _ in range(60):
         camera = _propose_camera(landmark, rng, wild)
-        if camera is None:
-            continue
-        share = _building_share(landmark, camera)
-        if share >= SMALLEST_SHARE:
-            return camera
-        if share > best_share:
-            best, best_share = camera, share
-    assert best is not None
-    return best
+        if camera is not None:
+            seen.append((_building_share(landmark, camera), camera))
+            if seen[-1][0] >= SMALLEST_SHARE:
+                return camera
+    return max(seen, key=lambda shown: shown[0])[1]
 
 
 def _propose_camera(landmark: Landmark, rng: np.random.Generator, wild: bool) -> Camera | None:
@@ -210,40 +184,29 @@ def _spot_in_front(landmark: Landmark, camera: Camera, rng: np.random.Generator)
 
 
 def _random_weather(rng: np.random.Generator) -> Weather:
-    def varied(color, spread=0.12):
-        r, g, b = (
-            np.array(color) * rng.uniform(1 - spread, 1 + spread) * rng.uniform(0.97, 1.03, 3)
-        ).tolist()
+    def varied(*color: float, spread: float = 0.12) -> tuple[float, float, float]:
+        factor = rng.uniform(1 - spread, 1 + spread)
+        r, g, b = (np.array(color) * factor * rng.uniform(0.97, 1.03, 3)).tolist()
         return r, g, b
 
     mood = rng.choice(["sunny", "cloudy", "overcast", "evening"], p=[0.4, 0.25, 0.2, 0.15])
     elevation = rng.uniform(0.4, 1.15)
-    sun, light = varied((1.1, 1.0, 0.86)), varied((0.42, 0.47, 0.56))
-    horizon, zenith, clouds = varied((0.72, 0.79, 0.88)), varied((0.20, 0.37, 0.70), 0.25), 0.0
+    sun, light = varied(1.1, 1.0, 0.86), varied(0.42, 0.47, 0.56)
+    horizon, zenith, clouds = varied(0.72, 0.79, 0.88), varied(0.20, 0.37, 0.70, spread=0.25), 0.0
     if mood == "cloudy":
         clouds = rng.uniform(0.3, 0.8)
     elif mood == "overcast":
-        sun, light = varied((0.16, 0.16, 0.16)), varied((0.72, 0.74, 0.78))
-        horizon, zenith, clouds = (
-            varied((0.74, 0.76, 0.79)),
-            varied((0.56, 0.59, 0.64)),
-            rng.uniform(0.0, 0.6),
-        )
+        sun, light = varied(0.16, 0.16, 0.16), varied(0.72, 0.74, 0.78)
+        horizon, zenith, clouds = varied(0.74, 0.76, 0.79), varied(0.56, 0.59, 0.64), rng.uniform(0.0, 0.6)
     elif mood == "evening":
         elevation = rng.uniform(0.12, 0.4)
-        sun, light = varied((1.25, 0.82, 0.5)), varied((0.36, 0.38, 0.48))
-        horizon, zenith, clouds = varied((0.95, 0.72, 0.52)), varied((0.32, 0.40, 0.60)), rng.uniform(0, 0.5)
+        sun, light = varied(1.25, 0.82, 0.5), varied(0.36, 0.38, 0.48)
+        horizon, zenith, clouds = varied(0.95, 0.72, 0.52), varied(0.32, 0.40, 0.60), rng.uniform(0, 0.5)
     return Weather(
-        sun_azimuth=rng.uniform(-1.9, 1.9),
-        sun_elevation=elevation,
-        sun_color=sun,
-        sky_light=light,
-        horizon=horizon,
-        zenith=zenith,
-        clouds=clouds,
-        cloud_seed=int(rng.integers(1000)),
+        sun_azimuth=rng.uniform(-1.9, 1.9), sun_elevation=elevation, sun_color=sun, sky_light=light,
+        horizon=horizon, zenith=zenith, clouds=clouds, cloud_seed=int(rng.integers(1000)),
         haze=math.exp(rng.uniform(math.log(400), math.log(4000))),
-    )
+    )  # fmt: skip
 
 
 def _random_lens(rng: np.random.Generator) -> Lens:
@@ -255,11 +218,6 @@ def _random_lens(rng: np.random.Generator) -> Lens:
         noise=rng.uniform(0.002, 0.015),
         noise_seed=int(rng.integers(2**31)),
     )
-
-
-def _with_own_materials(shapes: tuple[Shape, ...], first: int) -> tuple[Shape, ...]:
-    """The shapes with their materials numbered from `first`."""
-    return tuple(replace(shape, material=shape.material + first) for shape in shapes)
 
 
 _TONE = np.linspace(0, 1, 4096, dtype=np.float32)

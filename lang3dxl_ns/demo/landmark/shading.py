@@ -37,10 +37,8 @@ class Weather:
 
     @property
     def to_sun(self) -> Float[Array, "3"]:
-        flat = np.cos(self.sun_elevation)
-        return floats(
-            [np.cos(self.sun_azimuth) * flat, np.sin(self.sun_azimuth) * flat, np.sin(self.sun_elevation)]
-        )
+        azimuth, flat = self.sun_azimuth, np.cos(self.sun_elevation)
+        return floats([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(self.sun_elevation)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +68,8 @@ class ShadowMap:
         fx, fy = x[inside] - 0.5 - column, y[inside] - 0.5 - row
         limit = z[inside] - 0.8 * texel
         free = [self.depth[row + j, column + i] >= limit for j in (0, 1) for i in (0, 1)]
-        lit[inside] = (free[0] * (1 - fx) + free[1] * fx) * (1 - fy) + (
-            free[2] * (1 - fx) + free[3] * fx
-        ) * fy
+        upper, lower = free[0] * (1 - fx) + free[1] * fx, free[2] * (1 - fx) + free[3] * fx
+        lit[inside] = upper * (1 - fy) + lower * fy
         return lit
 
 
@@ -109,16 +106,10 @@ def trace(shapes: Sequence[Shape], camera: Camera, weather: Weather, width: int,
     pixel = order[np.searchsorted(index.ravel()[order], 0) :]
     shape, n = index.ravel()[pixel], len(pixel)
     traced = Traced(
-        depth=depth,
-        pixel=pixel,
-        part=np.empty(n, np.uint8),
-        element=np.empty(n, np.uint8),
-        material=np.empty(n, np.int16),
-        normal=np.empty((n, 3), np.float32),
-        texture=np.empty((2, n), np.float32),
-        shade=np.empty(n, np.float32),
-        sunlit=np.empty(n, np.float32),
-    )
+        depth=depth, pixel=pixel, part=np.empty(n, np.uint8), element=np.empty(n, np.uint8),
+        material=np.empty(n, np.int16), normal=np.empty((n, 3), np.float32),
+        texture=np.empty((2, n), np.float32), shade=np.empty(n, np.float32), sunlit=np.empty(n, np.float32),
+    )  # fmt: skip
     rays, position = _flat(camera, width, height)[pixel].T, camera.position.astype(np.float32)
     to_sun = tuple(weather.to_sun.tolist())
     starts = np.flatnonzero(np.diff(shape, prepend=-1)).tolist()
@@ -179,14 +170,9 @@ def _lit(
     color *= light * hits.shade[:, None]
     shiny = np.flatnonzero(gloss)
     if len(shiny):
-        color[shiny] += _glint(
-            ray[shiny] / length[shiny, None],
-            hits.normal[shiny],
-            gloss[shiny],
-            color[shiny],
-            sunlight[shiny],
-            weather,
-        )
+        view = ray[shiny] / length[shiny, None]
+        normal, matte = hits.normal[shiny], color[shiny]
+        color[shiny] += _glint(view, normal, gloss[shiny], matte, sunlight[shiny], weather)
     clear = np.exp(-distance * length / weather.haze)[:, None]
     return color * clear + floats(weather.horizon) * (1 - clear)
 
@@ -211,10 +197,8 @@ def _sky(rays, weather: Weather) -> Float[Array, "n 3"]:
     above = np.flatnonzero(up > 0.02)
     if weather.clouds > 0 and len(above):
         # Clouds lie on a plane overhead, so they shrink towards the horizon.
-        x, y = (
-            rays[above, i] / (rays[above, 2] + 0.15 * np.hypot(rays[above, 0], rays[above, 1]))
-            for i in (0, 1)
-        )
+        height = rays[above, 2] + 0.15 * np.hypot(rays[above, 0], rays[above, 1])
+        x, y = (rays[above, i] / height for i in (0, 1))
         noise = fractal_noise(x * 1.5, y * 1.5, weather.cloud_seed, 5)
         cover = np.clip((noise - 0.75 + 0.45 * weather.clouds) * 4, 0, 1)[:, None]
         bright = floats(weather.horizon).max() * (1.05 - 0.25 * cover * weather.clouds)

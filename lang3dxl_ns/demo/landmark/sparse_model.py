@@ -98,9 +98,8 @@ def sample_points(shot: Shot, camera: Camera, count: int, rng: np.random.Generat
     chosen = rng.choice(weight.size, count, replace=False, p=(weight / total).ravel().astype(np.float64))
     row, column = np.divmod(chosen, width)
     focal = camera.focal * max(width, height)
-    ray = np.stack(
-        [(column + 0.5 - width / 2) / focal, (row + 0.5 - height / 2) / focal, np.ones(count)], axis=1
-    )
+    x, y = (column + 0.5 - width / 2) / focal, (row + 0.5 - height / 2) / focal
+    ray = np.stack([x, y, np.ones(count)], axis=1)
     points = (ray * shot.depth[row, column, None]) @ camera.rotation + camera.position
     return points, shot.image[row, column]
 
@@ -193,16 +192,12 @@ def write_model(
     for i, photo in enumerate(photos):
         camera_id = 1 if one_camera else photo.number
         if not model.exists_camera(camera_id):
-            focal = photo.camera.focal * max(photo.width, photo.height)
-            model.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    model="SIMPLE_PINHOLE",
-                    width=photo.width,
-                    height=photo.height,
-                    params=[focal, photo.width / 2, photo.height / 2],
-                    camera_id=camera_id,
-                )
+            width, height = photo.width, photo.height
+            pinhole = [photo.camera.focal * max(width, height), width / 2, height / 2]
+            camera = pycolmap.Camera(
+                model="SIMPLE_PINHOLE", width=width, height=height, params=pinhole, camera_id=camera_id
             )
+            model.add_camera_with_trivial_rig(camera)
         own = order[starts[i] : starts[i + 1]]
         image = pycolmap.Image(
             name=f"{photo.number:04d}.jpg",
@@ -214,9 +209,8 @@ def write_model(
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
         for keypoint, point in enumerate(tracks.point[own].tolist()):
             elements[point].append((photo.number, keypoint))
-    for xyz, color, observations in zip(
-        similarity.apply(tracks.points), tracks.colors, elements, strict=True
-    ):
+    places = similarity.apply(tracks.points)
+    for xyz, color, observations in zip(places, tracks.colors, elements, strict=True):
         track = pycolmap.Track()
         for number, keypoint in observations:
             track.add_element(number, keypoint)

@@ -11,7 +11,7 @@ from lang3dxl_ns.demo.landmark.labels import PART
 from lang3dxl_ns.demo.landmark.materials import MASONRY, colored, make_material
 from lang3dxl_ns.demo.landmark.openings import Openings
 from lang3dxl_ns.demo.landmark.shape_list import Point, ShapeList
-from lang3dxl_ns.demo.landmark.vocabulary import Builder, ahead
+from lang3dxl_ns.demo.landmark.vocabulary import Builder, above, ahead
 
 
 def place_surroundings(b: Builder, center, radius: float) -> None:
@@ -61,22 +61,13 @@ def _tree(b: Builder, foot: Point) -> None:
             b.cone("tree", leaves, (x, y, height * 0.12), height * b.between(0.1, 0.2), 0.0, height)
         else:
             for i in range(3):
-                b.cone(
-                    "tree",
-                    leaves,
-                    (x, y, height * (0.12 + 0.26 * i)),
-                    height * (0.24 - 0.06 * i),
-                    0.0,
-                    height * 0.46,
-                )
+                part = (x, y, height * (0.12 + 0.26 * i))
+                b.cone("tree", leaves, part, height * (0.24 - 0.06 * i), 0.0, height * 0.46)
         return
     for _ in range(5):
         r = height * b.between(0.16, 0.26)
-        blob = (
-            x + height * b.between(-0.15, 0.15),
-            y + height * b.between(-0.15, 0.15),
-            height * b.between(0.55, 0.85),
-        )
+        dx, dy = (height * b.between(-0.15, 0.15) for _ in range(2))
+        blob = (x + dx, y + dy, height * b.between(0.55, 0.85))
         b.ellipsoid("tree", leaves, blob, (r, r, r * b.between(0.8, 1.1)))
 
 
@@ -86,41 +77,24 @@ def _house(b: Builder, foot: Point) -> None:
     b.role["house"] = b.add_material(make_material(str(b.rng.choice(MASONRY)), b.rng))
     b.box("house", "house", foot, (width, depth, height), yaw)
     if b.chance(0.8):
-        x, y, z = foot
-        b.gable(
-            "house", "roof", (x, y, z + height), width * 1.1, depth * 1.05, width * b.between(0.3, 0.5), yaw
-        )
+        rise = width * b.between(0.3, 0.5)
+        b.gable("house", "roof", above(foot, height), width * 1.1, depth * 1.05, rise, yaw)
     for turn, across, out in ((0, depth, width), (math.pi / 2, width, depth), (math.pi, depth, width)):
         facing = yaw + turn
         wall = ahead((foot[0], foot[1], 0.4), facing, out / 2 + 0.04)
-        b.shapes.append(
-            Openings(
-                part=PART["house"],
-                material=b.role["glass"],
-                position=wall,
-                yaw=facing,
-                element=0,
-                trim_material=b.role["house"],
-                field=(across * 0.9, height - 0.6),
-                columns=max(2, int(across / 2.6)),
-                rows=max(1, int(height / 2.8)),
-                width=1.0,
-                height=1.5,
-                outline="rectangle",
-                filling="mullion",
-                depth=0.2,
-                orders=1,
-                step=0.06,
-                surround=0.12,
-            )
-        )
+        windows = Openings(
+            PART["house"], b.role["glass"], wall, facing, 0, trim_material=b.role["house"],
+            field=(across * 0.9, height - 0.6), columns=max(2, int(across / 2.6)),
+            rows=max(1, int(height / 2.8)), width=1.0, height=1.5, outline="rectangle", filling="mullion",
+            depth=0.2, orders=1, step=0.06, surround=0.12,
+        )  # fmt: skip
+        b.shapes.append(windows)
 
 
 def _lamp(b: Builder, foot: Point) -> None:
-    x, y, z = foot
     height = b.between(4, 7)
     b.cone("lamp", "iron", foot, 0.13, 0.07, height)
-    b.ellipsoid("lamp", "trim", (x, y, z + height), (0.32, 0.32, 0.4))
+    b.ellipsoid("lamp", "trim", above(foot, height), (0.32, 0.32, 0.4))
 
 
 def _person(b: ShapeList, foot: Point) -> None:
@@ -133,10 +107,8 @@ def _person(b: ShapeList, foot: Point) -> None:
     for side in (-1, 1):
         leg = ahead(foot, yaw, side * 0.12 * size)
         b.cone("person", "trousers", leg, 0.08 * size, 0.12 * size, 0.85 * size)
-        arm = ahead((x, y, z + 0.8 * size), yaw, side * 0.27 * size)
-        b.ellipsoid(
-            "person", "coat", (arm[0], arm[1], z + 1.1 * size), (0.08 * size, 0.08 * size, 0.33 * size)
-        )
+        arm = ahead((x, y, z + 1.1 * size), yaw, side * 0.27 * size)
+        b.ellipsoid("person", "coat", arm, (0.08 * size, 0.08 * size, 0.33 * size))
     b.ellipsoid("person", "coat", (x, y, z + 1.13 * size), (0.24 * size, 0.2 * size, 0.4 * size))
     b.ellipsoid("person", "skin", (x, y, z + 1.63 * size), (0.11 * size, 0.11 * size, 0.14 * size))
 
@@ -147,12 +119,11 @@ def _car(b: ShapeList, foot: Point) -> None:
     for role in ("glass", "iron"):
         b.role[role] = b.add_material(make_material(role, rng))
     yaw, length = b.between(0, math.pi), b.between(3.8, 4.8)
-    x, y, z = foot
-    b.box("car", "body", (x, y, z + 0.3), (length, 1.8, 0.6), yaw)
-    cabin = ahead((x, y, z + 0.9), yaw, -0.2)
+    b.box("car", "body", above(foot, 0.3), (length, 1.8, 0.6), yaw)
+    cabin = ahead(above(foot, 0.9), yaw, -0.2)
     b.box("car", "glass", cabin, (length * 0.52, 1.6, 0.42), yaw)
-    b.box("car", "body", (cabin[0], cabin[1], z + 1.32), (length * 0.44, 1.55, 0.1), yaw)
+    b.box("car", "body", (cabin[0], cabin[1], foot[2] + 1.32), (length * 0.44, 1.55, 0.1), yaw)
     for along in (-1, 1):
         for side in (-1, 1):
-            hub = ahead((x, y, z + 0.32), yaw, along * length * 0.31, side * 0.88)
+            hub = ahead(above(foot, 0.32), yaw, along * length * 0.31, side * 0.88)
             b.ellipsoid("car", "iron", hub, (0.33, 0.33, 0.33))

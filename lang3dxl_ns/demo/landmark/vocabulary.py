@@ -37,12 +37,12 @@ class Builder(ShapeList):
     def _choose_materials(self) -> None:
         """All parts draw from the same two palettes, so that colour doesn't reveal a category."""
         rng = self.rng
-        masonry = [
-            self.add_material(make_material(name, rng)) for name in rng.choice(MASONRY, 3, replace=False)
-        ]
-        covering = [
-            self.add_material(make_material(name, rng)) for name in rng.choice(COVERING, 3, replace=False)
-        ]
+
+        def palette(names: tuple[str, ...]) -> list[int]:
+            chosen = rng.choice(names, 3, replace=False)
+            return [self.add_material(make_material(name, rng)) for name in chosen]
+
+        masonry, covering = palette(MASONRY), palette(COVERING)
         wall = masonry[0]
         for role, share in (("trim", 0.25), ("tower", 0.7), ("minaret", 0.5), ("column", 0.3), ("drum", 0.7)):
             self.role[role] = wall if self.chance(share) else int(rng.choice(masonry[1:]))
@@ -61,6 +61,11 @@ def ahead(point: Point, facing: float, distance: float, aside: float = 0.0) -> P
     return point[0] + c * distance - s * aside, point[1] + s * distance + c * aside, point[2]
 
 
+def above(point: Point, height: float) -> Point:
+    """A point `height` meters above another."""
+    return point[0], point[1], point[2] + height
+
+
 def window_row(
     b: Builder,
     part: str,
@@ -70,7 +75,6 @@ def window_row(
     height: float,
     columns: int | None = None,
     rows: int = 1,
-    outline: str | None = None,
     filling: str | None = None,
 ) -> None:
     """Windows on a field of wall whose lower edge is centred at `foot`.
@@ -78,123 +82,74 @@ def window_row(
     Without `columns`, as many as fit well. Their height stays within 1/60 … 1/8 of the façade's.
     """
     smallest, largest = b.facade_height / 60, b.facade_height / 8
-    outline = outline or b.window_outline
     tall = float(np.clip(b.between(0.6, 0.9) * height / rows, smallest, largest))
-    slender = 1.0 if outline == "circle" else b.between(0.32, 0.55)
-    wide = tall * slender
+    wide = tall * b.between(0.32, 0.55)
     if columns is None:
         columns = max(1, round(width / (wide * b.between(1.7, 2.6))))
     wide = min(wide, 0.8 * width / columns)
-    if outline == "circle":
-        tall = wide
     if tall > height / rows or min(wide, tall) < smallest * 0.3:
         return
-    _opening(
-        b,
-        part,
-        "window",
-        foot,
-        facing,
-        (width, height),
-        columns,
-        rows,
-        (wide, tall),
-        outline,
-        filling or b.glazing,
-    )
+    style, tiles = (b.window_outline, filling or b.glazing), (columns, rows)
+    _opening(b, part, "window", foot, facing, (width, height), (wide, tall), style, tiles)
 
 
 def rose_window(b: Builder, part: str, foot: Point, facing: float, diameter: float) -> None:
     diameter = min(diameter, b.facade_height / 8)
-    size = (diameter, diameter)
-    field_ = (diameter * 1.5, diameter * 1.3)
-    _opening(b, part, "window", foot, facing, field_, 1, 1, size, "circle", "rose")
+    field_, size = (diameter * 1.5, diameter * 1.3), (diameter, diameter)
+    _opening(b, part, "window", foot, facing, field_, size, ("circle", "rose"))
 
 
 def portal(b: Builder, part: str, foot: Point, facing: float, width: float, height: float) -> None:
     """A door with a stepped reveal, sometimes under a gable or behind steps."""
     orders = int(b.rng.integers(1, 5))
     step = 0.26 * width / 2 / orders
-    size = (width, height)
-    _opening(
-        b,
-        part,
-        "portal",
-        foot,
-        facing,
-        (width * 1.5, height * 1.12),
-        1,
-        1,
-        size,
-        b.portal_outline,
-        b.doors,
-        orders,
-        step,
-    )
+    field_, style = (width * 1.5, height * 1.12), (b.portal_outline, b.doors)
+    _opening(b, part, "portal", foot, facing, field_, (width, height), style, orders=orders, step=step)
     for i in range(int(b.rng.integers(0, 4))):
         depth = 1.6 - 0.4 * i
-        b.box(
-            "ground",
-            "trim",
-            ahead(foot, facing, depth / 2),
-            (depth, width * 1.9 - 0.5 * i, 0.16 * (i + 1)),
-            facing,
-        )
+        slab = (depth, width * 1.9 - 0.5 * i, 0.16 * (i + 1))
+        b.box("ground", "trim", ahead(foot, facing, depth / 2), slab, facing)
 
 
 def niche_row(b: Builder, foot: Point, facing: float, width: float, height: float, columns: int) -> None:
     """Blind arches: like windows, but walled up."""
     tall = min(0.86 * height, b.facade_height / 8)
     wide = min(tall * 0.5, 0.7 * width / columns)
-    _opening(b, "clutter", "none", foot, facing, (width, height), columns, 1, (wide, tall), "round", "plain")
+    style = ("round", "plain")
+    _opening(b, "clutter", "none", foot, facing, (width, height), (wide, tall), style, (columns, 1))
 
 
-def _opening(
-    b, part, element, foot, facing, field_, columns, rows, size, outline, filling, orders=1, step=None
-) -> None:
+def _opening(b, part, element, foot, facing, field_, size, style, tiles=(1, 1), orders=1, step=None) -> None:
+    outline, filling = style
     fillings = {"portal": "shadow" if filling == "open" else "door", "window": "glass", "none": "wall"}
     material = fillings[element] if filling != "louvre" else "shadow"
     depth = 0.35 + 0.3 * orders if element == "portal" else min(0.28 * size[0], 0.7)
-    b.shapes.append(
-        Openings(
-            part=PART[part],
-            material=b.role[material],
-            position=ahead(foot, facing, 0.04),
-            yaw=facing,
-            element=ELEMENT[element],
-            trim_material=b.role["trim"],
-            field=field_,
-            columns=columns,
-            rows=rows,
-            width=size[0],
-            height=size[1],
-            outline=outline,
-            filling=filling,
-            depth=depth,
-            orders=orders,
-            step=0.05 * size[0] if step is None else step,
-            surround=min(0.14 * size[0], 0.4) if element != "none" else 0.0,
-        )
-    )
+    surround = min(0.14 * size[0], 0.4) if element != "none" else 0.0
+    opening = Openings(
+        PART[part], b.role[material], ahead(foot, facing, 0.04), facing, ELEMENT[element],
+        trim_material=b.role["trim"], field=field_, columns=tiles[0], rows=tiles[1], width=size[0],
+        height=size[1], outline=outline, filling=filling, depth=depth, orders=orders,
+        step=0.05 * size[0] if step is None else step, surround=surround,
+    )  # fmt: skip
+    b.shapes.append(opening)
 
 
 def dome(
     b: Builder, foot: Point, radius: float, drum: float, windows: bool = True, onion: bool | None = None
 ) -> None:
     """A dome on a drum of the given height, with windows around the drum."""
-    x, y, z = foot
     if drum > 0:
         b.cone("wall", "drum", foot, radius * 1.02, radius * 1.02, drum)
-        b.cone("wall", "trim", (x, y, z + drum * 0.92), radius * 1.08, radius * 1.08, drum * 0.1)
+        b.cone("wall", "trim", above(foot, drum * 0.92), radius * 1.08, radius * 1.08, drum * 0.1)
     if windows and drum > 1:
         sides = int(b.rng.choice([8, 12, 16]))
         for i in range(sides):
             facing = 2 * math.pi * i / sides
             # A flat field on a round drum: place it in front of the curve's middle.
             side = 2 * math.pi * radius / sides
-            place = ahead((x, y, z + drum * 0.12), facing, radius * 1.02)
+            place = ahead(above(foot, drum * 0.12), facing, radius * 1.02)
             window_row(b, "wall", place, facing, side * 0.6, drum * 0.74, columns=1)
-    z += drum
+    x, y, z = above(foot, drum)
     if b.onion if onion is None else onion:
         top = z + _onion(b, (x, y, z), radius)
     else:
@@ -202,13 +157,8 @@ def dome(
         top = z + radius * b.dome_rise
         if b.lantern and radius > 3:
             b.cone("dome", "trim", (x, y, top - 0.06 * radius), radius * 0.16, radius * 0.16, radius * 0.34)
-            b.ellipsoid(
-                "dome",
-                "dome",
-                (x, y, top + 0.28 * radius),
-                (radius * 0.19, radius * 0.19, radius * 0.2),
-                cut=0.0,
-            )
+            ball = (radius * 0.19, radius * 0.19, radius * 0.2)
+            b.ellipsoid("dome", "dome", (x, y, top + 0.28 * radius), ball, cut=0.0)
             top += 0.46 * radius
     if radius > 1:
         b.cone("dome", "trim", (x, y, top - 0.05 * radius), radius * 0.04, radius * 0.015, radius * 0.4)
@@ -235,27 +185,20 @@ def spire(b: Builder, foot: Point, radius: float, height: float) -> None:
         sides = int(b.rng.choice([4, 8]))
         b.prism("spire", "spire", foot, radius, height, sides, taper=1.0, yaw=0.0)
     if height > 5:
-        x, y, z = foot
         bar = 0.03 * radius + 0.03
+        x, y, z = foot
         b.box("spire", "trim", (x, y, z + height - 0.3), (bar, bar, 0.45 * radius + 0.6))
         b.box("spire", "trim", (x, y, z + height + 0.3 * radius), (bar, 5 * bar, bar))
 
 
 def pinnacle(b: Builder, foot: Point, radius: float, height: float) -> None:
     """A small spire on a square shaft."""
-    x, y, z = foot
     b.box("spire", "trim", foot, (radius * 1.7, radius * 1.7, height * 0.35))
-    b.prism("spire", "spire", (x, y, z + height * 0.35), radius, height * 0.65, 4, taper=1.0, yaw=0.0)
+    b.prism("spire", "spire", above(foot, height * 0.35), radius, height * 0.65, 4, taper=1.0)
 
 
 def tower(
-    b: Builder,
-    foot: Point,
-    width: float,
-    height: float,
-    top: str,
-    sides: int = 4,
-    bare: tuple[float, ...] = (),
+    b: Builder, foot: Point, width: float, height: float, top: str, sides=4, bare: tuple[float, ...] = ()
 ) -> None:
     """A tower in storeys with belfry openings; top: spire, flat, pyramid, dome or onion.
 
@@ -281,19 +224,10 @@ def tower(
             if i == 0 and (facing in bare or storey < 4):
                 continue
             place = ahead((x, y, z + i * storey + 0.15 * storey), facing, width / 2)
-            across = width * (0.8 if sides == 4 else 0.38)
+            field_ = width * (0.8 if sides == 4 else 0.38), storey * 0.66
             belfry = i == storeys - 1
-            filling = "louvre" if belfry and b.lantern else None
-            window_row(
-                b,
-                "tower",
-                place,
-                facing,
-                across,
-                storey * 0.66,
-                columns if belfry else max(1, columns - 1),
-                filling=filling,
-            )
+            filling, across = "louvre" if belfry and b.lantern else None, columns - (not belfry)
+            window_row(b, "tower", place, facing, *field_, max(1, across), filling=filling)
     _tower_top(b, (x, y, z + height), width, top)
 
 
@@ -352,13 +286,8 @@ def minaret(
         b.cone("minaret", "cap", (x, y, top), radius * 1.2, 0.0, height * 0.13)
         top += height * 0.13
     elif cap == "dome":
-        b.ellipsoid(
-            "minaret",
-            "cap",
-            (x, y, top + 0.4 * radius),
-            (radius * 1.25, radius * 1.25, radius * 1.6),
-            cut=-0.4 * radius,
-        )
+        radii = (radius * 1.25, radius * 1.25, radius * 1.6)
+        b.ellipsoid("minaret", "cap", (x, y, top + 0.4 * radius), radii, cut=-0.4 * radius)
         top += 2 * radius
     else:
         for i in range(6):
