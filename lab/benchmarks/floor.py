@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from lab.benchmarks.dense_rasterizer import count_pairs
-from lang3dxl_ns.common.reports import interleaved_times
+from lab.benchmarks.interleaved import interleaved_times
 from lang3dxl_ns.rendering import Camera, Gaussians
 
 _FLOAT = 4  # bytes

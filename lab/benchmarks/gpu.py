@@ -16,13 +16,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from lab.benchmarks.interleaved import interleaved_times
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
-    interleaved_times,
     markdown_table,
     write_report,
 )

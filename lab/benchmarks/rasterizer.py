@@ -25,6 +25,7 @@ from lab.benchmarks.dense_rasterizer import (
     count_pairs,
     render_dense,
 )
+from lab.benchmarks.interleaved import interleaved_times
 from lab.benchmarks.peak_memory import MEBIBYTE, peak_memory
 from lab.benchmarks.rasterizer_scenes import (
     CHANNELS,
@@ -40,7 +41,6 @@ from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
-    interleaved_times,
     markdown_table,
     progress_bar,
     write_report,

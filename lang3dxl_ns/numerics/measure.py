@@ -7,12 +7,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from statistics import median
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.common.reports import interleaved_times
+from lang3dxl_ns.common.reports import synchronize
 
 Maps = dict[str, Tensor]
 Function = Callable[[Maps], Mapping[str, Tensor]]
@@ -134,7 +135,15 @@ def measure(case: Case, mode: str, device: torch.device | str = "cpu", repeats: 
         _gradients(again, leaves, upstream)
 
     clock = time.process_time if torch.device(device).type == "cpu" else time.perf_counter
-    seconds = interleaved_times({"it": work}, repeats, 0.2, clock)["it"] if repeats else [0.0]
+    seconds: list[float] = []
+    for number in range(repeats and repeats + 1):
+        start = clock()
+        work()
+        synchronize()
+        if number:  # the first warms up
+            seconds.append(clock() - start)
+        if sum(seconds) > 0.2:
+            break
     return Row(
         case.component,
         case.name,
@@ -145,7 +154,7 @@ def measure(case: Case, mode: str, device: torch.device | str = "cpu", repeats: 
         gradient_rms=_worst(error.rms for error in slopes) if slopes else None,
         flipped=1 - _share(settled),
         finite=all(error.finite for error in (*outputs, *slopes)),
-        ms=1e3 * sorted(seconds)[len(seconds) // 2],
+        ms=1e3 * median(seconds or [0.0]),
         bounds=case.bounds[mode],
         note=case.note,
     )

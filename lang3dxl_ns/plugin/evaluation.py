@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -44,12 +45,20 @@ _COLORS_OF_LIGHT = ("psnr", "ssim", "lpips")
 """Image metrics that are meaningless where views are lit differently from the photos."""
 
 
-class Settings(Protocol):
-    """What to evaluate: see `Lang3DXLPipelineConfig`."""
+@dataclass
+class EvaluationSettings:
+    """What to evaluate."""
 
-    ground_truth: Path | None
-    ground_truth_layout: Layout | Literal["auto"]
-    evaluated_photos: Split
+    ground_truth: Path | None = None
+    """Folder of ground truth, in any of the layouts of docs/evaluation.md: `ns-eval` then reports how well
+    words find their pixels. Default: ground_truth/ or label/ in the data folder, or label/<scene> beside it,
+    if present."""
+    ground_truth_layout: Layout | Literal["auto"] = "auto"
+    """HolyScenes' masks, LERF-OVS' and PT-OVS' labels, or plain masks; "auto" detects it."""
+    evaluated_photos: Split = "held-out"
+    """Photos that `ns-eval` evaluates: those held out of training (and the scene's test views, if any); the
+    training photos with ground truth (the main tables of HolyScenes use photos seen in training); or the test
+    views alone."""
 
 
 class Evaluation:
@@ -61,7 +70,9 @@ class Evaluation:
         settings: which photos, against which ground truth.
     """
 
-    def __init__(self, model: Lang3DXLModel, datamanager: Lang3DXLDataManager, settings: Settings) -> None:
+    def __init__(
+        self, model: Lang3DXLModel, datamanager: Lang3DXLDataManager, settings: EvaluationSettings
+    ) -> None:
         self._model, self._data, self._settings = model, datamanager, settings
         self._engine: QueryEngine | None = None
         """Of the evaluation that is under way."""

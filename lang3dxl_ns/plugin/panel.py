@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import viser
 import viser.theme
@@ -39,33 +39,29 @@ _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""
 
 
-class Asked(Protocol):
-    """What the panel asks: the pipeline."""
-
-    model: Lang3DXLModel
-
-    @property
-    def scene_file(self) -> SceneFile:
-        """Photos, cameras and CLIP."""
-
-    @property
-    def query(self) -> str:
-        """The prompts to begin with."""
-
-    def learn_words(self) -> None:
-        """Gather the photos' features onto the present Gaussians, and learn codes."""
-
-
 class AskPanel(ViewerControl):
     """A text box, heat maps over the view, and the views that show a match best.
 
     nerfstudio's viewer finds it as an attribute of the pipeline, and sets it up on start.
+
+    Args:
+        model: what is asked.
+        scene_file: returns photos, cameras and CLIP.
+        query: returns the prompts to begin with.
+        learn_words: gathers the photos' features onto the present Gaussians, and learns codes.
     """
 
-    def __init__(self, pipeline: Asked) -> None:
+    def __init__(
+        self,
+        model: Lang3DXLModel,
+        scene_file: Callable[[], SceneFile],
+        query: Callable[[], str],
+        learn_words: Callable[[], None],
+    ) -> None:
         guard_viewers()  # before nerfstudio starts a server
         keep_frames_recognizable()
-        self._pipeline = pipeline
+        self._model, self._scene_file, self._query = model, scene_file, query
+        self._learn_words = learn_words
         self._views: list[tuple[Found, int]] = []
         """Views to fly to: a match and the number of its view, best first, prompt after prompt."""
         self._place = -1
@@ -81,7 +77,7 @@ class AskPanel(ViewerControl):
         if viewer.trainer is None:
             viewer.pause_train.visible = False  # there is nothing to pause
         self._leave_out_logo(guard.public)
-        gui, model = self.viser_server.gui, self._pipeline.model
+        gui, model = self.viser_server.gui, self._model
         with gui.add_folder("Ask the scene", order=-1):
             if model.semantic_field is None:
                 gui.add_markdown(NO_SEMANTICS)
@@ -90,7 +86,7 @@ class AskPanel(ViewerControl):
             with gui.add_folder("Who can open this page", expand_by_default=False):
                 gui.add_markdown(guard.who_may_look)
         CONSOLE.print(guard.who_may_look.replace("`", ""), soft_wrap=True, highlight=False)
-        self._photos = [photo for photo in self._pipeline.scene_file.photos if photo.split == "train"]
+        self._photos = [photo for photo in self._scene_file().photos if photo.split == "train"]
         self.viser_server.on_client_connect(self._welcome)
         if model.semantic_field is not None:
             self._start(viewer)
@@ -106,19 +102,19 @@ class AskPanel(ViewerControl):
 
     def _start(self, viewer: Viewer) -> None:
         self.conversation = Conversation(
-            self._pipeline.model,
-            self._pipeline.scene_file,
+            self._model,
+            self._scene_file(),
             viewer.log_filename.parent,
             viewer.train_lock or nullcontext(),
             learning=lambda: viewer.trainer is not None and viewer.trainer.training_state != "completed",
-            learn=self._pipeline.learn_words,
+            learn=self._learn_words,
             shown=self._outputs_shown,
             watch=self._say,
         )
         self._asker, self._finder = Worker("ask"), Worker("find")
-        self._pipeline.model.answers = self
-        if self._pipeline.query:
-            self._question.value = self._pipeline.query
+        self._model.answers = self
+        if query := self._query():
+            self._question.value = query
 
     def _leave_out_logo(self, share: bool) -> None:
         """nerfstudio's title bar without its logo, which is loaded from the Internet."""
@@ -212,7 +208,7 @@ class AskPanel(ViewerControl):
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """New clients start at an overview photo."""
-        middle = tuple(self._pipeline.model.means.detach().median(0).values.tolist())
+        middle = tuple(self._model.means.detach().median(0).values.tolist())
         _place_camera(client, overview(self._photos, middle).camera, middle)
 
     def _fly_on(self, client: viser.ClientHandle | None) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -17,9 +17,8 @@ from torch import Tensor
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import progress_bar
-from lang3dxl_ns.evaluation.ground_truth import Layout
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
-from lang3dxl_ns.plugin.evaluation import Evaluation, Split
+from lang3dxl_ns.plugin.evaluation import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.lift_features import learn_from_photos
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.panel import AskPanel
@@ -51,22 +50,12 @@ class RenderedAnswers:
 
 
 @dataclass
-class Lang3DXLPipelineConfig(VanillaPipelineConfig):
+class Lang3DXLPipelineConfig(EvaluationSettings, VanillaPipelineConfig):
     """Configuration of the pipeline."""
 
     _target: type = field(default_factory=lambda: Lang3DXLPipeline)
     datamanager: Lang3DXLDataManagerConfig = field(default_factory=Lang3DXLDataManagerConfig)
     model: Lang3DXLModelConfig = field(default_factory=Lang3DXLModelConfig)
-    ground_truth: Path | None = None
-    """Folder of ground truth, in any of the layouts of docs/evaluation.md: `ns-eval` then reports how well
-    words find their pixels. Default: ground_truth/ or label/ in the data folder, or label/<scene> beside it,
-    if present."""
-    ground_truth_layout: Layout | Literal["auto"] = "auto"
-    """HolyScenes' masks, LERF-OVS' and PT-OVS' labels, or plain masks; "auto" detects it."""
-    evaluated_photos: Split = "held-out"
-    """Photos that `ns-eval` evaluates: those held out of training (and the scene's test views, if any); the
-    training photos with ground truth (the main tables of HolyScenes use photos seen in training); or the test
-    views alone."""
     query: str = ""
     """Prompts for `ns-render` ("rose window; dome"), and the viewer's initial ones; the environment variable
     LANG3DXL_QUERY overrides it."""
@@ -84,7 +73,8 @@ class Lang3DXLPipeline(VanillaPipeline):
     def __init__(self, *args, **kwargs):
         print_user_errors_plainly()
         super().__init__(*args, **kwargs)
-        self.panel = AskPanel(self)  # nerfstudio's viewer looks for controls here
+        # nerfstudio's viewer looks for controls here.
+        self.panel = AskPanel(self.model, lambda: self.scene_file, lambda: self.query, self.learn_words)
 
     @cached_property
     def evaluation(self) -> Evaluation:

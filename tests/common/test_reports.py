@@ -1,4 +1,4 @@
-"""Benchmark reports: machine line, interleaved times, atomic writes."""
+"""Benchmark reports: machine line, atomic writes."""
 
 import json
 import os
@@ -12,7 +12,6 @@ import torch
 from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
-    interleaved_times,
     markdown_table,
     write_report,
 )
@@ -38,24 +37,6 @@ def test_command_line_has_exactly_the_flags_that_differ_from_their_defaults():
     assert command_line("lang3dxl benchmark", Settings(Path("a b"))) == "lang3dxl benchmark --out 'a b'"
     changed = Settings(Path("o"), quick=True, image_sizes=((8, 6), (4, 3)))
     assert command_line("x", changed) == "x --out o --quick --image-sizes 8 6 4 3"
-
-
-def test_candidates_run_in_turn_and_the_warm_up_is_left_out():
-    calls = []
-    times = interleaved_times({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, repeats=3)
-    assert calls == ["a", "b"] * 4
-    assert {name: len(taken) for name, taken in times.items()} == {"a": 3, "b": 3}
-
-
-def test_a_candidate_over_its_budget_stops_and_keeps_what_it_has():
-    now = [0.0]
-
-    def taking(seconds):
-        return lambda: now.__setitem__(0, now[0] + seconds)
-
-    candidates = {"quick": taking(1), "slow": taking(4), "slower": taking(30)}
-    times = interleaved_times(candidates, repeats=5, budget_seconds=10, clock=lambda: now[0])
-    assert times == {"quick": [1] * 5, "slow": [4, 4, 4], "slower": [30]}
 
 
 def test_table_has_a_line_for_each_row_and_a_dash_for_what_is_missing():
