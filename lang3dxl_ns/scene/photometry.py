@@ -86,24 +86,18 @@ def _fit(
     point: Int[Array, " m"], photo: Int[Array, " m"], color: Float[Array, "m 3"], ray: Float[Array, "m 3"]
 ) -> Photometry:
     """Alternate between the points' means and the photos' medians until both converge."""
-    point = np.unique(point, return_inverse=True)[1]
-    count = np.bincount(point).astype(float)
-    order = np.argsort(photo, kind="stable")
-    groups = np.split(order, np.cumsum(np.bincount(photo))[:-1])
-    groups = [group for group in groups if len(group)]
+    point, photo = (np.unique(numbers, return_inverse=True)[1] for numbers in (point, photo))
+    count, groups = np.bincount(point).astype(float), _grouped(photo)
     offset = np.zeros((len(groups), 3))
-    observed = np.empty(len(photo), dtype=int)
-    for index, group in enumerate(groups):
-        observed[group] = index
     for _ in range(50):
-        mean = _point_means(point, color - offset[observed], count)
+        mean = _point_means(point, color - offset[photo], count)
         new = np.stack([np.median(color[group] - mean[point[group]], axis=0) for group in groups])
         new -= new.mean(axis=0)
         change = np.abs(new - offset).max()
         offset = new
         if change < 1e-4:
             break
-    residual = color - offset[observed] - _point_means(point, color - offset[observed], count)[point]
+    residual = color - offset[photo] - _point_means(point, color - offset[photo], count)[point]
     return Photometry(
         spread=float(np.sqrt((offset**2).mean())),
         residual=float(1.4826 * np.median(np.abs(residual))),
@@ -111,6 +105,12 @@ def _fit(
         photos=len(groups),
         points=len(count),
     )
+
+
+def _grouped(numbers: Int[Array, " m"]) -> list[Int[Array, " k"]]:
+    """The rows of every number from 0 on."""
+    order = np.argsort(numbers, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(numbers))[:-1])
 
 
 def _point_means(point: Int[Array, " m"], values: Float[Array, "m 3"], count: Float[Array, " n"]) -> Array:
@@ -121,9 +121,8 @@ def _explained_by_direction(
     point: Int[Array, " m"], residual: Float[Array, "m 3"], ray: Float[Array, "m 3"], fewest: int = 6
 ) -> float:
     """Adjusted R² of a linear function of the direction, over points seen at least `fewest` times."""
-    order = np.argsort(point, kind="stable")
     explained, total = 0.0, 0.0
-    for group in np.split(order, np.cumsum(np.bincount(point))[:-1]):
+    for group in _grouped(point):
         if len(group) < fewest:
             continue
         centered = ray[group] - ray[group].mean(axis=0)

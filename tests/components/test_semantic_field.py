@@ -296,11 +296,7 @@ def test_short_preset_learns_a_labeled_scene_in_300_steps():
     groups = [
         {"params": [codes], "lr": 3e-2},
         {"params": field.encoding_parameters(), "lr": 1e-2},
-        {
-            "params": field.decoder_parameters(),
-            "lr": 1e-2,
-            "weight_decay": 1e-5,
-        },
+        {"params": field.decoder_parameters(), "lr": 1e-2, "weight_decay": 1e-5},
     ]
     optimizer = torch.optim.Adam(groups, eps=1e-15)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 300)

@@ -23,16 +23,9 @@ def folder(tmp_path_factory):
 
 
 def write(out, **changes):
-    settings = {
-        "seed": SEED,
-        "family": "mosque",
-        "photos": PHOTOS,
-        "test_views": 6,
-        "width": SIZE[0],
-        "height": SIZE[1],
-        "workers": 1,
-    }
-    return write_scene(DemoScene(out=out, **(settings | changes)))
+    settings = {"seed": SEED, "family": "mosque", "photos": PHOTOS, "test_views": 6, "workers": 1}
+    size = {"width": SIZE[0], "height": SIZE[1]}
+    return write_scene(DemoScene(out=out, **(settings | size | changes)))
 
 
 @cache

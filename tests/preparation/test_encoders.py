@@ -142,20 +142,11 @@ def test_dense_grid_keeps_top_left_at_the_top_left(dino_folder):
 def test_a_plain_vit_is_read_at_other_grids_than_its_own(tmp_path):
     from transformers import ViTConfig, ViTModel
 
-    config = ViTConfig(
-        hidden_size=16,
-        num_hidden_layers=1,
-        num_attention_heads=2,
-        intermediate_size=32,
-        image_size=32,
-        patch_size=8,
-    )
+    width = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
+    config = ViTConfig(**width, image_size=32, patch_size=8)
     ViTModel(config, add_pooling_layer=False).save_pretrained(tmp_path / "vit")
-    assert load_dense_encoder(tmp_path / "vit", "cpu", tokens=7).encode(torch.rand(30, 40, 3)).shape == (
-        7,
-        7,
-        16,
-    )
+    encoder = load_dense_encoder(tmp_path / "vit", "cpu", tokens=7)
+    assert encoder.encode(torch.rand(30, 40, 3)).shape == (7, 7, 16)
 
 
 def test_the_builtin_models_say_once_what_they_know(capsys):

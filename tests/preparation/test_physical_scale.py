@@ -86,16 +86,12 @@ def test_relative_scales_are_seven_from_a_twentieth_to_half():
 
 @pytest.mark.parametrize(
     ("ratio", "paper", "half"),
-    [
-        (0.25, 1.96, 1.00),
-        (0.5, 1.86, 0.98),
-        (0.8, 1.69, 0.95),
-        (1.0, 1.57, 0.93),
-        (1.2, 1.46, 0.90),
-        (1.5, 1.31, 0.86),
-        (2.0, 1.11, 0.79),
-        (3.0, 0.83, 0.66),
-    ],
+    zip(
+        (0.25, 0.5, 0.8, 1.0, 1.2, 1.5, 2.0, 3.0),
+        (1.96, 1.86, 1.69, 1.57, 1.46, 1.31, 1.11, 0.83),
+        (1.00, 0.98, 0.95, 0.93, 0.90, 0.86, 0.79, 0.66),
+        strict=True,
+    ),
 )
 def test_angle_rules_differ_as_published(ratio, paper, half):
     photo = make_photo(focal=1000 / ratio)

@@ -67,18 +67,8 @@ def test_numbers_beyond_half_precision_stay_float32_and_non_numbers_are_refused(
 
 
 def test_odd_names_never_share_a_file(store):
-    names = [
-        "a/b.jpg",
-        "a_b.jpg",
-        "a b.jpg",
-        "A/b.jpg",
-        "x.jpg",
-        "x.png",
-        "x",
-        "../x.jpg",
-        "/x.jpg",
-        "x:y|z?.jpg",
-    ]
+    names = ["a/b.jpg", "a_b.jpg", "a b.jpg", "A/b.jpg", "x.jpg", "x.png", "x", "../x.jpg", "/x.jpg"]
+    names += ["x:y|z?.jpg"]
     names += ["é.jpg", "e\u0301.jpg", "n" * 300, "n" * 301, "\udcff.jpg", "a\\b.jpg", ".hidden", ""]
     for index, name in enumerate(names):
         store.write("clip", name, {"index": torch.tensor(index)}, {"name": index})

@@ -68,11 +68,7 @@ def test_shrinking_averages_instead_of_skipping(tmp_path):
 @pytest.mark.parametrize(
     ("mode", "ending"),
     [
-        ("L", "png"),
-        ("LA", "png"),
-        ("1", "png"),
-        ("P", "png"),
-        ("RGBA", "png"),
+        *((mode, "png") for mode in ("L", "LA", "1", "P", "RGBA")),
         ("CMYK", "tif"),
         ("CMYK", "jpg"),
         ("RGB", "webp"),
