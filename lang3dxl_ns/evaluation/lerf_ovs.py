@@ -18,7 +18,6 @@ from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth, check_shape
-from lang3dxl_ns.scene.camera import MOST_PIXELS
 
 _SLACK = 0.02
 """Share of a side by which hand-drawn outlines may exceed the photo; they are clipped to it."""
@@ -78,6 +77,8 @@ def read_lerf_ovs(folder: Path) -> Annotations:
 
 def _read_labels(path: Path) -> dict[str, Outlines]:
     """A photo's labels by category. Label files come from others, so everything is validated."""
+    from lang3dxl_ns.scene.camera import MOST_PIXELS  # loads torch, which a help does without
+
     content = read_json(path)
     height, width = (content["info"][side] for side in ("height", "width"))
     whole = all(type(side) is int and side > 0 for side in (height, width))

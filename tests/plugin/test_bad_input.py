@@ -94,7 +94,7 @@ def test_truncated_photo_does_not_end_the_run(start, folder, capsys, semantics):
 def test_truncated_held_out_photo_does_not_end_the_evaluation(start, folder, capsys):
     photo = sorted((folder / "images").iterdir())[0]
     photo.write_bytes(photo.read_bytes()[:-400])
-    trainer = start(folder, semantics=False)
+    trainer = start(folder)
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert f"{photo.name} is left out" in " ".join(capsys.readouterr().out.split())
     assert metrics["psnr"] > 0
