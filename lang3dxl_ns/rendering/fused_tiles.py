@@ -73,10 +73,8 @@ class _Splat(NamedTuple):
 
 
 class _Wave(NamedTuple):
-    """The rows of a wave, each with a slot for every block that it reaches."""
+    """The rows of a wave, one after the other, each with a slot for every block that it reaches."""
 
-    slots: Int[np.ndarray, " wave+1"]
-    """First slot of each row."""
     places: Int[np.ndarray, " slots"]
     """First pixel of each slot's block."""
     alphas: Float[np.ndarray, " slots*lanes"]
@@ -242,7 +240,7 @@ def backward_tiles(tiles, plan, maps, trace, absolutes, sums):
     transmittance, behind, room = _aligned(PIXELS, like), _aligned(PIXELS, like), WAVE * PIXELS
     alphas, weights, values = _aligned(room, like), _aligned(room, like), _aligned(room, like)
     slots, places = np.empty(WAVE + 1, np.int64), np.empty(WAVE * _BLOCKS, np.int64)
-    found, masks = _Wave(slots, places, alphas, weights, values), np.empty(WAVE, np.int64)
+    found, masks = _Wave(places, alphas, weights, values), np.empty(WAVE, np.int64)
     across, down, lines = _pixel_centers(like)
     zero = lines * 0.0
     for tile in tiles:
@@ -278,12 +276,13 @@ def backward_tiles(tiles, plan, maps, trace, absolutes, sums):
                     slot += 1
             slots[count] = slot
             for k in range(count - 1, -1, -1):
-                if slots[k] < slots[k + 1]:
+                first, last = slots[k], slots[k + 1]
+                if first < last:
                     rank = plan.ranks[begin + k]
                     splat = _splat(plan.splats, rank, corner_x, corner_y)
-                    _add_values(plan, upstream, rank, k, found)
-                    _add_shape(across, down, splat, k, found, behind, absolutes, zero, sums[rank])
-                    _add_channels(upstream, k, found, channels, zero, sums[rank])
+                    _add_values(plan, upstream, rank, first, last, found)
+                    _add_shape(across, down, splat, first, last, found, behind, absolutes, zero, sums[rank])
+                    _add_channels(upstream, first, last, found, channels, zero, sums[rank])
 
 
 @numba.njit(forceinline=True)
@@ -303,12 +302,12 @@ def _read_upstream(plan, maps, corner_x, corner_y, upstream):
 
 
 @numba.njit(forceinline=True)
-def _add_values(plan, upstream, rank, k, found):
+def _add_values(plan, upstream, rank, first, last, found):
     """Σ channel × upstream of a row, over the channels that have a gradient to the geometry."""
     channels = plan.table.shape[1]
     for c in range(0, plan.attached, UNROLL):
         column = rank * channels + c
-        for slot in range(found.slots[k], found.slots[k + 1]):
+        for slot in range(first, last):
             at = entry(found.places, slot) * channels + c * LANES
             value = load(upstream, at) * entry(plan.table, column)
             value += load(upstream, at + LANES) * entry(plan.table, column + 1)
@@ -320,10 +319,10 @@ def _add_values(plan, upstream, rank, k, found):
 
 
 @numba.njit(forceinline=True)
-def _add_shape(across, down, splat, k, found, behind, absolutes, zero, sums):
+def _add_shape(across, down, splat, first, last, found, behind, absolutes, zero, sums):
     """Gradients of a row's conic, moments and opacity; moves `behind` in front of it."""
     m, mx, my, mxx, mxy, myy, abs_x, abs_y = zero, zero, zero, zero, zero, zero, zero, zero
-    for slot in range(found.slots[k], found.slots[k + 1]):
+    for slot in range(first, last):
         at = entry(found.places, slot)
         dx, dy = load(across, at) - splat.x, load(down, at) - splat.y
         back, alpha = load(behind, at), load(found.alphas, slot * LANES)
@@ -353,11 +352,11 @@ def _add_shape(across, down, splat, k, found, behind, absolutes, zero, sums):
 
 
 @numba.njit(forceinline=True)
-def _add_channels(upstream, k, found, channels, zero, sums):
+def _add_channels(upstream, first, last, found, channels, zero, sums):
     """Gradients of a row's channels."""
     for c in range(0, channels, UNROLL):
         g0, g1, g2, g3 = zero, zero, zero, zero
-        for slot in range(found.slots[k], found.slots[k + 1]):
+        for slot in range(first, last):
             at, weight = entry(found.places, slot) * channels + c * LANES, load(found.weights, slot * LANES)
             g0 += load(upstream, at) * weight
             g1 += load(upstream, at + LANES) * weight
