@@ -12,33 +12,30 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.image import resize
 from lang3dxl_ns.preparation.crop_budget import Crops, choose_crops, input_side
-from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, fine_grid, map_grids
+from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids
 from lang3dxl_ns.preparation.encoders import (
     CLIP_OPTION,
     DENSE_OPTION,
     DenseEncoder,
     ImageTextEncoder,
     find_model,
-    head_reading,
     load_dense_encoder,
     load_image_text_encoder,
     patch_reading,
     spoken,
 )
 from lang3dxl_ns.preparation.model_files import BUILTIN
-from lang3dxl_ns.preparation.pyramid import HALF, THIRD, ClipTarget, build_clip_target
+from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -55,8 +52,8 @@ _ANNOUNCED_CROPS = 5_000
 """Fewer are encoded in seconds: no duration is measured."""
 _MEASURED_S = 3.0
 """Seconds in which noise is encoded, to announce a duration."""
-_PATCHES_PER_CROP = 6
-"""Patches of windows encoded at once, per crop: a window's features are many, a crop's are one."""
+_PATCHES_PER_CROP = 32
+"""Windows of patch features are encoded this many times fewer at once than crops: they hold more."""
 _LONG_S = 1800.0
 """Seconds on a CPU from which the remedies are named."""
 
@@ -88,10 +85,8 @@ class _Task:
     has_regions: bool
     is_fine: bool = False
     """Whether the crops are small ones alone, on a finer grid."""
-    grids: tuple[Grid, ...] | None = None
-    """Grids of a map of patch features, if there is one."""
-    beside_crops: bool = False
-    """Whether the map is averaged with the crops; otherwise it takes their place."""
+    grids: tuple[Grid, Grid] | None = None
+    """Grids of a map of patch features, which then takes the place of crops."""
 
     @property
     def clip_kind(self) -> str:
@@ -160,7 +155,6 @@ def _plan(
     clip_model = find_model(config.clip, CLIP_OPTION)
     input_pixels = input_side(clip_model.folder)
     patches = patch_reading(config.clip, config.clip_features)
-    head = None if patches is not None or not fine else head_reading(config.clip, config.clip_features)
     dense_model = None if not config.makes_dense else find_model(config.dense, DENSE_OPTION).identity
 
     def crops_of(photo: Photo, quality: Quality) -> Crops:
@@ -179,24 +173,18 @@ def _plan(
         clip = {**source, "encoder": clip_model.identity, "crop_sides": crops.sides, "rule": _CROP_RULE}
         if is_fine and crops.steps != THIRD:
             clip["steps"] = crops.steps
-        grids: tuple[Grid, ...] | None = None
+        grids = None
         if patches is not None:
             grids = map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
             sides = sorted(math.ceil(photo.width / columns) for _, columns in grids)
             clip = {**source, "encoder": clip_model.identity, "crop_sides": sides}
             clip |= {"patches": patches.recipe, "grids": grids, "rule": RULE}
-        elif head is not None and is_fine:
-            size = photo.height, photo.width
-            grids = tuple(fine_grid(*size, head.tokens, side) for side in reversed(crops.sides))
-            crops = replace(crops, steps=HALF)  # the map is finer, and takes as long as the crops between
-            clip |= {"steps": HALF, "patches": head.recipe, "grids": grids, "map_rule": RULE}
         has_dense = dense_model is not None and (is_fine or not fine)
         dense = {**source, "encoder": dense_model, "tokens": config.dense_tokens} if has_dense else None
         labels = None if regions is None else regions.settings(photo)
         settings = None if labels is None else {**source, **labels}
         has_regions = labels is not None
         task = _Task(photo, crops, fast, clip, dense, settings, has_dense, has_regions, is_fine, grids)
-        task.beside_crops = patches is None and grids is not None
         task.drop_current(store)
         tasks.append(task)
     without = [task.photo.name for task in tasks if not task.has_regions]
@@ -306,8 +294,21 @@ def _encode(
     crop_batch: int,
     store: FeatureStore,
 ) -> None:
-    if task.clip and clip:
-        target = _clip_target(task, clip.in_known_light(image), clip, crop_batch)
+    if task.clip and clip and task.grids:
+        tokens, windows = clip.crop_size // clip.patch_size, max(crop_batch // _PATCHES_PER_CROP, 1)
+        lit = clip.in_known_light(image)
+        features = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
+        tensors = {"features": features, "valid": torch.ones_like(features[..., 0])}
+        store.write(task.clip_kind, task.photo.name, tensors, task.clip)
+    elif task.clip and clip:
+        target = build_clip_target(
+            clip.in_known_light(image),
+            task.crops.sides,
+            clip.encode_images,
+            clip.crop_size,
+            crop_batch,
+            task.crops.steps,
+        )
         tensors = {"features": target.features, "valid": target.valid}
         store.write(task.clip_kind, task.photo.name, tensors, task.clip)
     if task.dense and dense:
@@ -315,28 +316,6 @@ def _encode(
     if task.regions and regions:
         labels = stored_labels(regions.labels(task.photo, image))
         store.write(REGIONS, task.photo.name, {"labels": labels}, task.regions)
-
-
-def _clip_target(
-    task: _Task, image: Float[Tensor, "h w 3"], clip: ImageTextEncoder, crop_batch: int
-) -> ClipTarget:
-    """The map of the photo's patch features, its crops, or the mean of both as unit features."""
-
-    def crops() -> ClipTarget:
-        sides, steps = task.crops.sides, task.crops.steps
-        return build_clip_target(image, sides, clip.encode_images, clip.crop_size, crop_batch, steps)
-
-    if not task.grids:
-        return crops()
-    tokens = clip.crop_size // clip.patch_size
-    windows = max(_PATCHES_PER_CROP * crop_batch // tokens**2, 1)
-    patches = build_dense_map(image, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
-    if not task.beside_crops:
-        return ClipTarget(patches, torch.ones_like(patches[..., 0]))
-    target, grid = crops(), patches.shape[:2]
-    both = (target.features, target.valid[..., None])
-    features, valid = (resize(values, (grid[0], grid[1])) for values in both)
-    return ClipTarget((F.normalize(features, dim=-1) + F.normalize(patches, dim=-1)) / 2, valid[..., 0])
 
 
 def _bytes_needed(tasks: Iterable[_Task], clip: ImageTextEncoder | None, dense: DenseEncoder | None) -> int:
@@ -361,7 +340,7 @@ def _announce_duration(
     device: torch.device,
 ) -> None:
     """Log how many crops are encoded, and for how long, by the time that noise takes."""
-    tasks = [task for task in missing if task.clip and (task.beside_crops or not task.grids)]
+    tasks = [task for task in missing if task.clip and not task.grids]
     crops = sum(task.crops.count(task.photo.height, task.photo.width) for task in tasks)
     if crops < _ANNOUNCED_CROPS:
         return
