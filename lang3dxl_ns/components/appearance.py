@@ -160,7 +160,8 @@ class AppearanceField(nn.Module):
     def remember(self, name: str, position: Float[Tensor, "3"], direction: Float[Tensor, "3"]) -> None:
         """Record that a photo is used in training, and its camera's position and unit viewing direction."""
         row = self._rows[name]
-        self.positions[row], self.directions[row], self.learned[row] = position, direction, True
+        self.positions[row], self.directions[row] = position, direction
+        self.learned[row].fill_(True)  # assigned, some versions of torch copy it from the CPU, and wait
 
     def vector_of_view(
         self, position: Float[Tensor, "3"], direction: Float[Tensor, "3"]
