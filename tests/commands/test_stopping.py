@@ -21,6 +21,7 @@ READING = ("lang3dxl_ns.evaluation.predictions", "_read_array")
 
 def stopped(place: str, function: str, number: int, arguments: list[str]) -> None:
     """A command that receives a signal at the third call of some function."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs without it
     owner = importlib.import_module(place)
     work, calls = getattr(owner, function), []
 
