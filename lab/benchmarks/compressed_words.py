@@ -22,16 +22,14 @@ import tyro
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lab.benchmarks.dense_teacher import gathered_crops
+from lab.benchmarks.dense_teacher import gathered_crops, words
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.evaluation.score_scene import score_scene
 from lang3dxl_ns.query.engine import PerGaussian, QueryEngine, make_engine
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import read_scene
 
 NOISE = 0.15
@@ -74,17 +72,6 @@ class Repeated:
 
     def maps(self, rendered: Float[Tensor, "h w q"], queries: Queries) -> Float[Tensor, "q h w"]:
         return rendered.permute(2, 0, 1)
-
-
-@torch.no_grad()
-def words(scene: Scene, engine: QueryEngine, truth: GroundTruth) -> dict[str, float]:
-    """AP of each word over the labeled photos."""
-    scene.__dict__["engine"] = engine
-    figures, _ = score_scene(scene, truth, "all")
-    return {
-        word: float(np.mean([f[f"ap_{word}"] for f in figures.values() if f"ap_{word}" in f]))
-        for word in truth.categories
-    }
 
 
 def main(config: CompressedWords) -> None:

@@ -209,6 +209,17 @@ def gathered_crops(run: Path, scene: Scene) -> tuple[Float[Tensor, "n c"], Float
 
 
 @torch.no_grad()
+def words(scene: Scene, engine: QueryEngine, truth: GroundTruth) -> dict[str, float]:
+    """AP of each word over the labeled photos."""
+    scene.__dict__["engine"] = engine
+    figures, _ = score_scene(scene, truth, "all")
+    return {
+        word: float(np.mean([f[f"ap_{word}"] for f in figures.values() if f"ap_{word}" in f]))
+        for word in truth.categories
+    }
+
+
+@torch.no_grad()
 def compare(run: Path, teacher: Teacher) -> list[tuple[str, dict[str, float]]]:
     """AP of each word in the labeled views, by where features come from."""
     scene = read_scene(next((run / "run").rglob("*.scene")))
@@ -225,13 +236,7 @@ def compare(run: Path, teacher: Teacher) -> list[tuple[str, dict[str, float]]]:
     rows.append(("both", Averaged((crops, dense))))
     found = []
     for name, engine in rows:
-        scene.__dict__["engine"] = engine
-        figures, _ = score_scene(scene, truth, "all")
-        words = {
-            word: float(np.mean([f[f"ap_{word}"] for f in figures.values() if f"ap_{word}" in f]))
-            for word in truth.categories
-        }
-        found.append((name, words))
+        found.append((name, words(scene, engine, truth)))
     return found
 
 

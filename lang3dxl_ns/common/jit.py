@@ -29,12 +29,6 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return compiled
 
 
-@numba.njit(cache=True)
-def successor(number: int) -> int:
-    """The smallest kernel, which shows that numba compiles."""
-    return number + 1
-
-
 class _Announcement(Listener):
     """Logs once per process that kernels are being compiled; loading them from disk is silent."""
 
@@ -53,6 +47,12 @@ class _Announcement(Listener):
 
 _announcement = _Announcement()
 register("numba:compile", _announcement)
+
+
+@kernel
+def successor(number: int) -> int:
+    """The smallest kernel, which shows that numba compiles."""
+    return number + 1
 
 
 def in_threads(function: Callable[..., Any], parts: Sequence[tuple[Any, ...]]) -> list[Any]:

@@ -235,19 +235,20 @@ def _principal_codes(
     return (places / deviation.clamp_min(1e-12)).clamp(-_REACH, _REACH)
 
 
-class CompressedField(SemanticField):
-    """The semantic field of a scene whose features are gathered onto its Gaussians after training: it
-    decodes each Gaussian's code, before compositing. Until then there are no codes."""
+class _LearningField(SemanticField):
+    """A semantic field that can learn codes of features gathered onto Gaussians."""
 
-    per_gaussian = True
-    needs_lifting = True
     gathered_channels = 128
 
     def __init__(
-        self, config: SemanticFieldConfig, clip_dim: int, compression: CompressionConfig | None = None
+        self,
+        config: SemanticFieldConfig,
+        clip_dim: int,
+        dense_dim: int = 0,
+        compression: CompressionConfig | None = None,
     ) -> None:
-        super().__init__(config, clip_dim)
-        self.config, self.compression = config, compression or CompressionConfig()
+        super().__init__(config, clip_dim, dense_dim)
+        self.compression = compression or CompressionConfig()
 
     @property
     def learning_steps(self) -> int:  # type: ignore[override]
@@ -256,6 +257,25 @@ class CompressedField(SemanticField):
     def learning_seconds(self, count: int) -> float:
         draws = self.compression.grown(count).steps * self.compression.batch
         return draws * _SECONDS_PER_DRAW + count * _SECONDS_PER_GAUSSIAN
+
+    def _step(self, gaussians: int, advance: Callable[[], None]) -> Callable[[], None]:
+        """Called at every step, advances a bar that has as many steps whatever the number of Gaussians."""
+        steps, growth = count(1), self.compression.growth(gaussians)
+        return lambda: advance() if next(steps) % growth == 0 else None
+
+
+class CompressedField(_LearningField):
+    """The semantic field of a scene whose features are gathered onto its Gaussians after training: it
+    decodes each Gaussian's code, before compositing. Until then there are no codes."""
+
+    per_gaussian = True
+    needs_lifting = True
+
+    def __init__(
+        self, config: SemanticFieldConfig, clip_dim: int, compression: CompressionConfig | None = None
+    ) -> None:
+        super().__init__(config, clip_dim, compression=compression)
+        self.config = config
 
     def initial_codes(self, count: int, generator: torch.Generator | None = None) -> None:  # type: ignore[override]
         return None
@@ -277,7 +297,7 @@ class CompressedField(SemanticField):
         generator = torch.Generator().manual_seed(0)
         config = self.compression.grown(len(features))
         sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
-        step = _every(self.compression.growth(len(features)), advance)
+        step = self._step(len(features), advance)
         state = generator.get_state()
         dims = CODE_DIMS if self.config.code_dim is None else (self.config.code_dim,)
         lost = ""
@@ -314,25 +334,9 @@ class CompressedField(SemanticField):
             self.take(SemanticField(replace(self.config, code_dim=codes.shape[1]), self.clip_dim))
 
 
-class JointField(SemanticField):
+class JointField(_LearningField):
     """The semantic field whose codes are trained with the scene. They may start from features gathered onto
     the Gaussians."""
-
-    gathered_channels = 128
-
-    def __init__(
-        self,
-        config: SemanticFieldConfig,
-        clip_dim: int,
-        dense_dim: int = 0,
-        compression: CompressionConfig | None = None,
-    ) -> None:
-        super().__init__(config, clip_dim, dense_dim)
-        self.compression = compression or CompressionConfig()
-
-    @property
-    def learning_steps(self) -> int:  # type: ignore[override]
-        return self.compression.steps
 
     def learn_gaussians(
         self,
@@ -344,16 +348,10 @@ class JointField(SemanticField):
         """Codes from which training goes on, and a field that decodes them."""
         generator = torch.Generator().manual_seed(0)
         config = self.compression.grown(len(features))
-        step = _every(self.compression.growth(len(features)), advance)
+        step = self._step(len(features), advance)
         sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
         codes = fit(sample, self, config, generator, step)
         return assign(features, mass, self, codes, basis)
-
-
-def _every(factor: int, advance: Callable[[], None]) -> Callable[[], None]:
-    """Advances at every so many calls: a bar has as many steps whatever the number of Gaussians."""
-    calls = count(1)
-    return lambda: advance() if next(calls) % factor == 0 else None
 
 
 def _nothing() -> None: ...

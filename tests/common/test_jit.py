@@ -21,6 +21,14 @@ def doubled(values):
 """
 
 
+def call_the_smallest_kernel(folder: Path, environment: dict[str, str]) -> None:
+    os.environ.update(environment)
+    sys.path.insert(0, str(folder))
+    from jit_module import successor
+
+    print(successor(1))
+
+
 def call_the_kernel(folder: Path, environment: dict[str, str]) -> None:
     os.environ.update(environment)
     sys.path.insert(0, str(folder))
@@ -56,6 +64,14 @@ def test_without_a_folder_that_can_be_written_a_kernel_is_compiled_anew(run, tmp
         assert printed.count("Compiling") == 1
         assert printed.endswith("[0. 2. 4.]\n")
     assert not list(Path(tmp_path).rglob("*.nbi"))
+
+
+def test_the_probe_of_the_compiler_needs_no_folder_that_can_be_written(tmp_path):
+    (tmp_path / "jit_module.py").write_text(Path(jit.__file__).read_text())
+    (tmp_path / "__pycache__").write_text("a file where the folder would be")
+    environment = {"XDG_CACHE_HOME": str(tmp_path / "__pycache__" / "cache")}
+    done = Process(call_the_smallest_kernel, tmp_path, environment).wait()
+    assert done.returncode == 0 and done.stdout.endswith("2\n"), done.stderr
 
 
 def test_threads_return_results_in_the_order_of_the_arguments():
