@@ -75,7 +75,7 @@ def make_decoder(
     elif config.name == "lifting":
         decoder = LiftedFeatures(clip_dim, dense_dim)
     elif config.name == "paper":
-        decoder = JointField(settings, clip_dim, dense_dim, config.compression)
+        decoder = JointField(settings, clip_dim, config.compression, dense_dim)
     elif config.name == "gathered":
         decoder = CompressedField(settings, clip_dim, config.compression)
     else:

@@ -244,11 +244,11 @@ class _LearningField(SemanticField):
         self,
         config: SemanticFieldConfig,
         clip_dim: int,
-        dense_dim: int = 0,
         compression: CompressionConfig | None = None,
+        dense_dim: int = 0,
     ) -> None:
         super().__init__(config, clip_dim, dense_dim)
-        self.compression = compression or CompressionConfig()
+        self.config, self.compression = config, compression or CompressionConfig()
 
     @property
     def learning_steps(self) -> int:  # type: ignore[override]
@@ -270,12 +270,6 @@ class CompressedField(_LearningField):
 
     per_gaussian = True
     needs_lifting = True
-
-    def __init__(
-        self, config: SemanticFieldConfig, clip_dim: int, compression: CompressionConfig | None = None
-    ) -> None:
-        super().__init__(config, clip_dim, compression=compression)
-        self.config = config
 
     def initial_codes(self, count: int, generator: torch.Generator | None = None) -> None:  # type: ignore[override]
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
@@ -30,6 +31,8 @@ _MOVED = {
 """Where settings are that earlier versions kept elsewhere."""
 _REMOVED = {"DecoderConfig": ("start",)}
 """Settings of earlier versions, by their class, that only training read: a finished run opens without."""
+_OURS = re.compile(r"lang3dxl(_|%5f)ns\.|method_name\W+lang3dxl", re.IGNORECASE)
+"""What a run of this package's has in its config.yml: the package's classes, or a method's name."""
 _DAMAGED = (LookupError, TypeError, AttributeError, ValueError, RecursionError, ImportError)
 """Exceptions raised on making settings of values that are none."""
 _UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
@@ -187,7 +190,7 @@ def _trouble(path: Path) -> str | None:
     """Why a file may not be passed on to nerfstudio; None if it may."""
     try:
         text = read_text(path)
-        if "lang3dxl_ns." in text:
+        if _OURS.search(text):
             _construct(text, [()])
     except (OSError, UnicodeError) as error:
         return f"can't be checked before it is used ({error})"

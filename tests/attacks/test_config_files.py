@@ -252,6 +252,17 @@ def test_a_config_that_can_not_be_looked_at_first_is_refused(tmp_path):
         read_config(tmp_path / "config.yml")
 
 
+@pytest.mark.parametrize(
+    "sign",
+    ["method_name: lang3dxl", 'method_name: "lang3dxl-paper"', "b: !!python/name:lang3dxl%5Fns.methods.x ''"],
+)
+def test_a_config_that_says_it_is_ours_is_checked_though_it_has_none_of_our_classes(tmp_path, sign):
+    path = tmp_path / "config.yml"
+    path.write_text(f"a: !!python/object/apply:os.system ['true']\n{sign}\n")
+    with pytest.raises(SystemExit, match="holds more than settings"):
+        check_command_line(["--load-config", str(path)])
+
+
 def test_configs_of_other_methods_are_left_to_nerfstudio(tmp_path):
     """A plugin does not decide about commands of others."""
     path = tmp_path / "config.yml"
