@@ -15,6 +15,7 @@ from difflib import get_close_matches
 from functools import reduce
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
@@ -22,12 +23,11 @@ import tyro
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.laboratory import has_laboratory
 from lang3dxl_ns.common.settings_help import asked_for_all
 
 BENCHMARKS = {
     "ablation": (
-        "benchmarks.ablation:Ablation",
+        "lab.benchmarks.ablation:Ablation",
         "The method, the baselines, and the method without each part.",
     ),
     "training": ("lab.benchmarks.training:TrainingBenchmark", "A training step by its parts."),
@@ -67,7 +67,7 @@ COMMANDS = {
     ),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),
     "preset": ("commands.preset:Preset", "Print the flags that train a benchmark's scene as in the paper."),
-    "numerics": ("numerics.command:Numerics", "Error and time of components on stiff cases."),
+    "numerics": ("lab.numerics.command:Numerics", "Error and time of components on stiff cases."),
     "benchmark": (BENCHMARKS, "Measure: time, memory and error, side by side."),
 }
 """Each command's settings class, which has a method `main`, and its summary in the list of commands. Those of
@@ -162,9 +162,9 @@ def settings_of(place: str) -> Any:
     module, _, name = place.partition(":")
     if not module.startswith("lab."):
         module = f"lang3dxl_ns.{module}"
-    elif not has_laboratory():
+    elif not (Path(__file__).parents[1] / "lab" / "README.md").is_file():
         raise UserError(
-            "this benchmark comes with a checkout of the repository, not with the package: clone it, "
+            "this command comes with a checkout of the repository, not with the package: clone it, "
             "and install the clone with pip install -e"
         )
     return getattr(import_module(module), name)

@@ -388,7 +388,7 @@ def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monk
 
 def test_numerics(gpu):
     from lab.numerics import losses
-    from lang3dxl_ns.numerics.command import measure_all
+    from lab.numerics.command import measure_all
 
     with gpu():
         rows = measure_all(list(losses.cases(quick=True, device="cuda"))[:4], quick=True, device="cuda")

@@ -39,11 +39,11 @@ ORDER = (
     {"components", "rendering"},
     {"preparation"},
     {"baselines", "query", "evaluation"},
-    {"attachment", "demo", "numerics"},
+    {"attachment", "demo"},
     {"plugin"},
     {"methods", "open_scene"},
     {"train_scene"},
-    {"commands", "benchmarks"},
+    {"commands"},
     {"cli"},
 )
 """Packages from the bottom up: each imports only from its own layer and those below."""

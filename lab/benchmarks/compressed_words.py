@@ -82,17 +82,21 @@ def main(config: CompressedWords) -> None:
     seen = (mass > 0).nonzero()[:, 0]
     features, mass = features[seen], mass[seen]
     lines: list[str] = []
+
+    def score(engine: QueryEngine, rows: Int[Tensor, " m"]) -> dict[str, float]:
+        return words(scene, Repeated(engine, seen[rows], everything), truth)  # type: ignore[arg-type]
+
     for count in config.gaussians:
         rows, draw = torch.arange(count) % len(seen), torch.Generator().manual_seed(1)
         noisy = features[rows]
         noisy += NOISE * features.std(0) * torch.randn(noisy.shape, generator=draw)
         unit = GaussianFeatures(F.normalize(noisy, dim=1).half(), None, torch.ones(count, dtype=torch.bool))
-        plain = words(scene, Repeated(PerGaussian(unit, temperature), seen[rows], everything), truth)
+        plain = score(PerGaussian(unit, temperature), rows)
         del unit
         start, field = time.process_time(), CompressedField(SemanticFieldConfig("short"), features.shape[1])
         codes = field.learn_gaussians(noisy, mass[rows])
         seconds = time.process_time() - start
-        found = words(scene, Repeated(make_engine(field, codes, temperature), seen[rows], everything), truth)
+        found = score(make_engine(field, codes, temperature), rows)
         if not lines:
             names = " | ".join(plain)
             lines = [f"| Gaussians | | seconds | mAP | {names} |", "|---" * (len(plain) + 4) + "|"]

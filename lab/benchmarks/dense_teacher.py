@@ -182,18 +182,24 @@ class Gathering:
         _, targets = prepare_photos(collection, config, run / "scene" / "lang3dxl_cache", "cpu")
         return cls(scene, photos, targets)
 
+    def dense(self, name: str) -> Float[Tensor, "t t d"]:
+        """The dense features of a photo."""
+        found = self.targets.dense(name)
+        assert found is not None
+        return found.float()
+
     @torch.no_grad()
     def features(
         self, read: Callable[[str], Float[Tensor, "h w c"]]
     ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
         """Sharpened features of all Gaussians, and their mass. read: the feature map of a photo."""
-        dense, width = self.targets.dense, self.targets.clip_dim
-        basis = PrincipalBasis.of((F.normalize(dense(n).float(), dim=-1) for n in self.photos), DENSE_AXES)
+        width = self.targets.clip_dim
+        basis = PrincipalBasis.of((F.normalize(self.dense(n), dim=-1) for n in self.photos), DENSE_AXES)
 
         def views():
             for name, photo in self.photos.items():
                 camera = resized(photo.camera, GATHERED)
-                groups = basis.coordinates(F.normalize(dense(name).float(), dim=-1))
+                groups = basis.coordinates(F.normalize(self.dense(name), dim=-1))
                 pixels = Pixels.of([read(name), groups], (camera.height, camera.width), None)
                 yield partial(composite, self.scene.splats, camera), pixels
 
@@ -231,7 +237,7 @@ def compare(run: Path, teacher: Teacher) -> list[tuple[str, dict[str, float]]]:
         return engine_of(scene, gathering.features(read)[0])
 
     crops = gathered(lambda name: targets.clip(name).features.float())
-    dense = gathered(lambda name: teacher.read(targets.dense(name)))
+    dense = gathered(lambda name: teacher.read(gathering.dense(name)))
     rows: list[tuple[str, QueryEngine]] = [("crops", crops), ("dense", dense)]
     rows.append(("both", Averaged((crops, dense))))
     found = []

@@ -135,8 +135,8 @@ def parity(count: int, size: tuple[int, int]) -> dict[str, float]:
 def numerics(quick: bool) -> dict[str, Any]:
     """How many hard cases are within their bounds (tf32 among them), and those that are not."""
     from lab.numerics import decoder, losses
-    from lang3dxl_ns.numerics.catalog import all_cases
-    from lang3dxl_ns.numerics.command import measure_all
+    from lab.numerics.catalog import all_cases
+    from lab.numerics.command import measure_all
 
     cases = list(losses.cases(True, "cuda"))[:2] + list(decoder.cases(True, "cuda"))[:1]
     rows = measure_all(cases if quick else list(all_cases(True, "cuda")), quick, "cuda")

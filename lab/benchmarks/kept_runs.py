@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from lang3dxl_ns.benchmarks.scored_runs import (
+from lab.benchmarks.scored_runs import (
     Run,
     RunSettings,
     ScoredRuns,

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from lab.benchmarks.ablation import make_all
+from lab.benchmarks.ablation_rows import FULL, choose_rows
 from lab.benchmarks.kept_runs import KeptRuns
-from lang3dxl_ns.baselines.rows import FULL, choose_rows
-from lang3dxl_ns.benchmarks.ablation import make_all
-from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings
+from lab.benchmarks.scored_runs import Run, RunSettings
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.presets import load_preset, scene_presets, train_flags

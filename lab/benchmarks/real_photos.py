@@ -8,9 +8,9 @@ from pathlib import Path
 
 import tyro
 
-from lang3dxl_ns.baselines.rows import CHANCE, FULL, LIMIT, TEACHER, choose_rows
-from lang3dxl_ns.benchmarks.ablation import make_all
-from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns
+from lab.benchmarks.ablation import make_all
+from lab.benchmarks.ablation_rows import CHANCE, FULL, LIMIT, TEACHER, choose_rows
+from lab.benchmarks.scored_runs import Run, RunSettings, ScoredRuns
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
 

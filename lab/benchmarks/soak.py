@@ -22,9 +22,10 @@ import numpy as np
 def client(port: int, seed: int, seconds: float) -> None:
     """A browser that looks around for a while and leaves, politely or not."""
     from websockets.sync.client import connect
+    from websockets.typing import Origin
 
     rng = np.random.default_rng(seed)
-    socket = connect(f"ws://127.0.0.1:{port}", origin=f"http://127.0.0.1:{port}", max_size=None)
+    socket = connect(f"ws://127.0.0.1:{port}", origin=Origin(f"http://127.0.0.1:{port}"), max_size=None)
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         position = rng.normal(0, 1, 3) * 5 + [0, -30, 5]

@@ -12,8 +12,8 @@ from torch.func import functional_call
 from torch.nn.functional import linear
 
 from lab.numerics.hash_grid import interpolate_reference
+from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.components.appearance import FIRST_LOGIT, TEMPERATURE, AppearanceConfig, AppearanceField
-from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.rendering import Gaussians
 
 COUNT = 200

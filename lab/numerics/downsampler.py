@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem, narrowed
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig, separable_kernel
-from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem, narrowed
 
 CHANNELS = 12
 SIZE, GRID, SIDES = (18, 24), (6, 8), (0.15, 0.4)

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
 
+from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.common.kernels import numba_works
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, HASH_PRIMES, HashGrid
-from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 
 LARGE = 512.0
 """Table values are a thousand times larger than a new grid's, as after training."""

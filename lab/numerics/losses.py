@@ -9,8 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem, narrowed
 from lang3dxl_ns.components.losses import clip_loss, dense_loss, region_variance_loss, rgb_loss
-from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem, narrowed
 
 BOUNDS = {"float32": Bounds(2e-6, 2e-6, 1e-4, 1e-5), "float64": EXACT}
 SSIM_BOUNDS = {"float32": Bounds(1e-4, 1e-4, 5e-3, 1e-3), "float64": Bounds(1e-5, 1e-5, 1e-4, 1e-4)}

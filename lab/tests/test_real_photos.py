@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from lab.benchmarks.ablation_rows import FULL, ROWS
 from lab.benchmarks.real_photos import RealPhotos, tables
-from lang3dxl_ns.baselines.rows import FULL, ROWS
-from lang3dxl_ns.benchmarks.scored_runs import Run, ScoredRuns
+from lab.benchmarks.scored_runs import Run, ScoredRuns
 from lang3dxl_ns.common.errors import UserError
 
 FULL_ROW = next(row for row in ROWS if row.name == FULL)

@@ -1,7 +1,7 @@
 """The landmarks that train the built-in encoders and those that score the method."""
 
+from lab.benchmarks.landmarks import SEEDS
 from lab.clip_training.views import SPLITS
-from lang3dxl_ns.benchmarks.landmarks import SEEDS
 
 
 def test_decision_published_and_training_landmarks_are_disjoint():

@@ -10,7 +10,9 @@ from types import SimpleNamespace
 import pytest
 from tiny_models import make_tiny_grounding_dino, make_tiny_sam
 
-from lang3dxl_ns.baselines.rows import (
+from lab.benchmarks.ablation import Ablation, bound_figures, make_all
+from lab.benchmarks.ablation_report import mark_front, spread, table_of_runs, write_ablation
+from lab.benchmarks.ablation_rows import (
     CHANCE,
     CLIPSEG,
     FULL,
@@ -22,9 +24,7 @@ from lang3dxl_ns.baselines.rows import (
     Row,
     choose_rows,
 )
-from lang3dxl_ns.benchmarks.ablation import Ablation, bound_figures, make_all
-from lang3dxl_ns.benchmarks.ablation_report import mark_front, spread, table_of_runs, write_ablation
-from lang3dxl_ns.benchmarks.scored_runs import (
+from lab.benchmarks.scored_runs import (
     Run,
     RunSettings,
     ScoredRuns,

@@ -16,17 +16,13 @@ from lab.benchmarks.teaching import ways
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.methods import run_config
-from lang3dxl_ns.numerics.catalog import groups
 
 
-def test_without_a_checkout_the_remedy_is_told_and_numerics_has_what_is_used_after_training(monkeypatch):
-    monkeypatch.setattr("lang3dxl_ns.__file__", "/site-packages/lang3dxl_ns/__init__.py")
-    assert [group.__name__ for group in groups()] == [
-        "lang3dxl_ns.numerics.rasterizer",
-        "lang3dxl_ns.numerics.relevancy",
-    ]
-    with pytest.raises(SystemExit, match="comes with a checkout of the repository"):
-        cli.main(["benchmark", "scale", "--help"])
+@pytest.mark.parametrize("name", ["numerics", *(f"benchmark {name}" for name in cli.BENCHMARKS)])
+def test_without_a_checkout_the_remedy_is_told(name, monkeypatch):
+    monkeypatch.setattr(cli, "__file__", "/site-packages/lang3dxl_ns/cli.py")
+    with pytest.raises(SystemExit, match="this command comes with a checkout of the repository"):
+        cli.main([*name.split(), "--help"])
 
 
 def test_a_scenes_splat_is_attached_with_photos_and_without_once(tmp_path, monkeypatch):

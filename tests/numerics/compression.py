@@ -8,10 +8,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from lab.numerics.measure import Bounds, Case, Maps, Problem
 from lang3dxl_ns.components.compression import CompressionConfig, assign, fit, seen_by_photos
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
-from lang3dxl_ns.numerics.measure import Bounds, Case, Maps, Problem
 
 COUNT, CHANNELS, KINDS = 2_000, 32, 12
 RARE = 0.005

@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import Queries

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy import ndarray as Array
 
+from lab.numerics.measure import Bounds, Case, Problem
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.numerics.measure import Bounds, Case, Problem
 from lang3dxl_ns.preparation.physical_scale import (
     crop_sides,
     physical_scales,

@@ -8,8 +8,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from lab.numerics.measure import Bounds, Case, Maps, Problem
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.numerics.measure import Bounds, Case, Maps, Problem
 
 ROWS, CHANNELS, RANK = 900, 48, 8
 BOUNDS = {"float32": Bounds(1e-6, 5e-7)}

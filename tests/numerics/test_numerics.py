@@ -4,12 +4,11 @@ import pytest
 import torch
 from numerics import compression, gathering, physical_scale, principal_basis, sharpening
 
+from lab.numerics import catalog, command
+from lab.numerics.command import measure_all
+from lab.numerics.measure import Bounds, Case, Problem, measure
 from lab.numerics.optimization import Run, runs
 from lang3dxl_ns import cli
-from lang3dxl_ns.numerics import catalog, command
-from lang3dxl_ns.numerics.catalog import groups
-from lang3dxl_ns.numerics.command import measure_all
-from lang3dxl_ns.numerics.measure import Bounds, Case, Problem, measure
 
 BOUNDS = {"float32": Bounds(), "bf16": Bounds(1e-2, 1e-2, 1e-2, 1e-2)}
 
@@ -33,7 +32,9 @@ def squares(distort=lambda out: out, **settings) -> Case:
 OTHERS = (physical_scale, principal_basis, gathering, sharpening, compression)
 
 
-@pytest.mark.parametrize("group", [*groups(), *OTHERS], ids=lambda group: group.__name__.rpartition(".")[2])
+@pytest.mark.parametrize(
+    "group", [*catalog.GROUPS, *OTHERS], ids=lambda group: group.__name__.rpartition(".")[2]
+)
 def test_every_hard_case_is_within_its_bound(group):
     rows = measure_all(list(group.cases(quick=True, device="cpu")), quick=True, device="cpu")
     assert rows
@@ -106,7 +107,7 @@ def test_a_miss_is_reported_in_words_and_makes_the_exit_code_1(tmp_path, monkeyp
     wrong = squares(lambda out: out * torch.where(out > 0.9, torch.inf, 1.001))
     monkeypatch.setattr(command, "all_cases", lambda quick, device: [wrong, squares()])
     broken = Run("fast", 30, True, losses=[1.0] * 10, codes=[1.0] * 10, finite=False)
-    monkeypatch.setattr(command, "optimizations", lambda quick: [broken])
+    monkeypatch.setattr(command.optimization, "runs", lambda quick: [broken])
     with pytest.raises(SystemExit) as stop:
         cli.main(["numerics", "--out", str(tmp_path), "--quick"])
     assert stop.value.code == 1

@@ -7,8 +7,8 @@ import pytest
 import torch
 from splat_clouds import Cloud, gaussians, gradients, make_cloud, maps, relative_error
 
+from lab.numerics.rasterizer_reference import rasterize_reference
 from lang3dxl_ns.rendering import rasterize
-from lang3dxl_ns.rendering.reference import rasterize_reference
 
 pytestmark = pytest.mark.usefixtures("backend")
 MODES = [

@@ -4,8 +4,8 @@ import pytest
 import torch
 from splat_clouds import gaussians, gradients, make_cloud, maps, relative_error
 
+from lab.numerics.rasterizer_reference import rasterize_reference
 from lang3dxl_ns.rendering import Gaussians, rasterize, torch_rasterizer
-from lang3dxl_ns.rendering.reference import rasterize_reference
 from lang3dxl_ns.scene.camera import Camera
 
 pytestmark = pytest.mark.usefixtures("backend")

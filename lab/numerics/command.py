@@ -6,15 +6,15 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
+from lab.numerics import optimization
+from lab.numerics.catalog import all_cases
+from lab.numerics.measure import Case, Row, measure
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.reports import as_png, command_line, describe_machine, markdown_table, progress_bar
-from lang3dxl_ns.numerics.catalog import all_cases, optimizations
-from lang3dxl_ns.numerics.measure import Case, Row, measure
 
 HEADER = "component", "case", "mode", "output", "gradient", "bounds", "flipped", "ms", "verdict"
 SMALLEST = 1e-18
@@ -43,13 +43,13 @@ class Numerics:
         try:
             repeats = 1 if self.quick else 3
             rows = measure_all(list(all_cases(self.quick, device)), self.quick, device, repeats)
-            runs = optimizations(self.quick)
+            runs = optimization.runs(self.quick)
             heading = f"`{command_line('lang3dxl numerics', self)}`\n{describe_machine(device)}."
         finally:
             torch.set_num_threads(threads)
-        misses = [f"{row.name}: {'; '.join(row.misses)}" for row in (*rows, *runs) if row.misses]
-        total = len(rows) + len(runs)
-        verdict = f"{total - len(misses)} of {total} rows pass"
+        judged: list[Row | optimization.Run] = [*rows, *runs]
+        misses = [f"{row.name}: {'; '.join(row.misses)}" for row in judged if row.misses]
+        verdict = f"{len(judged) - len(misses)} of {len(judged)} rows pass"
         write_atomically(self.out / "numerics.md", _markdown(rows, runs, heading, verdict))
         write_atomically(self.out / "numerics.png", _plot(rows))
         for miss in misses:
@@ -73,7 +73,7 @@ def measure_all(cases: Sequence[Case], quick: bool, device: str, repeats: int = 
         return [measure(case, mode, device, repeats) for case, mode in watched]
 
 
-def _markdown(rows: Sequence[Row], runs: Sequence[Any], heading: str, verdict: str) -> str:
+def _markdown(rows: Sequence[Row], runs: Sequence[optimization.Run], heading: str, verdict: str) -> str:
     notes = dict.fromkeys(f"- {row.component}, {row.case}: {row.note}" for row in rows if row.note)
     table = markdown_table(HEADER, [*map(_cells, rows), *map(_optimization, runs)])
     return f"""# Numerics: error against run time on stiff and extreme cases
@@ -106,12 +106,12 @@ def _cells(row: Row) -> list[str | None]:
     return [row.component, row.case, row.mode, output, slopes, bounds, *shares, _verdict(row)]
 
 
-def _optimization(run: Any) -> list[str | None]:
+def _optimization(run: optimization.Run) -> list[str | None]:
     case, ms = f"{run.case}, {run.steps:,} steps", f"{1e3 * run.seconds:.0f}"
     return ["optimization", case, "float32", *[None] * 4, ms, _verdict(run)]
 
 
-def _verdict(row: Any) -> str:
+def _verdict(row: Row | optimization.Run) -> str:
     return f"**miss**: {'; '.join(row.misses)}" if row.misses else "pass"
 
 

@@ -9,10 +9,10 @@ from multiprocessing import active_children
 from pathlib import Path
 from typing import TypeVar
 
-from lang3dxl_ns.baselines.rows import BOUNDS, FULL, SEGMENTERS, Row, choose_rows
-from lang3dxl_ns.benchmarks.ablation_report import write_ablation
-from lang3dxl_ns.benchmarks.landmarks import Landmarks, landmark_scenes
-from lang3dxl_ns.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
+from lab.benchmarks.ablation_report import write_ablation
+from lab.benchmarks.ablation_rows import BOUNDS, FULL, SEGMENTERS, Row, choose_rows
+from lab.benchmarks.landmarks import Landmarks, landmark_scenes
+from lab.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import command_line, progress_bar
 from lang3dxl_ns.common.settings_help import showing

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from lang3dxl_ns.baselines.rows import CLIPSEG, LANGSAM, SAM3, SEGMENTERS, Row
+from lab.benchmarks.ablation_rows import CLIPSEG, LANGSAM, SAM3, SEGMENTERS, Row
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import host_peak, in_own_process, write_atomically

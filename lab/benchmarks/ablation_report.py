@@ -9,8 +9,8 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from lang3dxl_ns.baselines.rows import BOUNDS, FULL, Row
-from lang3dxl_ns.benchmarks.scored_runs import Run
+from lab.benchmarks.ablation_rows import BOUNDS, FULL, Row
+from lab.benchmarks.scored_runs import Run
 from lang3dxl_ns.common.reports import (
     as_png,
     describe_machine,

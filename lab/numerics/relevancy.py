@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.numerics.measure import EXACT, Bounds, Case, Maps, Problem
+from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.query.relevancy import relevancy
 
 CHANNELS = 64

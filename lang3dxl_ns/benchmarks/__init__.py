@@ -1,1 +1,0 @@
-"""Benchmarks of `lang3dxl benchmark`: error beside time and memory."""

@@ -1,1 +1,0 @@
-"""Numerical stability: components measured on a catalog of extreme cases."""
