@@ -11,11 +11,11 @@ from typing import Any
 
 from lab.benchmarks.ablation_rows import BOUNDS, FULL, Row
 from lab.benchmarks.scored_runs import Run
+from lab.reports import as_png
+from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.reports import (
-    as_png,
     describe_machine,
     markdown_table,
-    write_atomically,
     write_report,
 )
 

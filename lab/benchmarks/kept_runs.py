@@ -15,7 +15,7 @@ from lab.benchmarks.scored_runs import (
     run_configuration,
     write_output_to,
 )
-from lang3dxl_ns.common.reports import write_atomically
+from lang3dxl_ns.common.files import write_atomically
 
 
 class KeptRuns(ScoredRuns):

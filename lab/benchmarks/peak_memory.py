@@ -8,7 +8,8 @@ from typing import Any
 
 import torch
 
-from lang3dxl_ns.common.reports import host_peak, in_own_process
+from lab.reports import in_own_process
+from lang3dxl_ns.common.reports import host_peak
 
 MEBIBYTE = 2**20
 

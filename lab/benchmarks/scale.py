@@ -10,11 +10,11 @@ from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Literal
 
+from lab.reports import in_own_process
 from lang3dxl_ns.common.reports import (
     command_line,
     describe_machine,
     host_peak,
-    in_own_process,
     markdown_table,
     write_report,
 )

@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from lab.benchmarks.ablation_rows import CLIPSEG, LANGSAM, SAM3, SEGMENTERS, Row
+from lab.reports import in_own_process
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.common.reports import host_peak, in_own_process, write_atomically
+from lang3dxl_ns.common.files import expanded, write_atomically
+from lang3dxl_ns.common.reports import host_peak
 
 if TYPE_CHECKING:
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth

@@ -8,10 +8,10 @@ import pytest
 from label_sets import box_object, write_labels
 
 from lab.benchmarks.kept_runs import KeptRuns
-from lab.benchmarks.published import HolyScenes, LerfOvs, PtOvs
+from lab.benchmarks.published import HolyScenes, LerfOvs, PtOvs, published_figures
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.presets import load_preset
-from lang3dxl_ns.common.reports import write_atomically
 from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
@@ -218,7 +218,7 @@ def test_what_is_not_found_is_told_with_what_is(two_scenes, tmp_path):
 
 
 def test_published_figures_are_of_scenes_and_categories_that_the_presets_name():
-    figures = load_preset("published/holyscenes")
+    figures = published_figures("holyscenes")
     assert sum(len(scene) for scene in figures["scenes"].values()) == 18
     for scene in figures["scenes"]:
         load_preset(f"holyscenes/{scene}")

@@ -1,19 +1,15 @@
-"""Benchmark reports: machine description, peak memory, and atomic JSON and markdown."""
+"""Reports: machine description, peak memory, progress, and atomic JSON and markdown."""
 
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import os
 import platform
 import shlex
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from datetime import date
-from multiprocessing import get_context
-from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -23,7 +19,6 @@ from lang3dxl_ns.common.files import write_atomically
 
 if TYPE_CHECKING:  # imported where it is used: a command's help comes without it
     import torch
-    from matplotlib.figure import Figure
 
 Result = TypeVar("Result")
 
@@ -96,26 +91,6 @@ def synchronize() -> None:
         torch.cuda.synchronize()
 
 
-def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence[str] = ()) -> Result:
-    """The result of `work(*args)`, run in its own process so that its peak memory can be measured.
-
-    Without a GPU, processes are forked from one that has imported the modules of `preload` (the first call's,
-    for all calls); a process that has used a GPU can't be forked. All arguments must be picklable.
-
-    Raises:
-        BrokenProcessPool: the process was killed, most likely for lack of memory.
-    """
-    import torch
-
-    if torch.cuda.is_available():
-        context: BaseContext = get_context("spawn")
-    else:
-        context = get_context("forkserver")
-        context.set_forkserver_preload(list(preload))
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(work, *args).result()
-
-
 def host_peak(reset: bool = False) -> int:
     """Peak memory of this process, bytes; `reset` first lowers the recorded peak to what is held now."""
     if sys.platform == "linux":
@@ -134,7 +109,7 @@ def host_peak(reset: bool = False) -> int:
 
 
 def progress_bar() -> Progress:
-    """A rich progress bar with the time left; add one task per benchmark."""
+    """A rich progress bar with the time left; add one task per kind of work."""
     columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     return Progress(*columns, speed_estimate_period=600)  # steps vary: a short window would make it jump
 
@@ -154,13 +129,6 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> s
     """A markdown table; None becomes a dash."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join("–" if c is None else str(c) for c in line) + " |" for line in lines)
-
-
-def as_png(figure: Figure) -> bytes:
-    """A matplotlib figure as the bytes of a PNG."""
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=150)
-    return file.getvalue()
 
 
 def write_report(folder: Path, name: str, markdown: str, data: Mapping[str, Any]) -> None:

@@ -29,18 +29,15 @@ def rgb_loss(
     target: Float[Tensor, "h w 3"],
     mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
     ssim_weight: float = 0.5,
-    mask_ssim: bool = False,
 ) -> Float[Tensor, ""]:
     """(1 − w)·L1 + w·(1 − SSIM), colors in [0, 1]; SSIM's window is 11 pixels with σ 1.5.
 
-    L1 is a mean over the mask. SSIM sees the whole images, as in the published system, or with `mask_ssim`
-    both images multiplied by the mask. An image narrower than the window is extended by its border.
+    L1 is a mean over the mask. SSIM sees the whole images, as in the published system. An image narrower than
+    the window is extended by its border.
     """
     color = _weighted_mean((prediction - target).abs(), mask)
     if mask is None:
         return torch.lerp(color, 1 - _ssim(prediction, target), ssim_weight)
-    if mask_ssim:
-        prediction, target = prediction * mask[..., None], target * mask[..., None]
     structure = torch.where(mask.any(), 1 - _ssim(prediction, target), 0.0)
     return torch.lerp(color, structure, ssim_weight)
 

@@ -19,7 +19,6 @@ from lang3dxl_ns.query.run_checkpoint import latest_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.run_settings import read_model_config
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.text import EncodeTexts
 
 NOT_FINISHED = "this run has no semantics yet: they are learned when training ends; resume it (--load-dir)"
 
@@ -28,7 +27,6 @@ def load_run(
     run: str | Path | None = None,
     device: torch.device | str | None = None,
     config: QueryConfig | None = None,
-    encode_texts: EncodeTexts | None = None,
 ) -> Scene:
     """The scene of a run, from its latest checkpoint.
 
@@ -38,7 +36,6 @@ def load_run(
             commands, ns-eval and others, do trust it).
         device: by default a GPU if there is one.
         config: defaults of queries.
-        encode_texts: the run's CLIP, if it is already loaded.
 
     Raises:
         UserError: the folder has no checkpoint, or the run is damaged or of another method.
@@ -51,9 +48,7 @@ def load_run(
     )
     if model.semantic_field is not None and model.carried is None:
         raise UserError(NOT_FINISHED)
-    return model.scene(
-        file, config=config, encode_texts=encode_texts, cache=path.parent / "lang3dxl_visible.safetensors"
-    )
+    return model.scene(file, config=config, cache=path.parent / "lang3dxl_visible.safetensors")
 
 
 def _load_model(config: Any, checkpoints: Path, file: SceneFile, device: torch.device) -> Lang3DXLModel:

@@ -10,11 +10,10 @@ from painted_scene import painted_scene
 from scenes import write_scene
 
 from lab.benchmarks import attach, training
-from lab.benchmarks.published import HolyScenes
+from lab.benchmarks.published import HolyScenes, published_figures
 from lab.benchmarks.scale import ScaleBenchmark, Stage, markdown
 from lab.benchmarks.teaching import ways
 from lang3dxl_ns import cli
-from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.methods import run_config
 
 
@@ -50,7 +49,7 @@ def test_ours_stand_beside_the_published_figures_of_their_scene_and_category():
 
     scenes = {"milano": results(a=0.1, b=0.2, c=0.3), "St_Paul": results(a=0.9)}
     benchmark = HolyScenes(data=Path(), out=Path())
-    _, by_scene, _, together = benchmark.tables(scenes, load_preset("published/holyscenes"))
+    _, by_scene, _, together = benchmark.tables(scenes, published_figures("holyscenes"))
     heads, _, *lines = ([cell.strip() for cell in line.split("|")[1:-1]] for line in by_scene.splitlines())
     rows = {(line[0], line[1]): dict(zip(heads, line, strict=True)) for line in lines}
     for scene, ours, theirs in (("milano", "0.200", "0.740"), ("St_Paul", "0.900", "0.720")):

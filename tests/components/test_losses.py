@@ -48,8 +48,7 @@ def test_rgb_loss_is_the_usual_mix_of_l1_and_ssim(weight):
 
 def test_a_full_mask_changes_no_loss():
     a, b, mask = seeded(20, 30, 3), seeded(20, 30, 3, seed=1), torch.ones(20, 30, dtype=torch.bool)
-    for mask_ssim in (False, True):
-        torch.testing.assert_close(rgb_loss(a, b, mask, mask_ssim=mask_ssim), rgb_loss(a, b))
+    torch.testing.assert_close(rgb_loss(a, b, mask), rgb_loss(a, b))
 
 
 def test_masked_l1_is_the_mean_over_the_mask_however_small_it_is():
@@ -62,13 +61,12 @@ def test_masked_l1_is_the_mean_over_the_mask_however_small_it_is():
     )
 
 
-def test_ssim_sees_the_whole_image_unless_it_is_masked_too():
+def test_ssim_sees_the_whole_image():
     prediction, mask = seeded(40, 40, 3), torch.zeros(40, 40, dtype=torch.bool)
     mask[:20] = True
     target = prediction.clone()
     target[30:] = seeded(10, 40, 3, seed=1)
     assert rgb_loss(prediction, target, mask).item() > 0.01
-    assert rgb_loss(prediction, target, mask, mask_ssim=True).item() == pytest.approx(0, abs=1e-7)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 30), (10, 4), (11, 10), (3, 200)])
@@ -88,7 +86,6 @@ def test_images_below_the_ssim_window_have_a_finite_loss_and_gradient(size):
     "loss",
     [
         lambda x: rgb_loss(x, torch.ones_like(x), torch.zeros(12, 14)),
-        lambda x: rgb_loss(x, torch.ones_like(x), torch.zeros(12, 14), mask_ssim=True),
         lambda x: clip_loss(x, torch.ones_like(x), torch.zeros(12, 14)),
         lambda x: dense_loss(x, torch.ones(6, 7, 3), torch.zeros(6, 7)),
         lambda x: dense_loss(x, torch.ones(20, 20, 3), torch.zeros(20, 20)),

@@ -9,8 +9,6 @@ import numpy as np
 
 from lang3dxl_ns.demo.landmark.shapes import MISS, NEAREST, Shape, Surface, Vector
 
-OUTLINES = ("round", "pointed", "rectangle", "circle", "segment")
-"""Round arch, pointed arch, lintel, oculus, and flat (segmental) arch."""
 DOORS = ("leaves", "panels", "tympanum", "open")
 """Fillings of portals."""
 
@@ -31,6 +29,7 @@ class Openings(Shape):
     width: float
     height: float
     outline: str
+    """round, pointed or (flat) segment: arches; rectangle: a lintel; circle: an oculus."""
     filling: str
     """How the innermost surface looks: see _filling."""
     depth: float

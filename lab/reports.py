@@ -1,0 +1,42 @@
+"""Reports of the laboratory, beyond `lang3dxl_ns.common.reports`: work in its own process, and figures."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from multiprocessing.context import BaseContext
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:  # imported where it is used: a command's help comes without it
+    from matplotlib.figure import Figure
+
+Result = TypeVar("Result")
+
+
+def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence[str] = ()) -> Result:
+    """The result of `work(*args)`, run in its own process so that its peak memory can be measured.
+
+    Without a GPU, processes are forked from one that has imported the modules of `preload` (the first call's,
+    for all calls); a process that has used a GPU can't be forked. All arguments must be picklable.
+
+    Raises:
+        BrokenProcessPool: the process was killed, most likely for lack of memory.
+    """
+    import torch
+
+    if torch.cuda.is_available():
+        context: BaseContext = get_context("spawn")
+    else:
+        context = get_context("forkserver")
+        context.set_forkserver_preload(list(preload))
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(work, *args).result()
+
+
+def as_png(figure: Figure) -> bytes:
+    """A matplotlib figure as the bytes of a PNG."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=150)
+    return file.getvalue()
