@@ -51,6 +51,22 @@ def test_commands_run_from_it_alone(wheel, tmp_path):
     assert {path.name for path in page.iterdir()} >= {"index.html", "page.js", "splats.js", "LICENSES.txt"}
 
 
+def test_commands_of_a_checkout_are_listed_and_tell_the_remedy(wheel, tmp_path):
+    zipfile.ZipFile(wheel).extractall(tmp_path)
+
+    def lang3dxl(*words: str) -> subprocess.CompletedProcess:
+        command = [sys.executable, "-m", "lang3dxl_ns.cli", *words]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+
+    for listed, words in (("numerics", ["--help"]), ("ablation", ["benchmark", "--help"])):
+        helped = lang3dxl(*words)
+        assert helped.returncode == 0 and f"• {listed} " in helped.stdout
+    for words in (["numerics"], ["benchmark", "ablation"]):
+        refused = lang3dxl(*words, "--out", "report")
+        assert refused.returncode == 1
+        assert refused.stderr.startswith("Error: this command comes with a checkout of the repository")
+
+
 def test_the_version_is_the_same_everywhere(wheel):
     version = re.search(r'^version = "(.*)"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)[1]
     assert f"-{version}-" in wheel.name
