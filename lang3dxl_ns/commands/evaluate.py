@@ -40,7 +40,7 @@ class EvaluateMaps:
     masks: Path | None = None
     """Folder of foreground masks, white = keep: predictions become 0 elsewhere."""
     temperature: float = 1.0
-    """Softmax temperature that the maps were made with: 10 for `lang3dxl query`, as in LERF's code. The
+    """Softmax temperature that the maps were made with: 20 for `lang3dxl query`, 10 in LERF's code. The
     published processing uses temperature 1, to which maps are converted for it."""
     scene: str | None = None
     """Name in the report (default: that of the ground truth's folder)."""

@@ -41,6 +41,17 @@ def map_grids(height: int, width: int, tokens: int, least: int) -> tuple[Grid, G
     return (a, b), (c, d)
 
 
+def fine_grid(height: int, width: int, tokens: int, side: int) -> Grid:
+    """The patches of a photo that is read in windows of `side` of its pixels.
+
+    Args:
+        tokens: patches per side of a window.
+        side: pixels of a window's side; a window is no larger than the photo.
+    """
+    rows, columns = (max(round(tokens * length / side), tokens) for length in (height, width))
+    return rows, columns
+
+
 @torch.no_grad()
 def build_dense_map(
     photo: Float[Tensor, "h w 3"],

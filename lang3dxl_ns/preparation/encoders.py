@@ -31,6 +31,7 @@ from lang3dxl_ns.preparation.model_files import (
     spoken,
     whole,
 )
+from lang3dxl_ns.preparation.patch_head import PatchHead, head_recipe, read_patch_head
 
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _NORMALIZE_THEMSELVES = ("radio",)
@@ -62,11 +63,13 @@ class ImageTextEncoder:
         identity: str,
         brightness: float | None = None,
         resample: Literal["bilinear", "bicubic"] = "bicubic",
+        head: PatchHead | None = None,
     ) -> None:
         vision, text = model.config.vision_config, model.config.text_config
         self.crop_size, self.patch_size = input_side(vision), int(vision.patch_size)
         self.identity, self.brightness = identity, brightness
         self._family: Family = FAMILIES[model.config.model_type]
+        self._patches = self._family.patches if head is None else head.patches
         self._model, self._tokenizer, self._resample = model, tokenizer, resample
         self._device = next(model.parameters()).device
         self._mean, self._std = _channels(mean, self._device), _channels(std, self._device)
@@ -95,7 +98,7 @@ class ImageTextEncoder:
         rows, columns = (side // self.patch_size for side in windows.shape[-2:])
         windows = windows.to(self._device, torch.float32)
         with _precision_of_images(self._device):
-            patches = self._family.patches(self._model, (windows - self._mean) / self._std)
+            patches = self._patches(self._model, (windows - self._mean) / self._std)
         return patches.float().unflatten(1, (rows, columns))
 
     @torch.no_grad()
@@ -134,8 +137,19 @@ def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> Pat
     family = _family(files)
     if (family.features if features == "auto" else features) == "crops":
         return None
+    return _reading(files, head_recipe(files.folder) or family.recipe)
+
+
+def head_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
+    """How an encoder reads small windows by its patch head; None if it has none, or is to read crops."""
+    files = find_model(clip, CLIP_OPTION)
+    recipe = head_recipe(files.folder)
+    return None if recipe is None or features == "crops" else _reading(files, recipe)
+
+
+def _reading(files: ModelFiles, recipe: str) -> PatchReading:
     vision = read_config(files).vision_config
-    return PatchReading(family.recipe, input_side(vision) // vision.patch_size)
+    return PatchReading(recipe, input_side(vision) // vision.patch_size)
 
 
 def _family(files: ModelFiles) -> Family:
@@ -202,6 +216,7 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
             files.identity,
             getattr(processor, "brightness", None),  # a key of our own, in the built-in CLIP's folder
             "bilinear" if int(processor.resample) == 2 else "bicubic",
+            read_patch_head(files.folder, device),
         )
 
 

@@ -12,21 +12,24 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.image import resize
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation.crop_budget import USUAL_INPUT, Crops, choose_crops
-from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids
+from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, fine_grid, map_grids
 from lang3dxl_ns.preparation.encoders import (
     DenseEncoder,
     ImageTextEncoder,
+    head_reading,
     load_dense_encoder,
     load_image_text_encoder,
     patch_reading,
@@ -39,7 +42,7 @@ from lang3dxl_ns.preparation.model_files import (
     read_config,
     spoken,
 )
-from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
+from lang3dxl_ns.preparation.pyramid import HALF, THIRD, build_clip_target
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -56,8 +59,8 @@ _ANNOUNCED_CROPS = 5_000
 """Fewer are encoded in seconds: no duration is measured."""
 _MEASURED_S = 3.0
 """Seconds in which noise is encoded, to announce a duration."""
-_PATCHES_PER_CROP = 32
-"""Windows of patch features are encoded this many times fewer at once than crops: they hold more."""
+_PATCHES_PER_CROP = 6
+"""As many patches as this, for each crop of a batch, are encoded at once: they hold more than crops do."""
 _LONG_S = 1800.0
 """Seconds on a CPU from which the remedies are named."""
 
@@ -82,8 +85,10 @@ class _Task:
     crops: Crops
     fast: int
     """Crops that `--quality fast` would take."""
-    grids: tuple[Grid, Grid] | None
-    """Grids of a map of patch features, which then takes the place of crops."""
+    grids: tuple[Grid, ...] | None
+    """Grids of a map of patch features, if there is one."""
+    with_crops: bool
+    """Whether there are crops; beside a map, their mean is taken."""
     kinds: set[str]
     """All targets that the photo has."""
     missing: dict[str, dict[str, Any]]
@@ -168,6 +173,7 @@ def _plan(
     """A task per photo, and reasons for the photos that can't be read."""
     clip_model = find_model(config.clip, CLIP_OPTION)
     patches = patch_reading(config.clip, config.clip_features)
+    head = None if patches is not None or not fine else head_reading(config.clip, config.clip_features)
     input_pixels = getattr(read_config(clip_model).vision_config, "image_size", USUAL_INPUT)
     dense_model = find_model(config.dense, DENSE_OPTION).identity if config.makes_dense else None
     tasks, left_out = [], {}
@@ -181,7 +187,8 @@ def _plan(
         crops, fast = (
             choose_crops(scales, pixel_size, size, is_fine, input_pixels, quality) for quality in qualities
         )
-        grids, source = None, _source(photo, content)
+        grids: tuple[Grid, ...] | None = None
+        source = _source(photo, content)
         clip = {**source, "encoder": clip_model.identity, "crop_sides": crops.sides, "rule": _CROP_RULE}
         if is_fine and crops.steps != THIRD:
             clip["steps"] = crops.steps
@@ -190,6 +197,11 @@ def _plan(
             sides = sorted(math.ceil(photo.width / columns) for _, columns in grids)
             clip = {**source, "encoder": clip_model.identity, "crop_sides": sides}
             clip |= {"patches": patches.recipe, "grids": grids, "rule": RULE}
+        elif head is not None and is_fine:
+            descending = reversed(crops.sides)
+            grids = tuple(fine_grid(photo.height, photo.width, head.tokens, side) for side in descending)
+            crops = replace(crops, steps=HALF)  # the map is finer, and takes as long as the crops between
+            clip |= {"steps": HALF, "patches": head.recipe, "grids": grids, "map_rule": RULE}
         settings = {FINE if is_fine else CLIP: clip}
         if dense_model is not None and (is_fine or not fine):
             settings[DENSE] = {**source, "encoder": dense_model, "tokens": config.dense_tokens}
@@ -197,7 +209,7 @@ def _plan(
             settings[REGIONS] = {**source, **labels}
         missing = {kind: s for kind, s in settings.items() if not store.is_current(kind, photo.name, s)}
         fast_count = fast.count(photo.height, photo.width)
-        tasks.append(_Task(photo, crops, fast_count, grids, set(settings), missing))
+        tasks.append(_Task(photo, crops, fast_count, grids, patches is None, set(settings), missing))
     without = [task.photo.name for task in tasks if REGIONS not in task.kinds]
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
@@ -287,14 +299,22 @@ class _Maker:
             assert dense is not None
             return {"features": dense.encode(image)}
         assert clip is not None
-        lit, batch = clip.in_known_light(image), self._config.crop_batch
-        if task.grids:
-            tokens, windows = clip.crop_size // clip.patch_size, max(batch // _PATCHES_PER_CROP, 1)
-            features = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
-            return {"features": features, "valid": torch.ones_like(features[..., 0])}
-        crops = task.crops
-        target = build_clip_target(lit, crops.sides, clip.encode_images, clip.crop_size, batch, crops.steps)
-        return {"features": target.features, "valid": target.valid}
+        lit, batch, crops = clip.in_known_light(image), self._config.crop_batch, task.crops
+        size, of_crops = clip.crop_size, None
+        if task.with_crops:
+            of_crops = build_clip_target(lit, crops.sides, clip.encode_images, size, batch, crops.steps)
+            if not task.grids:
+                return {"features": of_crops.features, "valid": of_crops.valid}
+        assert task.grids is not None
+        tokens = size // clip.patch_size
+        windows = max(_PATCHES_PER_CROP * batch // tokens**2, 1)
+        patches = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
+        if of_crops is None:
+            return {"features": patches, "valid": torch.ones_like(patches[..., 0])}
+        grid = task.grids[-1]
+        features, valid = (resize(x, grid) for x in (of_crops.features, of_crops.valid[..., None]))
+        mean = (F.normalize(features, dim=-1) + F.normalize(patches, dim=-1)) / 2
+        return {"features": mean, "valid": valid[..., 0]}
 
     def announce(self, photos: int, device: str) -> None:
         """Log the work ahead, and the disk, memory and time it needs. Raises UserError if the disk is too
@@ -327,7 +347,7 @@ class _Maker:
         self, clip: ImageTextEncoder, dense: DenseEncoder | None, device: torch.device
     ) -> None:
         """Log how many crops are encoded, and for how long, by the time that noise takes."""
-        config, tasks = self._config, [task for task in self._tasks if task.clip and not task.grids]
+        config, tasks = self._config, [task for task in self._tasks if task.clip and task.with_crops]
         crops = sum(task.count for task in tasks)
         if crops < _ANNOUNCED_CROPS:
             return

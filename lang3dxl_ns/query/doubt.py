@@ -31,9 +31,9 @@ UNRELATED = (
 training's absent things would be told apart more easily than what people ask for."""
 DOUBTFUL = 0.1
 """A prompt with more doubt than this is reported as doubtful: so are nine in ten absent things."""
-LEAST_PEAK = 0.1
+LEAST_PEAK = 0.012
 """A prompt that fits no place better than this is in doubt whatever the unrelated words do: all of them may
-fit even less. Present things reach 0.4 and more."""
+fit even less. Present things reach 0.3 and more."""
 _BEST = 0.005
 """Share of the Gaussians that a prompt's fit is read from."""
 _AT_A_TIME = 4

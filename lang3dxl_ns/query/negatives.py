@@ -45,7 +45,7 @@ NEGATIVES = (*CANONICAL, *_NAMED)
 """The default."""
 NOTHING = ("sky", *CANONICAL)
 """Phrases that fit best where there is nothing to name."""
-CLEAR = 0.55
+CLEAR = 0.6
 """Relevancy from which a word names a place that one of them fits best."""
 
 

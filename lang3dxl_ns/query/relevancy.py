@@ -15,9 +15,9 @@ from lang3dxl_ns.query.teach import TaughtWord
 
 CANONICAL = ("object", "things", "stuff", "texture")
 """Phrases that fit anything (LERF): a prompt matches where it fits better than all of them."""
-TEMPERATURE = 10.0
-"""As in LERF's code, for cosines of the spread `SPREAD`. Neither a Gaussian's rank nor the 0.5 contour
-depends on it."""
+TEMPERATURE = 20.0
+"""For cosines of the spread `SPREAD`; LERF's code has 10. Neither a Gaussian's rank nor the 0.5 contour
+depends on it, but a pixel blends several Gaussians (docs/lab/words.md)."""
 SPREAD = 0.272
 """`spread` of the built-in CLIP's cosines in scenes that it knows."""
 _LEAST_SPREAD = 1e-4

@@ -11,7 +11,7 @@ from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 
 EVEN = 0.5
 """Relevancy where prompt and negatives fit equally well."""
-SHARE = 0.4
+SHARE = 0.3
 """Of the way from the median Gaussian's relevancy to a prompt's peak, where matches begin; chosen on
 landmarks for decisions (docs/lab/words.md)."""
 COVERED = 0.3

@@ -12,15 +12,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from PIL import Image
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 from lang3dxl_ns.common import console as progress
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.image import resize
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation import prepare as module
-from lang3dxl_ns.preparation.dense_map import build_dense_map, map_grids
+from lang3dxl_ns.preparation.dense_map import build_dense_map, fine_grid, map_grids
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
+from lang3dxl_ns.preparation.patch_head import FILE
 from lang3dxl_ns.preparation.prepare import TargetReader, prepare
 from lang3dxl_ns.preparation.pyramid import build_clip_target
 from lang3dxl_ns.preparation.regions import FelzenszwalbRegions, FolderRegions, stored_labels
@@ -311,6 +314,30 @@ def test_dense_clip_features_take_the_place_of_crops(photos, config, store, call
     calls.clear()
     assert run(photos, dense, store).encoded == 0 and not calls
     assert run(photos, replace(dense, dense_tokens=12), store).encoded == 3
+
+
+def test_training_photos_are_the_mean_of_crops_and_of_the_map_by_the_clips_patch_head(
+    photos, config, store, models
+):
+    from safetensors.torch import save_file
+    from transformers import CLIPModel
+
+    weight = CLIPModel.from_pretrained(models["clip"]).visual_projection.weight.detach()
+    folder = store.root.parent / "with_head"
+    shutil.copytree(models["clip"], folder)
+    save_file({"weight": weight.clone(), "bias": torch.zeros(len(weight))}, folder / FILE)
+    own = replace(config, clip=str(folder))
+    reader = prepare(photos, None, own, SCALES, store, "cpu", fine=[NAMES[1]]).reader
+    clip, found = load_image_text_encoder(folder, "cpu"), reader.clip(NAMES[1])
+    sides, photo = [round(share * 100) for share in found.crop_fractions], photos[1].read()
+    grids = [fine_grid(80, 100, 4, side) for side in reversed(sides)]
+    patches = build_dense_map(photo, grids, clip.encode_patches, 4, clip.patch_size, 1)
+    crops = build_clip_target(photo, sides, clip.encode_images, clip.crop_size, 8).features
+    crops = F.normalize(resize(crops, patches.shape[:2]), dim=-1)
+    expected = (crops + F.normalize(patches, dim=-1)) / 2
+    torch.testing.assert_close(found.features, expected.half(), atol=2e-3, rtol=2e-3)
+    others = prepare(photos, None, config, SCALES, store, "cpu", fine=[NAMES[1]]).reader
+    assert torch.equal(reader.clip(NAMES[0]).features, others.clip(NAMES[0]).features)  # as the 2-D teacher
 
 
 def test_without_dense_features_no_dense_entry_is_made_or_read(photos, config, store):

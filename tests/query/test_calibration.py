@@ -85,7 +85,7 @@ def test_both_engines_are_calibrated_alike():
     )
     assert each.temperature == pytest.approx(pixel.temperature, rel=1e-4)
     assert replace(each, temperature=1.0).calibrated(words).temperature == pytest.approx(
-        each.temperature / 10
+        each.temperature / TEMPERATURE
     )
 
 

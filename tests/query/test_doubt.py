@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from lang3dxl_ns.query.doubt import DOUBTFUL, UNRELATED, Doubts, doubtful, peaks
+from lang3dxl_ns.query.doubt import DOUBTFUL, LEAST_PEAK, UNRELATED, Doubts, doubtful, peaks
 from lang3dxl_ns.query.relevancy import Queries
 
 CHANNELS, GAUSSIANS = 16, 1_000
@@ -74,7 +74,9 @@ def test_a_scene_without_known_gaussians_doubts_everything():
     assert scene_of(torch.zeros(GAUSSIANS, CHANNELS), {"thing": torch.ones(CHANNELS)}).ask("thing") == [1.0]
 
 
-@pytest.mark.parametrize(("level", "expected"), [(0.0, 1.0), (0.099, 1.0), (0.101, 1 / 61), (0.9, 1 / 61)])
+@pytest.mark.parametrize(
+    ("level", "expected"), [(0.0, 1.0), (0.99 * LEAST_PEAK, 1.0), (1.01 * LEAST_PEAK, 1 / 61), (0.9, 1 / 61)]
+)
 def test_what_fits_nowhere_is_doubted_though_unrelated_words_fit_even_less(level, expected):
     nothing = Doubts(
         lambda queries: torch.zeros(len(queries), GAUSSIANS),
