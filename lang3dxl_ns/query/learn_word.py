@@ -245,8 +245,8 @@ def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
 def _logistic(
     places: Float[Tensor, "m k"], word: Float[Tensor, " m"], rest: Float[Tensor, " m"], ridge: float
 ) -> tuple[Float[Tensor, " k"], float]:
-    """Fit the slope and bias of a logistic regression in which both classes weigh the same: minimize ½ Σ word
-    · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
+    """Fit slope and bias of a logistic regression in which both classes weigh the same:
+    minimize ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
     from sklearn.linear_model import LogisticRegression
 
     labels, inputs, weights = _labeled(places, word / 2, rest / 2)

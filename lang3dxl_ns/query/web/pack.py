@@ -31,7 +31,7 @@ _MOST_PRODUCTS = 30_000
 """Most multiplications per Gaussian for which the page decodes codes itself; beyond, it gets decoded rows."""
 _MOST_ROW_BYTES = 200_000_000
 LEAST_PIXELS, PIXEL_STEPS = 0.05, 12
-"""Pixels of a view that code 0 stands for, and codes per doubling. 12.75 codes would reach 50,000 pixels."""
+"""Pixels of a view that code 0 stands for, and codes per doubling; 12.75 would reach only 50,000 pixels."""
 
 
 # ── splats ──────────────────────────────────────────────────────────────────────────────────────────────
