@@ -1,4 +1,4 @@
-"""Conversion of lenses and poses between nerfstudio's cameras and ours."""
+"""Conversion of lenses and poses between nerfstudio's cameras and this package's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 
 
 def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4"]) -> Cameras:
-    """Pinhole cameras (photos are undistorted on reading) at nerfstudio's poses."""
+    """Build pinhole cameras (photos are undistorted on reading) at nerfstudio's poses."""
 
     def column(name: str) -> Tensor:
         return torch.tensor([getattr(lens, name) for lens in lenses])
@@ -30,7 +30,7 @@ def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4
 
 
 def lens_of(cameras: Cameras, index: int) -> Lens:
-    """The lens of a nerfstudio perspective camera."""
+    """Return the lens of a nerfstudio perspective camera."""
     parameters = cameras.distortion_params
     k1, k2, k3, _, p1, p2 = [0.0] * 6 if parameters is None else parameters[index].tolist()
     return Lens(
@@ -45,7 +45,7 @@ def lens_of(cameras: Cameras, index: int) -> Lens:
 
 
 def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
-    """The lens of a nerfstudio camera at its pose, or another (refined) one, camera → world."""
+    """Convert a nerfstudio camera for the rasterizer, at its own or a refined pose (camera → world)."""
     return Camera(
         view_matrix=view_matrix(camera.camera_to_worlds[0] if pose is None else pose),
         intrinsics=camera.get_intrinsics_matrices()[0],

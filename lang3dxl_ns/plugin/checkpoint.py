@@ -11,10 +11,10 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 
 
 def run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
-    """Densification statistics, whether codes have begun, the current round through the photos, and the
-    random generators' states.
+    """Collect densification statistics, whether codes have begun, the current round through the photos, and
+    the random generators' states.
 
-    Only tensors and plain values, which torch's weights-only loader accepts.
+    The state has only tensors and plain values, which torch's weights-only loader accepts.
     """
     model = pipeline.model
     return {
@@ -33,7 +33,7 @@ def restore_run_state(pipeline: Lang3DXLPipeline, state: dict[str, Any]) -> None
         name: value.to(model.device) if isinstance(value, Tensor) else value
         for name, value in state["strategy"].items()
     }
-    model.codes_have_begun = state.get("codes_have_begun", False)  # absent from earlier checkpoints
+    model.codes_have_begun = state.get("codes_have_begun", False)  # earlier checkpoints lack this
     pipeline.datamanager.restore_round(state["photos"])
     torch.set_rng_state(state["random"])
     if torch.cuda.is_available() and len(state["random_cuda"]) == torch.cuda.device_count():

@@ -65,7 +65,7 @@ from lang3dxl_ns.scene.photo import Photo
 )
 @dataclass
 class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
-    """Photos and their targets. `--pipeline.datamanager.clip none` trains colors only."""
+    """Settings of photos and their targets. `--pipeline.datamanager.clip none` trains only colors."""
 
     _target: type = field(default_factory=lambda: Lang3DXLDataManager)
     dataparser: AnnotatedDataParserUnion = field(default_factory=PhotoCollectionDataParserConfig)
@@ -73,23 +73,23 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     cache_dir: Path | None = None
     """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
     cache_gb: float | None = None
-    """Memory for decoded photos and their targets, in gigabytes: the first that fit are kept, the others read
-    ahead of their use. Default: a quarter of the machine's memory."""
+    """Memory in gigabytes for decoded photos and their targets. The first photos that fit are kept, and the
+    others are read ahead of their use. Default: a quarter of the machine's memory."""
     read_ahead: int = 16
-    """Photos read ahead of the training step, in addition to that memory."""
+    """Number of photos read ahead of the training step, in addition to that memory."""
     targets_in_steps: tyro.conf.Suppress[bool] = True
-    """Whether training steps learn from the targets; settled with the encoder."""
+    """Whether training steps learn from the targets; set together with the encoders."""
     run: tyro.conf.Suppress[Path | None] = None
-    """Folder of the run whose config.yml this comes from; set when that is read."""
+    """Folder of the run whose config.yml these settings come from; set when that file is read."""
 
     def check(self) -> None:
-        """Raises UserError for invalid options, before any work."""
+        """Raise UserError if an option is invalid, before any work."""
         super().check()
         check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
 
     def settle_targets(self, learned: bool) -> None:
-        """Regions and targets in every step are for semantics `learned` with the scene; others have finer
-        crops."""
+        """Resolve what is prepared: semantics `learned` with the scene use regions and targets in every step,
+        others use finer crops."""
         self.targets_in_steps = learned
         if self.crops == "auto":
             self.crops = "pyramid" if learned else "fine"
@@ -102,22 +102,22 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
 
 
 _IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regions": torch.int64}
-"""Number types of targets in a step; kept in memory they are half as wide."""
+"""Number types of targets in a step; in memory they are kept half as wide."""
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
 
 
 class PhotosGoneError(UserError):
-    """Too many photos have vanished during training to continue."""
+    """Raised when too many photos have vanished during training to continue."""
 
 
 _WORTH_TELLING = 1e8
-"""Bytes of photos and targets from which their memory is announced."""
+"""Bytes of photos and targets above which their memory is logged."""
 MOST_GONE = 0.1
-"""Share of the training photos that may vanish."""
+"""Share of the training photos that may vanish before training ends."""
 
 
 class Lang3DXLDataManager(FullImageDatamanager):
-    """One photo per step: camera, image, mask, and the targets of the semantic losses."""
+    """Source of one photo per step: camera, image, mask, and the targets of the semantic losses."""
 
     config: Lang3DXLDataManagerConfig
     train_dataset: PhotoDataset
@@ -132,7 +132,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if config.data is not None:
             config.dataparser.data = Path(config.data)
         if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
-            # a run's own cameras are never found anew: its Gaussians would not fit them
+            # never find a run's own cameras anew: its Gaussians would not match them
             config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
             config.data = config.dataparser.data
         if hasattr(config.dataparser, "load_3D_points"):
@@ -151,7 +151,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             super().__init__(config, *args, **kwargs)
 
     def get_datapath(self) -> Path:
-        """Folder where the viewer keeps camera paths: the run's."""
+        """Return the folder where the viewer keeps camera paths, which is the run's."""
         return self.config.run or super().get_datapath()
 
     def create_train_dataset(self) -> PhotoDataset:
@@ -185,15 +185,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return WorkingPhotos(FeatureStore(self.cache_dir))
 
     def setup_train(self) -> None:
-        """Before training: prepare missing targets, and give the model their statistics and the scene's
-        needs."""
+        """Prepare missing targets before training; give the model their statistics and the scene's needs."""
         if self.test_mode != "val":
             return
         facts = SceneFacts.of(self.train_dataset.metadata)
         facts.needs = {need.component: need.needed for need in self.needs}
         CONSOLE.print(Markdown(f"**What this scene needs**\n\n{needs_table(self.needs)}"))
         if self.targets is not None:
-            prepared = set(self.targets.names)  # without damaged photos
+            prepared = set(self.targets.names)  # damaged photos are missing from it
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
             facts.statistics = self.targets.feature_statistics(names, self.config.targets_in_steps)
             facts.clip_targets = partial(self.targets.clip_features, names)
@@ -204,12 +203,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def targets(self) -> TargetReader | None:
-        """The prepared targets of all photos, or None if only colors are trained. Made on first use,
-        so that the viewer and exports never wait for them."""
+        """Prepared targets of all photos; None if only colors are trained. They are made on first use, so
+        that the viewer and exports never wait for them."""
         photos = list(self.photos.values())
         if self.config.clip == "none":
             return None
-        # Held-out photos have the whole pyramid, which the 2-D teacher is.
+        # Held-out photos have the whole pyramid, which serves as the 2-D teacher.
         fine = [p.name for p in self.train_dataset.photos] if self.config.crops == "fine" else []
         return prepare_collection(
             photos,
@@ -223,7 +222,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         ).reader
 
     def clean_store(self) -> tuple[int, int]:
-        """Delete targets unused by the scene's photos with this configuration; returns files and bytes."""
+        """Delete targets that this configuration and the scene's photos don't use; count files and bytes."""
         c = self.config
         used = {
             CLIP: c.clip != "none",
@@ -240,7 +239,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def test_views(self) -> NovelViews | None:
-        """The scene's test views, if it has any."""
+        """Test views of the scene; None if it has none."""
         return read_novel_views(self.data_folder)
 
     @cached_property
@@ -257,7 +256,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if self.targets is not None:
             plan = plan_crops(list(self.photos.values()), self._reconstruction(), config)
             sizes = None
-            if plan.pixel_sizes is not None:  # per pixel of the views' files
+            if plan.pixel_sizes is not None:  # the dataset needs them per pixel of the views' files
                 sizes = novel_pixel_sizes(views, config)
                 widths = {view.name: view.width for view in views.cameras}
                 sizes = {p.name: sizes[p.name] * widths[p.name] / p.width for p in dataset.photos}
@@ -271,7 +270,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def needs(self) -> list[Need]:
-        """The scene's needs for optional components, measured on first use."""
+        """Needs of the scene for optional components, measured on first use."""
         learns = self.config.clip != "none"
         sources = Sources(
             dense=learns and self.config.makes_dense,
@@ -282,8 +281,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def photos(self) -> dict[str, Photo]:
-        """All photos by name, with their foreground masks, which both datasets then use. Made on first use,
-        like the targets."""
+        """All photos by name, with their foreground masks, which both datasets then use. They are made on
+        first use, like the targets."""
         datasets = (self.train_dataset, self.eval_dataset)
         photos = {photo.name: photo for dataset in datasets for photo in dataset.photos}
         masked = with_foreground(
@@ -295,15 +294,15 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return photos
 
     def foreground(self, name: str) -> Bool[Tensor, "h w"] | None:
-        """A photo's foreground, at training resolution; None if it is the whole photo."""
+        """Return a photo's foreground at training resolution; None if it is the whole photo."""
         return self._working.mask(self.photos[name], self.config.camera_res_scale_factor)
 
     def scene_file(self) -> SceneFile:
-        """Description of the scene for the run's folder: photos, cameras, the CLIP."""
+        """Describe the scene for the run's folder: photos, cameras and CLIP."""
         outputs, clip = self.train_dataparser_outputs, self.config.clip
         known = None if clip == "none" else find_model(clip, CLIP_OPTION)
         local, trained = expanded(clip), self._described(self.train_dataset, "train")
-        names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are held out
+        names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are also held out
         held_out = self._described(self.eval_dataset, "eval")
         return SceneFile(
             photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
@@ -340,7 +339,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return expanded(self.config.cache_dir or self.data_folder / "lang3dxl_cache")
 
     def _reconstruction(self) -> Reconstruction:
-        """The model in its own units: COLMAP's, or for other dataparsers one made from the seed points."""
+        """Return the model in its own units: COLMAP's, or else one made from the dataparser's seed points."""
         own = getattr(self.dataparser, "reconstruction", None)
         if own is not None:
             return own
@@ -348,18 +347,18 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def _train_cache(self) -> PhotoCache:
-        _ = self.targets  # so that they are not made in the cache's thread
+        _ = self.targets  # prepare the targets now, not in the cache's thread
         read = partial(self._read, self.train_dataset, with_targets=self.config.targets_in_steps)
         return PhotoCache(read, self.cache_bytes)
 
     @property
     def cache_bytes(self) -> float:
-        """Memory for photos and targets, bytes."""
+        """Memory for photos and targets in bytes."""
         gigabytes = self.config.cache_gb
         return machine_memory() / 4 if gigabytes is None else gigabytes * 1e9
 
     def _memory_budget(self) -> str:
-        """Memory for photos in training, estimated from the first one's targets; "" if it is little."""
+        """Describe the memory for photos in training, estimated from the first one's targets; "" if low."""
         photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
         total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
         if self.targets is not None and self.config.targets_in_steps:
@@ -374,7 +373,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         )
 
     def sample_train_cameras(self) -> list[int]:
-        """A new round of all usable training photos."""
+        """Start a new round of all usable training photos."""
         rounds = super().sample_train_cameras()
         usable = [i for i in rounds if i not in self._left_out]
         if not usable:
@@ -382,7 +381,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return usable
 
     def next_train(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
-        """Camera and batch of the next training photo; every photo once per round.
+        """Return camera and batch of the next training photo; every photo appears once per round.
 
         A photo found to be damaged is left out from then on, and logged.
         """
@@ -397,7 +396,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
             except UserError as reason:
                 _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
                 self._leave_out(index, reason)
-                # The round continues without it: a resumed run, which meets it later, has the same order.
+                # The round continues without the photo, so that a resumed run, which meets it later, has the
+                # same order.
                 rest = [i for i in self.train_unseen_cameras if i != index]
                 self.train_unseen_cameras = rest or self.sample_train_cameras()
                 continue
@@ -406,7 +406,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             return camera, batch
 
     def _leave_out(self, index: int, reason: UserError) -> None:
-        """Raises PhotosGoneError if too many have vanished."""
+        """Leave out a photo from now on. Raises PhotosGoneError if too many have vanished."""
         self._left_out.add(index)
         self._gone += has_vanished(reason)
         if self._gone > max(MOST_GONE * len(self.train_dataset), 1):
@@ -416,7 +416,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             ) from reason
 
     def round_state(self) -> dict[str, Any]:
-        """Photos left in this round, and the state that determines the next, for a checkpoint."""
+        """Return the photos left in this round, and the state that determines the next, for a checkpoint."""
         names = [photo.name for photo in self.train_dataset.photos]
         generator = getattr(self, "random_generator", None)  # "fps" sampling has none
         return {
@@ -425,7 +425,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         }
 
     def restore_round(self, state: dict[str, Any]) -> None:
-        """Restores `round_state`; photos that this run lacks are skipped, new ones join in the next round."""
+        """Restore `round_state`. Photos that this run lacks are skipped; new ones join in the next round."""
         index = {photo.name: i for i, photo in enumerate(self.train_dataset.photos)}
         if state["generator"] is not None and hasattr(self, "random_generator"):
             self.random_generator.setstate(state["generator"])
@@ -433,7 +433,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         self.train_unseen_cameras = upcoming or self.sample_train_cameras()
 
     def train_photos(self) -> Iterator[tuple[Cameras, Batch]]:
-        """Camera and batch of every training photo once, without the damaged ones."""
+        """Yield camera and batch of every training photo once, without the damaged ones."""
         photos = enumerate(self.train_dataset.photos)
         usable = {photo.name for index, photo in photos if index not in self._left_out}
         for camera, batch in self.evaluated(self.train_dataset, usable):
@@ -441,7 +441,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             yield camera, batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
-        """Camera and batch of a held-out photo, in turn."""
+        """Return camera and batch of a held-out photo, in turn."""
         return next(self._eval_rounds)
 
     @cached_property
@@ -450,35 +450,36 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @property
     def fixed_indices_eval_dataloader(self) -> EvalPhotos:  # type: ignore[override]
-        """All held-out photos, read one at a time."""
+        """All held-out photos, which are read one at a time."""
         return self.evaluated()
 
     def evaluated(
         self, dataset: PhotoDataset | None = None, names: Collection[str] | None = None
     ) -> EvalPhotos:
-        """Photos of a dataset (default: the held-out ones) to evaluate; names: by default all of them."""
+        """Return photos of a dataset (default: the held-out ones) for evaluation. names: names of the photos;
+        default: all."""
         dataset = dataset or self.eval_dataset
 
         def ready() -> Callable[[int], tuple[Cameras, Batch]]:
-            _ = self.targets  # errors in preparing them must not be blamed on a photo
+            _ = self.targets  # errors in preparing targets must not be blamed on a photo
             return partial(self.read, dataset)
 
         return EvalPhotos(dataset, ready, names)
 
     def read(self, dataset: PhotoDataset, index: int) -> tuple[Cameras, Batch]:
-        """Camera and batch of a photo. Raises UserError if it can't be read."""
+        """Read camera and batch of a photo. Raises UserError if it can't be read."""
         return self._batch(dataset, index, self._read(dataset, index))
 
     def get_train_rays_per_batch(self) -> int:
-        """Pixels of a typical photo, for nerfstudio's speed display."""
+        """Return the pixels of a typical photo, for nerfstudio's speed display."""
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
 
     def _read(self, dataset: PhotoDataset, index: int, with_targets: bool = True) -> dict[str, Any]:
-        """A photo's data for a step, as kept in memory: bytes and half precision.
+        """Read a photo's data for a step as they are kept in memory: bytes and half precision.
 
-        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target` [Hd, Wd, C],
-        `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
-        (labels, −1 for none).
+        The data are `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target`
+        [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions`
+        [h, w] (labels, −1 for none).
         """
         data: dict[str, Any] = dict(dataset.read(index))
         if self.targets is not None and with_targets:
@@ -489,14 +490,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 "dense_target": self.targets.dense(name),
                 "regions": self.targets.regions(name),
             }
-            # Cloned: read from disk now, not during the step.
+            # Clone the values, so that they are read from disk now and not during the step.
             data |= {key: value.clone() for key, value in found.items() if value is not None}
             data["crop_sides"] = clip.crop_fractions
         return data
 
     def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, Batch]:
-        """A photo's data for a step, on the device, with `name` and `image_idx`. The camera stays on the CPU:
-        the host reads its size, and would wait for a GPU."""
+        """Put a photo's data for a step on the device, with `name` and `image_idx`. The camera stays on the
+        CPU, since the host reads its size and would wait for a GPU."""
         batch: dict[str, Any] = {"image_idx": index, "name": dataset.photos[index].name}
         for key, value in data.items():
             if isinstance(value, Tensor):
@@ -507,5 +508,5 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
 
 def _log(message: str) -> None:
-    """Log verbatim: brackets in a photo's name are not markup."""
+    """Log verbatim, since brackets in a photo's name are not markup."""
     CONSOLE.log(escape(message))

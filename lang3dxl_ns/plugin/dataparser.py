@@ -1,4 +1,4 @@
-"""Dataparsers: photo collections with a COLMAP model, the cameras of a finished run; choice of one."""
+"""Dataparsers: photo collections with a COLMAP model, recorded cameras of a run; the choice for --data."""
 
 from __future__ import annotations
 
@@ -41,28 +41,28 @@ from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 @without(*OF_COLMAP)
 @dataclass
 class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
-    """A folder with images/, a COLMAP model, and optionally masks/."""
+    """Settings of a folder with images/, a COLMAP model, and optionally masks/."""
 
     _target: type = field(default_factory=lambda: PhotoCollectionDataParser)
     colmap_path: Path = Path("sparse/0")
     """COLMAP model, relative to the data folder; sparse, colmap/sparse/0 and dense/sparse are tried too."""
     images_path: Path = Path("images")
-    """Photos, relative to the data folder; dense/images is tried too."""
+    """Folder of the photos, relative to the data folder; dense/images is tried too."""
     masks_path: Path | None = Path("masks")
-    """Foreground masks, white = keep, named like the photos (.png or .jpg); a photo without one is used
-    whole. See --pipeline.datamanager.foreground for other sources."""
+    """Folder of foreground masks, named like the photos (.png or .jpg); white marks what to keep. A photo
+    without a mask is used whole. --pipeline.datamanager.foreground has other sources."""
     held_out: Path | None = None
-    """Text file with names of the photos to hold out of training, one per line, with or without suffix;
-    replaces every eighth. `lang3dxl evaluate split` makes one from ground truth."""
+    """Text file with names of the photos to hold out of training, one per line, with or without suffix, in
+    place of every eighth photo. `lang3dxl evaluate split` makes one from ground truth."""
     follow_links: bool = False
     """Whether photos and masks may be symbolic links that leave their folder."""
     downscale_factor: int | None = 1
-    """Always 1: photos are resized on reading (--pipeline.datamanager.camera-res-scale-factor)."""
+    """Always 1, since photos are resized on reading (--pipeline.datamanager.camera-res-scale-factor)."""
 
 
 @dataclass
 class PhotoCollectionDataParser(ColmapDataParser):
-    """Reads any COLMAP model, with lens and size per photo. Photos are undistorted on reading
+    """Dataparser of any COLMAP model, with lens and size per photo. Photos are undistorted on reading
     (`Photo.read`), so all output cameras are pinholes."""
 
     config: PhotoCollectionDataParserConfig
@@ -91,7 +91,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         if self.reconstruction is None:
             self._read_collection()
             self._mention_what_is_not_used()
-        # The parent would require a mask for every photo; ours are optional and found per photo.
+        # The parent would require a mask for every photo; here masks are optional and found per photo.
         masks, scaled = self.config.masks_path, self.config.auto_scale_poses
         self.config.masks_path, self.config.auto_scale_poses = None, scaled and self._cameras_are_apart
         try:
@@ -126,7 +126,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         return indices
 
     def _held_out(self, photos: list[str]) -> list[int]:
-        """Indices of the photos in the list. Raises UserError if one of them doesn't exist."""
+        """Return the indices of the listed photos. Raises UserError if one of them doesn't exist."""
         assert self.config.held_out is not None
         indices = []
         for name in read_names(self.config.held_out):
@@ -141,7 +141,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         return indices
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict:
-        """Frames for the parent, sorted by name (so that interval splits don't depend on COLMAP's ids)."""
+        """Build the parent's frames, sorted by name, so that interval splits don't depend on COLMAP's ids."""
         assert self.reconstruction is not None
         frames = [self._frame(tracked) for tracked in self.reconstruction.photos.values()]
         applied = np.eye(4)[:3][[0, 2, 1]]
@@ -150,7 +150,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
 
     @cached_property
     def _origin(self) -> np.ndarray:
-        """The origin subtracted from positions while they are in float64: the center of the cameras.
+        """Center of the cameras, which is subtracted from positions as the origin while they are in float64.
 
         The parent casts to float32, which resolves map coordinates (millions of meters) only to half a meter.
         """
@@ -169,7 +169,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         return bool(np.ptp(centers, axis=0).max() > 1e-6 * typical)
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: torch.Tensor, scale_factor: float) -> dict:
-        """The model's points in the scene's frame, with their colors."""
+        """Return the model's points in the scene's frame, with their colors."""
         assert self.reconstruction is not None
         transform = transform_matrix.double()
         points = torch.from_numpy(self.reconstruction.points - self._origin)
@@ -207,7 +207,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         return Path(path).relative_to(self.config.data / self.config.images_path).as_posix()
 
     def _read_collection(self) -> None:
-        """The model's usable photos; logs which are left out, and why."""
+        """Read the model's usable photos, and log which are left out, and why."""
         reconstruction = read_reconstruction(self.config.data / self.config.colmap_path)
         self.photos, kept, left_out = usable_photos(
             reconstruction, self._images_folder, self._mask_path, self.config.follow_links
@@ -232,7 +232,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         self.reconstruction = replace(reconstruction, photos=kept)
 
     def _mask_path(self, name: str) -> Path | None:
-        """The photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""
+        """Find the photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""
         if self.config.masks_path is None:
             return None
         return find_mask(self.config.data / self.config.masks_path, name, self.config.follow_links)
@@ -259,7 +259,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
 
 
 def _models_beside(model: Path) -> list[Path]:
-    """The models that COLMAP's mapper left in one folder: 0, 1, …; only this one if it has no number."""
+    """List the models that COLMAP's mapper left in one folder: 0, 1, …; only this one if it has no number."""
     if not model.name.isdigit():
         return [model]
     numbered = (folder for folder in model.parent.iterdir() if folder.name.isdigit())
@@ -267,7 +267,7 @@ def _models_beside(model: Path) -> list[Path]:
 
 
 def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Path:
-    """The first of the folders (relative to `data`) that exists and holds files; otherwise the first."""
+    """Return the first folder (relative to `data`) that exists and holds files, or else the first one."""
     return next((c for c in candidates if any(p.is_file() for p in (data / c).glob(contents))), candidates[0])
 
 
@@ -276,7 +276,7 @@ def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Pa
 
 @dataclass
 class RecordedSceneDataParserConfig(DataParserConfig):
-    """The scene recorded in a run's folder."""
+    """Settings of the scene recorded in a run's folder."""
 
     _target: type = field(default_factory=lambda: RecordedSceneDataParser)
     run: Path = Path()
@@ -284,7 +284,7 @@ class RecordedSceneDataParserConfig(DataParserConfig):
 
 
 class RecordedSceneDataParser(DataParser):
-    """Cameras at training resolution. Reads nothing outside the run's folder."""
+    """Dataparser of recorded cameras at training resolution, which reads nothing outside the run's folder."""
 
     config: RecordedSceneDataParserConfig
 
@@ -300,7 +300,7 @@ class RecordedSceneDataParser(DataParser):
             scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
             metadata={
                 "photos": photos,
-                # The checkpoint brings its own Gaussians: start with the fewest possible.
+                # The checkpoint brings its own Gaussians, so start with as few as possible.
                 "points3D_xyz": torch.eye(4)[:, :3],
                 "points3D_rgb": torch.zeros(4, 3),
             },
@@ -310,7 +310,7 @@ class RecordedSceneDataParser(DataParser):
 
 
 def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
-    """The recorded scene of a run's folder, if there is one."""
+    """Return the settings for the scene recorded in a run's folder; None if there is none."""
     if run is None or not (run / SCENE_FILE).is_file():
         return None
     return RecordedSceneDataParserConfig(run=run)
@@ -320,7 +320,7 @@ def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
 
 
 def check_data(data: Path | None) -> None:
-    """Raises UserError for a place that does not exist, before encoders are looked for. None passes."""
+    """Raise UserError if a place does not exist, before encoders are looked for. None is accepted."""
     place = None if data is None else expanded(data)
     if place is not None and not place.exists() and not frames_folder(place).is_dir():
         raise UserError(f"{data} is not a folder: pass the one that holds your photos as --data, or a video")
@@ -329,8 +329,8 @@ def check_data(data: Path | None) -> None:
 def parser_for(
     parser: PhotoCollectionDataParserConfig, cache_dir: Path | None, may_reconstruct: bool
 ) -> DataParserConfig:
-    """The dataparser for `parser.data`: photos without a model are reconstructed, if allowed; a video
-    becomes a folder of frames; a folder with only a transforms.json gets nerfstudio's own parser.
+    """Choose the dataparser for `parser.data`. Photos without a model are reconstructed, if allowed; a video
+    becomes a folder of frames. A folder with only a transforms.json gets nerfstudio's own parser.
 
     Raises UserError if the photos don't make a scene.
     """
@@ -357,7 +357,7 @@ def parser_for(
     return parser
 
 
-silence_libraries()  # nerfstudio imports this module before those that warn
+silence_libraries()  # nerfstudio imports this module before the libraries that warn
 
 photo_collection = DataParserSpecification(
     config=PhotoCollectionDataParserConfig(),

@@ -14,44 +14,44 @@ from torch import Tensor
 from lang3dxl_ns.components.bounds import near_cameras
 
 _BEYOND = 1.1
-"""Growth may exceed the cap by this factor before the least opaque Gaussians make room."""
+"""Factor by which growth may exceed the cap before the least opaque Gaussians are removed."""
 
 
 @dataclass
 class Densification(DefaultStrategy):
-    """gsplat's densification by screen-space gradient, up to a number of Gaussians."""
+    """Densification by gsplat's screen-space gradient, up to a number of Gaussians."""
 
     grow_grad2d: float = 2e-4
     """Screen-space gradient (image = [−1, 1]) above which Gaussians grow."""
     most: int = 0
-    """Number of Gaussians not to exceed; 0: no limit."""
+    """Most Gaussians; 0: no limit."""
     still: int = 0
-    """The first Gaussians, the sky's, which neither grow nor go."""
+    """Number of the sky's Gaussians, which come first and are neither grown nor pruned."""
     cameras: Float[Tensor, "p 3"] | None = None
     """Positions of the training cameras, around which Gaussians are pruned."""
     free: float = 0.0
-    """How far around them, world units."""
+    """Distance around the cameras within which Gaussians are pruned, world units."""
     loss_scale: float = 1.0
-    """Factor in the latest step's gradients, under mixed precision."""
+    """Factor of the latest step's gradients, under mixed precision."""
 
     def step_pre_backward(
         self, params: Any, optimizers: Any, state: dict[str, Any], step: int, info: dict[str, Any]
     ) -> None:
-        """Called with a step's rendering (`Raster.info`), which is kept until its backward pass is done."""
+        """Take a step's rendering (`Raster.info`), and keep it until its backward pass is done."""
         super().step_pre_backward(params, optimizers, state, step, info)
         state["rendered"] = info
 
     def step_post_backward(  # type: ignore[override]
         self, params: Any, optimizers: Any, state: dict[str, Any], step: int
     ) -> None:
-        """Called after the backward pass of the rendering that `step_pre_backward` was told of."""
+        """Densify after the backward pass of the rendering that `step_pre_backward` took."""
         super().step_post_backward(params, optimizers, state, step, state.pop("rendered"), packed=False)
 
     def _update_state(
         self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False
     ) -> None:
-        """Add a step's gradients, as gsplat does, but unscaled, and without picking the visible Gaussians,
-        whose number the host would have to wait for."""
+        """Add a step's gradients as gsplat does, but unscaled. The visible Gaussians are not selected,
+        because the host would have to wait for their number."""
         means2d = info[self.key_for_gradient]
         gradient: Tensor = (means2d.absgrad if self.absgrad else means2d.grad) / self.loss_scale
         half = info["width"] / 2.0 * info["n_cameras"], info["height"] / 2.0 * info["n_cameras"]
@@ -65,7 +65,7 @@ class Densification(DefaultStrategy):
         state["count"] += seen.sum(0)
 
     def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:
-        """Near the cap only the Gaussians with the largest gradients grow; each becomes two."""
+        """Grow Gaussians; near the cap only those with the largest gradients grow, and each becomes two."""
         usual, room = self.grow_grad2d, int(_BEYOND * self.most) - len(params["means"])
         gradients = state["grad2d"] / state["count"].clamp_min(1)
         if self.most and int((gradients > usual).sum()) > room:
@@ -76,7 +76,7 @@ class Densification(DefaultStrategy):
             self.grow_grad2d = usual
 
     def _prune_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> int:
-        """Those at a camera go and, beyond the cap, the least opaque."""
+        """Prune Gaussians, also those near a camera and, above the cap, the least opaque."""
         pruned = super()._prune_gs(params, optimizers, state, step)
         means, opacities = params["means"].detach(), params["opacities"].detach().flatten()
         gone = torch.zeros_like(opacities, dtype=torch.bool)

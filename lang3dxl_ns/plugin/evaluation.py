@@ -1,4 +1,4 @@
-"""Evaluation of a run: renders and scores the photos of a split, in colors, features and words."""
+"""Evaluation of a run: renders the photos of a split and scores their colors, features and words."""
 
 from __future__ import annotations
 
@@ -40,25 +40,24 @@ from lang3dxl_ns.scene.photo import Photo
 
 Split = Literal["held-out", "seen", "test"]
 Score = Callable[[Cameras, EvaluatedPhoto, Batch, Photo], None]
-"""Adds word scores to an evaluated photo."""
+"""Function that adds word scores to an evaluated photo."""
 _COLORS_OF_LIGHT = ("psnr", "ssim", "lpips")
-"""Image metrics that are meaningless where views are lit differently from the photos."""
+"""Image metrics that are meaningless for views whose lighting differs from the photos'."""
 
 
 @dataclass
 class EvaluationSettings:
-    """What to evaluate."""
+    """Settings of an evaluation."""
 
     ground_truth: Path | None = None
-    """Folder of ground truth, in any of the layouts of docs/evaluation.md: `ns-eval` then reports how well
-    words find their pixels. Default: ground_truth/ or label/ in the data folder, or label/<scene> beside it,
-    if present."""
+    """Folder of ground truth, in any layout of docs/evaluation.md; `ns-eval` then reports how well words find
+    their pixels. Default: ground_truth/ or label/ in the data folder, or label/<scene> beside it, if
+    present."""
     ground_truth_layout: Layout | Literal["auto"] = "auto"
-    """HolyScenes' masks, LERF-OVS' and PT-OVS' labels, or plain masks; "auto" detects it."""
+    """Layout of ground truth: HolyScenes' masks, LERF-OVS' or PT-OVS' labels, or plain; `auto` detects it."""
     evaluated_photos: Split = "held-out"
-    """Photos that `ns-eval` evaluates: those held out of training (and the scene's test views, if any); the
-    training photos with ground truth (the main tables of HolyScenes use photos seen in training); or the test
-    views alone."""
+    """Photos that `ns-eval` evaluates. `held-out`: photos held out of training, and any test views. `seen`:
+    training photos with ground truth, as in HolyScenes' main tables. `test`: the scene's test views."""
 
 
 class Evaluation:
@@ -66,8 +65,8 @@ class Evaluation:
 
     Args:
         model: the model, trained or still in training.
-        datamanager: its photos and their targets.
-        settings: which photos, against which ground truth.
+        datamanager: data manager with the photos and their targets.
+        settings: which photos to evaluate, against which ground truth.
     """
 
     def __init__(
@@ -75,11 +74,11 @@ class Evaluation:
     ) -> None:
         self._model, self._data, self._settings = model, datamanager, settings
         self._engine: QueryEngine | None = None
-        """Of the evaluation that is under way."""
+        """Query engine of the current evaluation."""
 
     @cached_property
     def scorer(self) -> LanguageScorer | None:
-        """Scores words in photos, if the scene has ground truth and the run has semantics."""
+        """Scorer of words in photos; None if the scene has no ground truth or the run has no semantics."""
         folder = self._settings.ground_truth or find_ground_truth(self._data.data_folder)
         if folder is None or self._model.semantic_field is None:
             return None
@@ -89,7 +88,7 @@ class Evaluation:
 
     @cached_property
     def _test_scorer(self) -> LanguageScorer | None:
-        """Scores words in the test views."""
+        """Scorer of words in the test views; None without test views or semantics."""
         views = self._data.test_views
         if views is None or self._model.semantic_field is None:
             return None
@@ -100,7 +99,7 @@ class Evaluation:
         return self._test_scorer if split == "test" else self.scorer
 
     def _check_labels(self, truth: GroundTruth) -> None:
-        """Labels must belong to photos of the scene, each to one; warns of labels without a photo."""
+        """Check that each label belongs to one photo of the scene; warn about labels without a photo."""
         named: dict[str, str] = {}
         for name in self._data.photos:
             key = truth.key(name)
@@ -123,7 +122,7 @@ class Evaluation:
 
     @torch.no_grad()
     def evaluate(self, split: Split | None = None) -> Iterator[EvaluatedPhoto]:
-        """Render and score the photos of a split (by default the configured one), with a progress bar."""
+        """Render and score the photos of a split (default: the configured one), with a progress bar."""
         self._model.eval()
         self._engine = None
         split = split or self._settings.evaluated_photos
@@ -151,8 +150,8 @@ class Evaluation:
         self._model.train()
 
     def _fits_looks(self, split: Split) -> bool:
-        """Whether the half-image protocol applies: photos may have looks, and those of the split are not
-        known from training."""
+        """Return whether the half-image protocol applies: photos may have looks, and training has not seen
+        the looks of this split."""
         return self._model.appearance is not None and split != "seen"
 
     def _half_image(self, camera: Cameras, batch: Batch) -> HalfImage:
@@ -179,7 +178,7 @@ class Evaluation:
         return self._data.evaluated(seen, labeled)
 
     def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Camera], Maps]:
-        """Maps of the labels themselves, lifted from the photos to the Gaussians."""
+        """Build a function that renders the labels themselves, lifted from the photos to the Gaussians."""
         truth = scorer.truth
 
         def labels():
@@ -234,8 +233,7 @@ class Evaluation:
 
     @torch.no_grad()
     def relevancy(self, camera: Cameras, queries: Queries, yardstick: Queries) -> Float[Tensor, "q h w"]:
-        """Relevancy of every pixel to every prompt, of the present model, calibrated by the words of a
-        yardstick."""
+        """Compute every pixel's relevancy to every prompt, calibrated by a yardstick's words."""
         model = self._model
         if self._engine is None:
             if model.semantic_field is None or model.carried is None:
@@ -247,12 +245,12 @@ class Evaluation:
         return self._engine.maps(rendering.channels, queries)
 
     def scored(self, output_path: Path | None = None, get_std: bool = False) -> dict[str, Any]:
-        """Means and totals over the evaluated photos, and `peak_memory_mb` of the process (or of the GPU, if
-        one is used); see `evaluation.aggregate.average`.
+        """Compute means and totals over the evaluated photos, and `peak_memory_mb` of the process (or of the
+        GPU, if one is used); see `evaluation.aggregate.average`.
 
-        output_path: folder for a picture of every photo, optional.
-        get_std: adds standard deviations, `protocol` (what was scored, and how),
-            `photos` (the figures of each), and with held-out photos the same for the scene's `test_views`.
+        output_path: folder for a picture of every photo, optional. get_std: add standard deviations,
+        `protocol` (what was scored, and how), `photos` (the figures of each), and, for held-out photos, the
+        same for the scene's `test_views`.
         """
         results = self._averages(self._settings.evaluated_photos, output_path, get_std)
         results["peak_memory_mb"] = _peak_memory(self._model.device) / 2**20
@@ -266,7 +264,7 @@ class Evaluation:
         for photo in self.evaluate(split):
             if output_path is not None:
                 photo.write_pictures(output_path)
-            photo.images, photo.maps = {}, {}  # too large for all photos
+            photo.images, photo.maps = {}, {}  # pictures and maps of all photos would take too much memory
             evaluated.append(photo)
         results = average([photo.metrics for photo in evaluated], get_std)
         if get_std:

@@ -1,4 +1,4 @@
-"""Settings without effect, nerfstudio's and, in some runs, our own: it is an error to set one."""
+"""Settings without effect, nerfstudio's and, in some runs, this package's: setting one is an error."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ OF_SPLATFACTO = (
     *("use_scale_regularization", "max_gauss_ratio", "use_bilateral_grid", "grid_shape"),
     *("color_corrected_metrics", "resolution_schedule"),
 )
-"""Splatfacto's own schedule and parts that this model does not have."""
+"""Settings of splatfacto's own schedule and parts, which this model does not have."""
 OF_IMAGE_CACHES = (
     *("masks_on_gpu", "images_on_gpu", "cache_images", "cache_images_type", "max_thread_workers"),
     *("eval_num_images_to_sample_from", "eval_num_times_to_repeat_images", "eval_image_indices"),
 )
-"""nerfstudio's caches of photos; here one bounded cache takes their place."""
+"""Settings of nerfstudio's photo caches, which one bounded cache replaces here."""
 OF_COLMAP = (
     *("downscale_rounding_mode", "depths_path", "depth_unit_scale_factor", "max_2D_matches_per_3D_point"),
     "load_3D_points",
 )
-"""nerfstudio's reader of COLMAP models; this package's reads points always, and depths never."""
+"""Settings of nerfstudio's COLMAP reader; this package's reads points always, and depths never."""
 _OF_RENDERINGS = (
     *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up", "semantic_ramp"),
     *("codes_from", "dense_compare", "mask_dense", "feature_gradient_to_geometry", "downsampler"),
 )
-"""Settings of semantics that are trained with the scene."""
+"""Settings that matter only for semantics that are trained with the scene."""
 
 
 def check_inert(model: Any, data: Any) -> None:
-    """Raises UserError if a setting that has no effect in this run differs from its default.
+    """Raise UserError if a setting that has no effect in this run differs from its default.
 
     model, data: settings of the model and of the data manager.
     """

@@ -15,8 +15,8 @@ from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.preparation.handover import Batch
 
 LONGER_SIDE = 1_600
-"""Pixels of the longer side at which larger photos are gathered: a CLIP crop covers hundreds of pixels, and
-time and memory grow with their number."""
+"""Longer side in pixels to which larger photos are reduced for gathering: a CLIP crop covers hundreds of
+pixels, and time and memory grow with their number."""
 
 
 def learn_from_photos(
@@ -24,10 +24,12 @@ def learn_from_photos(
     photos: Iterable[tuple[Cameras, Batch]],
     advance: Callable[[], None] = lambda: None,
 ) -> None:
-    """Give the model's Gaussians codes of the photos' targets; see `learn_codes`.
+    """Give the model's Gaussians codes that represent the photos' targets; see `learn_codes`.
 
-    model: in training mode, so that it renders its photos as in training. photos: cameras and batches, with
-    targets. advance: called as the decoder learns, `learning_steps` times.
+    Args:
+        model: the model in training mode, so that it renders its photos as in training.
+        photos: cameras and batches, with targets.
+        advance: called `learning_steps` times as the decoder learns.
     """
     decoder, facts = model.semantic_field, model.facts
     assert decoder is not None and facts.clip_targets is not None
@@ -54,7 +56,7 @@ def _view(model: Lang3DXLModel, camera: Cameras, batch: Batch) -> TargetView:
 
 
 def working_camera(camera: Cameras) -> Cameras:
-    """The camera, with an image plane of at most `LONGER_SIDE` pixels."""
+    """Return the camera, with an image plane of at most `LONGER_SIDE` pixels."""
     longer = int(torch.maximum(camera.width, camera.height).max())
     if longer > LONGER_SIDE:
         camera = deepcopy(camera)

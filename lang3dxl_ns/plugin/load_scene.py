@@ -28,13 +28,13 @@ def load_run(
     device: torch.device | str | None = None,
     config: QueryConfig | None = None,
 ) -> Scene:
-    """The scene of a run, from its latest checkpoint.
+    """Load the scene of a run from its latest checkpoint.
 
     Args:
-        run: the run's folder, a folder above it (the newest run there is taken), or its config.yml; None:
-            the newest under outputs/. The file is loaded without executing code (nerfstudio's own
-            commands, ns-eval and others, do trust it).
-        device: by default a GPU if there is one.
+        run: the run's folder, a folder above it (the newest run there is taken), or its config.yml; None: the
+            newest run under outputs/. The file is loaded without executing code (nerfstudio's own commands,
+            such as ns-eval, do trust it).
+        device: default: a GPU if there is one.
         config: defaults of queries.
 
     Raises:
@@ -58,7 +58,7 @@ def _load_model(config: Any, checkpoints: Path, file: SceneFile, device: torch.d
         raise UserError(f"{checkpoints.parent} is a run of another method: train one with ns-train lang3dxl")
     names, metadata = [photo.name for photo in file.photos if photo.split == "train"], dict[str, Any]()
     SceneFacts(names).into(metadata)
-    # The checkpoint brings its own Gaussians: start with the fewest possible.
+    # The checkpoint brings its own Gaussians, so start with as few as possible.
     start = replace(config, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
     model = start.setup(
         scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
@@ -79,5 +79,5 @@ def _load_model(config: Any, checkpoints: Path, file: SceneFile, device: torch.d
 
 
 def model_state(state: dict[str, Any]) -> dict[str, Any]:
-    """The model's part of a pipeline's parameters."""
+    """Select the model's part of a pipeline's parameters."""
     return {k.removeprefix("_model."): v for k, v in state.items() if k.startswith("_model.")}

@@ -34,7 +34,7 @@ from lang3dxl_ns.preparation.handover import Batch
 from lang3dxl_ns.scene.geometry import center_and_radius
 
 DECODE_SIZES = 5
-"""Sizes at which code maps are decoded in training."""
+"""Number of sizes at which code maps are decoded in training."""
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Lang3DXLModelConfig(ModelSettings):
 
 
 class Lang3DXLModel(RenderingModel):
-    """Gaussians with colors and semantic codes; without targets (clip = none) it has no semantic parts."""
+    """Gaussians with colors and semantic codes; without targets (clip = none) there are no semantic parts."""
 
     def populate_modules(self) -> None:
         """Build Gaussians, strategy, components and metrics (on the CPU; the pipeline moves them)."""
@@ -78,14 +78,14 @@ class Lang3DXLModel(RenderingModel):
     # ── training ────────────────────────────────────────────────────────────────────────────────────
 
     def step_cb(self, optimizers, step: int) -> None:
-        """Before an iteration: tell the components the fraction of the run done."""
+        """Tell the components the fraction of the run that is done; called before an iteration."""
         super().step_cb(optimizers, step)
         if self.semantic_field is not None:
             self.semantic_field.set_progress(step / self.config.total_steps)
 
     def step_post_backward(self, step: int) -> None:
-        """After an iteration: densify and prune (except at step 0, where the strategy would reset opacities,
-        and after a skipped step); keep Gaussians in bounds; write the sky's colors."""
+        """Finish an iteration: densify and prune (except at step 0, where the strategy would reset opacities,
+        and after a skipped step), keep Gaussians in bounds, and write the sky's colors."""
         if step > 0 and self.step_is_sound:
             before = self.num_points
             self.strategy.step_post_backward(
@@ -101,7 +101,7 @@ class Lang3DXLModel(RenderingModel):
                 self.gauss_params["features_dc"][: len(self.sky)] = colors
 
     def forget_gathered_codes(self) -> None:
-        """Remove codes that were gathered for a question in training: the Gaussians go on changing."""
+        """Remove codes that were gathered for a question in training, since the Gaussians still change."""
         if not self.learns_from_renderings and "codes" in self.gauss_params:
             del self.gauss_params["codes"]
 
@@ -110,7 +110,7 @@ class Lang3DXLModel(RenderingModel):
         return {name: [self.gauss_params[name]] for name in names}
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Optimizer groups: one per Gaussian property, and those of the components present."""
+        """Return the optimizer groups: one per Gaussian property, and those of the components present."""
         groups = self.get_gaussian_param_groups()
         for component in COMPONENTS:
             groups |= component.parameters(self)
@@ -121,7 +121,7 @@ class Lang3DXLModel(RenderingModel):
     def get_loss_dict(
         self, outputs: dict, batch: Batch, metrics_dict: dict | None = None
     ) -> dict[str, Tensor]:
-        """Color loss and, if there are semantics, the semantic losses (already weighted)."""
+        """Compute the color loss and, if there are semantics, the semantic losses, all already weighted."""
         mask = self._downscale_if_required(batch["mask"])[..., 0] if "mask" in batch else None
         with part("losses"):
             target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
@@ -143,7 +143,7 @@ class Lang3DXLModel(RenderingModel):
         with part("downsample"):
             predicted, target, weight = self._match(clip, batch, small_mask)
         with part("losses"):
-            # Cells with little foreground have little weight.
+            # Cells with little foreground have a low weight.
             weight = None if small_mask is None else weight
             loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, target, weight)}
             if dense is not None and "dense_target" in batch:
@@ -158,7 +158,7 @@ class Lang3DXLModel(RenderingModel):
         return loss | {name: ramp * value for name, value in own.items()}
 
     def _decode_small(self, codes: Float[Tensor, "H W 3"], mask: Tensor | None, size: tuple[int, int]):
-        """Decode a map resized (nearest) to a given size → clip [h, w, C], dense, mask [h, w]."""
+        """Resize a code map to a size (nearest), and decode it → clip [h, w, C], dense, mask [h, w]."""
         small_mask = None if mask is None else resize_nearest(mask[..., None].float(), size)[..., 0]
         assert self.semantic_field is not None
         with part("decode"):
@@ -170,8 +170,8 @@ class Lang3DXLModel(RenderingModel):
         return self.downsampler.match(clip, batch["clip_target"], batch["crop_sides"], mask)
 
     def _random_size(self) -> int:
-        """Longer side to decode at in this iteration, one of a few, since a GPU's libraries prepare for every
-        new size; the same after a resume."""
+        """Draw the longer side at which this iteration decodes. It is one of a few, since a GPU's libraries
+        prepare for every new size, and the same after a resume."""
         assert self.config.decode_size is not None
         smallest, largest = self.config.decode_size
         generator = torch.Generator().manual_seed(self.step)
@@ -179,7 +179,7 @@ class Lang3DXLModel(RenderingModel):
         return round(smallest + place * (largest - smallest))
 
     def get_metrics_dict(self, outputs: dict, batch: Batch) -> dict[str, Tensor]:
-        """Numbers for the log: PSNR of the step's photo and the number of Gaussians."""
+        """Compute numbers for the log: PSNR of the step's photo, and the number of Gaussians."""
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         metrics = {
             "psnr": psnr(outputs["rgb"].detach(), target),
@@ -196,7 +196,7 @@ class Lang3DXLModel(RenderingModel):
     def get_image_metrics_and_images(  # type: ignore[override]
         self, outputs: dict, batch: Batch
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Held-out photo: PSNR, SSIM, and LPIPS if its weights are available."""
+        """Evaluate a held-out photo: PSNR, SSIM, and LPIPS if its weights are available."""
         target, predicted = self.get_gt_img(batch["image"]), outputs["rgb"]
         metrics = self.image_metrics(predicted, target)
         images = {"img": torch.cat([target, predicted], dim=1)}
@@ -206,8 +206,8 @@ class Lang3DXLModel(RenderingModel):
 
     @torch.no_grad()
     def corrected_psnr(self, outputs: dict, batch: Batch) -> float:
-        """PSNR with matched colors. It takes seconds for a large photo, so `ns-eval` alone measures it."""
-        # Matched on the CPU, whose solver also handles pictures of a single color.
+        """Compute PSNR with matched colors, which takes seconds for a large photo; only `ns-eval` does."""
+        # Colors are matched on the CPU, whose solver also handles pictures of a single color.
         target, predicted = self.get_gt_img(batch["image"]).cpu(), outputs["rgb"].cpu()
         return float(psnr(color_correct(predicted, target), target))
 
@@ -215,7 +215,7 @@ class Lang3DXLModel(RenderingModel):
     def image_metrics(
         self, predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]
     ) -> dict[str, float]:
-        """`psnr` (dB), `ssim`, and `lpips` if its weights are available."""
+        """Compute `psnr` (dB), `ssim`, and `lpips` if its weights are available."""
         chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]
         metrics = {"psnr": float(psnr(predicted, target)), "ssim": float(self.ssim(*chw))}
         perceptual = self.lpips(*chw)
@@ -223,7 +223,7 @@ class Lang3DXLModel(RenderingModel):
 
     @torch.no_grad()
     def feature_metrics(self, camera: Cameras, batch: Batch) -> dict[str, float]:
-        """Agreement with a photo's targets, beside that of the mean training feature."""
+        """Measure agreement with a photo's targets, for the model and for the mean training feature."""
         if self.carried is None or "clip_target" not in batch:
             return {}
         assert self.config.decode_size is not None
@@ -238,8 +238,8 @@ class Lang3DXLModel(RenderingModel):
         return metrics
 
     def _feature_maps(self, camera: Cameras, longer_side: int, mask: Tensor | None):
-        """Features in a camera → clip [h, w, C], dense [h, w, D] or None, mask [h, w]; decoded before or
-        after compositing, depending on the decoder."""
+        """Compute features in a camera → clip [h, w, C], dense [h, w, D] or None, mask [h, w]. They are
+        decoded before or after compositing, depending on the decoder."""
         decoder, carried = self.semantic_field, self.carried
         assert decoder is not None and carried is not None
         if not decoder.per_gaussian:

@@ -19,10 +19,10 @@ from lang3dxl_ns.plugin.optimizers import run_length_weight
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
 
 SHORT_FIELD_RUN = 5_000
-"""Runs with fewer iterations use the field's `short` preset, if they train it with the scene: the grid as
-printed has learned no words after 300. Theirs are also the `auto` of `codes_from` and of the looks' grid."""
+"""Iterations below which a run that trains the field with the scene uses its `short` preset, since the
+published grid has learned no words after 300. `auto` of `codes_from` and of the looks' grid use this too."""
 START_OF_CODES = 0.25
-"""Fraction of the run after which codes start from photos: the paper's densification is over by then."""
+"""Fraction of the run after which codes start from photos; the paper's densification is over by then."""
 
 
 @without(*OF_SPLATFACTO)
@@ -36,81 +36,81 @@ class ModelSettings(SplatfactoModelConfig):
     """Splatfacto's settings, with the method's schedule and the semantic components."""
 
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
-    """The feature decoder: the semantic field, or a baseline."""
+    """Feature decoder: the semantic field, or a baseline."""
     semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
-    """Decoder from a 3-number code to CLIP and dense features."""
+    """Settings of the field that decodes a 3-number code to CLIP and dense features."""
     downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
-    """Reduces decoded features to the grid of the CLIP target; training only."""
+    """Settings of the training-only network that reduces decoded features to the CLIP target's grid."""
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
-    """Colors that depend on each photo's light."""
+    """Settings of colors that depend on each photo's lighting."""
     clip_weight: float = 1.0
-    """Weight of the CLIP loss (mean absolute difference)."""
+    """Weight of the CLIP loss, a mean absolute difference."""
     dense_weight: float | None = None
     """Weight of the dense (DINO) loss. None: 2 in short runs, falling to 0.5 in long ones."""
     region_weight: float = 5e-4
-    """Weight of the feature variance inside regions, if the scene has regions."""
+    """Weight of the loss on feature variance inside regions, if the scene has regions."""
     decode_size: tuple[int, int] | None = None
-    """The code map is decoded at one of five sizes in this range: pixels of its longer side, inclusive.
-    None: 56 to 72 in short runs, growing to 80 to 120 (the paper's) in long ones."""
+    """Range of the longer side in pixels, inclusive, at which the code map is decoded; five sizes in it are
+    used. None: 56 to 72 in short runs, growing to 80 to 120 (the paper's) in long ones."""
     dense_compare: Literal["auto", "target"] = "auto"
-    """Grid on which dense features are compared: the target's, as published; `auto`: the prediction's,
-    which costs a fraction, unless the target is much coarser."""
+    """Grid on which dense features are compared. `target`: the target's, as published. `auto`: the
+    prediction's, which costs a fraction, unless the target is much coarser."""
     mask_dense: bool = True
-    """Whether the dense loss leaves out the background, like the other losses; as published it doesn't."""
+    """Whether the dense loss leaves out the background, as the other losses do. The published one doesn't."""
     semantic_ramp: float = 0.5
     """Fraction of the run over which the weight of the CLIP and dense losses rises from 0.1 to 1."""
     warm_up: float = 0.0
-    """Fraction of the run that trains colors only, before the semantic losses start."""
+    """Fraction of the run that trains only colors, before the semantic losses start."""
     codes_from: Literal["auto", "noise", "photos"] = "noise"
-    """What codes and field start from when the warm-up is over: noise, as published, or the photos' features,
-    gathered onto the Gaussians; then a warm-up of 0 becomes a quarter of the run. `auto`: photos in runs of
-    under 5,000 iterations."""
+    """Start of codes and field when the warm-up is over. `noise`: random, as published. `photos`: the photos'
+    features, gathered onto the Gaussians; a warm-up of 0 then becomes a quarter of the run. `auto`: `photos`
+    in runs of under 5,000 iterations."""
     feature_gradient_to_geometry: bool = False
-    """Let the semantic losses also move Gaussians, as in the authors' code; opacities belong to the colors
-    alone. Costs a second rendering."""
+    """Let the semantic losses also move Gaussians, as in the authors' code; opacities still follow the colors
+    alone. This costs a second rendering."""
     view_dependence: Literal["auto", "on", "off"] = "auto"
-    """Colors that depend on the viewing direction (spherical harmonics of `sh_degree`); off leaves one
-    color and a quarter of the numbers per Gaussian. `auto`: by the scene's measured needs."""
+    """Let colors depend on the viewing direction (spherical harmonics of `sh_degree`). `off` leaves one color
+    and a quarter of the numbers per Gaussian. `auto` decides by measuring the scene."""
     camera_optimization: Literal["auto", "on", "off"] = "auto"
     """Refine the cameras during training. `auto`: if the COLMAP model's reprojection error is large."""
     rasterizer: Literal["auto", "gsplat", "torch"] = "auto"
-    """What renders on a GPU. `auto`: gsplat, built at its first use (docs/gpu.md), or, if it can't be built,
-    torch, many times slower."""
+    """Rasterizer on a GPU. `auto`: gsplat, which is built at its first use (docs/gpu.md), or, if the build
+    fails, torch, which is many times slower."""
     max_gaussians: int | None = None
-    """Most Gaussians that densification makes; beyond, the least opaque go. None: what the GPU's (or the
-    machine's) memory holds; 0: no limit."""
+    """Most Gaussians that densification makes; above it, the least opaque are removed. None: what the GPU's
+    (or the machine's) memory holds. 0: no limit."""
     sky_gaussians: int = 2_000
-    """Gaussians on a sphere around the scene for the sky and the far distance, where a COLMAP
-    model has no points; 0 for none. If photos share one light, their colors are one smooth function."""
+    """Number of Gaussians on a sphere around the scene for the sky and the far distance, where a COLMAP model
+    has no points. 0: none. If photos share one lighting, their colors are one smooth function."""
     total_steps: int = 30_000
-    """Iterations of the run, for the fractions below; set by the trainer."""
+    """Iterations of the run, to which the fractions refer. The trainer sets it."""
     densify_from: float = 1 / 15
     """Fraction of the run at which densification starts (the paper: 2,000 of 30,000)."""
     densify_until: float = 0.5
-    """Fraction of the run at which it ends."""
+    """Fraction of the run at which densification ends."""
     densify_every: float = 1 / 15
     """Fraction of the run between two densification steps (the paper: every 2,000)."""
     background_color: Literal["random", "black", "white"] = "black"
-    """Black, as in the paper: where nothing is rendered the code is zero too."""
+    """Color behind the scene. Black, as in the paper: where nothing is rendered, the code is zero too."""
     num_downscales: int = 0
-    """Photos already vary in size: no extra coarse-to-fine resolution."""
+    """Number of coarse-to-fine steps in resolution. None are needed, since photos already vary in size."""
     ssim_lambda: float = 0.5
     """Weight of 1 − SSIM relative to L1 in the color loss."""
     cull_alpha_thresh: float = 0.005
-    """Gaussians below this opacity are pruned."""
+    """Opacity below which Gaussians are pruned."""
     use_absgrad: bool = False
-    """Densify by the norm of the mean gradient, as in the paper."""
+    """Densify by absolute gradients. Off, as in the paper, which uses the norm of the mean gradient."""
     densify_grad_thresh: float | None = None  # type: ignore[assignment]
     """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-3 in
     short runs, which densify while gradients are still large, falling to 2e-4 (the paper's) in long ones."""
 
     def fit_to_run(self, iterations: int) -> None:
-        """Resolve settings that depend on the length of the run: between short and long ones
-        (`optimizers.run_length_weight`) numbers change gradually."""
+        """Resolve settings that depend on the length of the run. Numbers change gradually between short and
+        long runs (`optimizers.run_length_weight`)."""
         x = run_length_weight(iterations)
         self.total_steps = iterations
         if self.semantic_field.preset == "auto":
-            # Compression is a direct regression, whatever the run's length.
+            # Compression is a direct regression and does not depend on the run's length.
             compressed = self.decoder.name == "gathered"
             long = "paper" if self.decoder.name == "paper" else "default"
             preset = "short" if compressed or iterations < SHORT_FIELD_RUN else long
@@ -136,9 +136,9 @@ class ModelSettings(SplatfactoModelConfig):
 
 
 def make_strategy(config: ModelSettings) -> Densification:
-    """Densification with the run's schedule."""
+    """Build the densification with the run's schedule."""
     steps = config.total_steps
-    assert config.densify_grad_thresh is not None  # chosen by the length of the run
+    assert config.densify_grad_thresh is not None  # set by `fit_to_run`
     return Densification(
         prune_opa=config.cull_alpha_thresh,
         grow_grad2d=config.densify_grad_thresh,

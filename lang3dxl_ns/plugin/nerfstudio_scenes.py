@@ -1,4 +1,4 @@
-"""Scenes read by nerfstudio's own dataparsers: check of a transforms.json, photos, a model without tracks."""
+"""Scenes of nerfstudio's own dataparsers: check of a transforms.json, photos, models without tracks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def check_transforms(dataparser: DataParserConfig) -> None:
 
     Raises UserError for a file that is not JSON or lists no photo, an impossible lens or pose, an unknown
     camera model, and a path that leads out of the scene's folder, also through a link inside it. (A folder in
-    the scene's may be a link itself, as images/ may be.) Other dataparsers pass.
+    the scene's may be a link itself, such as images/.) Scenes of other dataparsers are not checked.
     """
     if not isinstance(dataparser, NerfstudioDataParserConfig):
         return
@@ -98,7 +98,7 @@ def _check_frame(frame: dict[str, Any], folder: Path) -> None:
 
 
 def _check_path(name: object, folder: Path) -> None:
-    """As `inside`; but folders of the scene may be links, as they often are for large photos."""
+    """Check a path as `inside` does; but folders of the scene may be links, as for large photos."""
     if not isinstance(name, str):
         raise ValueError(f"{str(name)[:40]!r} is not a path")
     path = folder / name
@@ -117,7 +117,7 @@ def _check_path(name: object, folder: Path) -> None:
 
 
 def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
-    """`Photo`s for the outputs of any nerfstudio dataparser.
+    """Build `Photo`s for the outputs of any nerfstudio dataparser.
 
     Raises UserError for a camera that is not a perspective camera, and for a photo outside the data folder.
     """
@@ -149,8 +149,8 @@ def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
 
 
 def reconstruction_of(splits: list[DataparserOutputs]) -> Reconstruction:
-    """A reconstruction in the scene's original units from cameras and seed points, for scenes without
-    tracks: a photo's points are the seed points that project into it."""
+    """Build a reconstruction in the scene's original units from cameras and seed points, for scenes without
+    tracks. A photo's points are the seed points that project into it."""
     metadata = splits[0].metadata
     scale = splits[0].dataparser_scale
     points = (

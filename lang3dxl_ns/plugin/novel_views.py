@@ -20,8 +20,8 @@ from lang3dxl_ns.scene.photo import Photo
 
 
 def novel_outputs(views: NovelViews, trained: DataparserOutputs, masked: bool) -> DataparserOutputs:
-    """The test views as dataparser outputs. trained: those of the photos, whose transform and scale apply to
-    the views' cameras too. masked: with their foreground masks, if any."""
+    """Build dataparser outputs of the test views. trained: outputs of the photos, whose transform and scale
+    also apply to the views' cameras. masked: whether to include the views' foreground masks, if any."""
     photos = [
         Photo.from_model(
             view,
@@ -39,7 +39,7 @@ def novel_outputs(views: NovelViews, trained: DataparserOutputs, masked: bool) -
 
 
 def novel_pixel_sizes(views: NovelViews, config: PreparationConfig) -> dict[str, float]:
-    """World units per pixel of every test view, by the same rules as for photos."""
+    """Compute the world units per pixel of every test view, by the same rules as for photos."""
     sizes = {g.name: pixel_size(g, config.pixel_distance, config.pixel_angle) for g in views.cameras}
     median = float(np.median([size for size in sizes.values() if size is not None]))
     return {name: median if size is None else size for name, size in sizes.items()}
@@ -48,7 +48,7 @@ def novel_pixel_sizes(views: NovelViews, config: PreparationConfig) -> dict[str,
 def _pose(
     camera_from_world: Float[Tensor, "3 4"], transform: Float[Tensor, "3 4"], scale: float
 ) -> Float[Tensor, "3 4"]:
-    """Camera → world in the run's frame, x ↦ scale · transform(x), nerfstudio's axes."""
+    """Convert to camera → world in the run's frame, x ↦ scale · transform(x), with nerfstudio's axes."""
     bottom = camera_from_world.new_tensor([[0.0, 0.0, 0.0, 1.0]])
     pose = camera_to_world(torch.cat([camera_from_world, bottom]))
     position = transform[:, :3] @ pose[:, 3:] + transform[:, 3:]

@@ -1,4 +1,4 @@
-"""Optimizers: Adam and its learning rates over a run of any length, a guard before each step."""
+"""Optimizers: Adam and its learning rates over a run of any length, with a guard before each step."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ from torch.optim.lr_scheduler import LambdaLR
 from lang3dxl_ns.components import schedules
 
 SHORT_RUN = 1_000
-"""Iterations of a run that uses the short-run rates."""
+"""Iterations up to which runs use the short-run rates."""
 LONG_RUN = 30_000
-"""Iterations of a run that uses the published rates."""
+"""Iterations from which runs use the published rates."""
 
 
 def run_length_weight(iterations: int) -> float:
-    """Position of a run between the short (0) and the long one (1), on a logarithmic scale."""
+    """Compute the position of a run between the short (0) and the long one (1), on a logarithmic scale."""
     position = math.log(max(iterations, 1) / SHORT_RUN) / math.log(LONG_RUN / SHORT_RUN)
     return min(max(position, 0.0), 1.0)
 
 
 @dataclass
 class RunAdamConfig(AdamOptimizerConfig):
-    """Adam with a learning rate for the length of the run."""
+    """Settings of Adam with a learning rate for the length of the run."""
 
     eps: float = 1e-15
-    """As in 3D Gaussian splatting: the first gradients of codes and tables are tiny."""
+    """Constant in Adam's denominator: as in 3D Gaussian splatting, since codes and tables have tiny gradients
+    at first."""
     short_lr: float | None = None
-    """Rate for runs of up to 1,000 iterations (None: the same as `lr`, which is for 30,000 and more).
-    In between, the two are interpolated on a logarithmic scale."""
+    """Rate for runs of up to 1,000 iterations, where `lr` is for 30,000 and more; in between, the two are
+    interpolated on a logarithmic scale. None: the same as `lr`."""
 
     def fit(self, iterations: int) -> None:
         """Resolve `lr` for a run of this many iterations."""
@@ -47,15 +48,15 @@ class RunAdamConfig(AdamOptimizerConfig):
 
     def setup(self, params) -> Optimizer:
         params = list(params)
-        # One pass over parameters and moments; a CPU otherwise takes ten, which for the tables of hash grids
-        # costs more than rendering.
+        # The fused form takes one pass over parameters and moments. A CPU otherwise takes ten, which for the
+        # tables of hash grids costs more than rendering.
         fused = True if all(p.device.type == "cpu" for p in params) else None
         return torch.optim.Adam(params, lr=self.lr, eps=self.eps, weight_decay=self.weight_decay, fused=fused)
 
 
 @dataclass
 class RunScheduleConfig(SchedulerConfig):
-    """A learning-rate curve in fractions of the run: warm-up (log-linear), then decay."""
+    """Learning-rate curve in fractions of the run: warm-up (log-linear), then decay."""
 
     _target: type = field(default_factory=lambda: RunSchedule)
     start: float = 1.0
@@ -67,25 +68,25 @@ class RunScheduleConfig(SchedulerConfig):
     shape: Literal["cosine", "log-linear"] = "cosine"
     """Shape of the decay after the warm-up."""
     power: float = 1.0
-    """Cosine only: the fraction is first raised to this power (2 keeps the rate high longer)."""
+    """Power to which the fraction is first raised, for `cosine` only; 2 keeps the rate high longer."""
     until: float = 1.0
-    """Fraction of the run at which the end is reached; constant afterwards."""
+    """Fraction of the run at which the end is reached; the rate is constant afterwards."""
     total_steps: int = LONG_RUN
-    """Iterations of the run; set by the trainer."""
+    """Iterations of the run. The trainer sets it."""
 
 
 class RunSchedule(Scheduler):
-    """Makes the scheduler of a `RunScheduleConfig`."""
+    """Scheduler of a `RunScheduleConfig`."""
 
     config: RunScheduleConfig
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        # A plain function, since LambdaLR would put a callable object's state into the checkpoint.
+        # A plain function is used, since LambdaLR would put a callable object's state into the checkpoint.
         return LambdaLR(optimizer, lambda step: self.multiple(step))
 
     def multiple(self, step: int) -> float:
-        """Multiple of the rate at an iteration, as a Python float (a NumPy one would end up in the
-        checkpoint, where torch's weights-only loader rejects it)."""
+        """Compute the multiple of the rate at an iteration, as a Python float (a NumPy one would end up in
+        the checkpoint, where torch's weights-only loader rejects it)."""
         c = self.config
         x = min(step / max(c.total_steps, 1) / c.until, 1.0)
         if x < c.warm:
@@ -114,7 +115,7 @@ class GuardedOptimizers(Optimizers):
         self.zero_grad_all()
 
     def live_parameters(self) -> dict[str, list[Tensor]]:
-        """The optimizers' present parameters (`parameters` are the initial ones, before densification)."""
+        """Return the optimizers' present parameters; `parameters` are those before densification."""
         return {
             name: [parameter for group in optimizer.param_groups for parameter in group["params"]]
             for name, optimizer in self.optimizers.items()

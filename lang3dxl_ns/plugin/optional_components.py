@@ -1,7 +1,7 @@
-"""Optional components of the model, all of one shape: smooth sky, camera refinement, semantics, lighting.
+"""Optional components of the model, with one interface: smooth sky, camera refinement, semantics, lighting.
 
-The model is built, loaded and optimized through `COMPONENTS`. What a component adds are attributes of
-the model, by which a checkpoint names its tensors.
+The model is built, loaded and optimized through `COMPONENTS`. A component adds attributes to the model, after
+which a checkpoint names its tensors.
 """
 
 from __future__ import annotations
@@ -29,39 +29,40 @@ from lang3dxl_ns.preparation.handover import SceneFacts
 
 
 class Component(ABC):
-    """A part that a model may have."""
+    """Interface of a part that a model may have."""
 
     attributes: tuple[str, ...]
-    """Of the model; None where it doesn't have the part."""
+    """Names of the model's attributes for this part, which `leave_out` sets to None unless overridden."""
 
     @abstractmethod
     def wanted(self, config: ModelSettings, facts: SceneFacts) -> bool:
-        """Whether a new model of this scene has it."""
+        """Return whether a new model of this scene has the component."""
 
     @abstractmethod
     def build(self, model: RenderingModel) -> None:
-        """Add it, on the CPU, to a new model whose Gaussians and strategy are made."""
+        """Add the component, on the CPU, to a new model that has its Gaussians and strategy."""
 
     def leave_out(self, model: RenderingModel) -> None:
-        """Let the model have none."""
+        """Mark the component as absent from the model."""
         for name in self.attributes:
             setattr(model, name, None)
 
     @abstractmethod
     def load(self, model: RenderingModel, state: Mapping[str, Any]) -> None:
-        """Add, replace or leave it out, so that a checkpoint (tensors by their names in the model) fits.
+        """Add, replace or leave out the component to match a checkpoint, which names tensors as the model
+        does.
 
         Raises UserError if the model's settings contradict the checkpoint.
         """
 
     @abstractmethod
     def parameters(self, model: RenderingModel) -> dict[str, list[Parameter]]:
-        """Optimizer groups by name; none if the model doesn't have it."""
+        """Return the component's optimizer groups by name; none if the model doesn't have it."""
 
 
 class SmoothSky(Component):
-    """The sky's colors as one smooth function, only where photos share one light: elsewhere it costs words
-    (docs/lab/short_and_long_runs.md). Without it the sky's Gaussians are trained like all others."""
+    """The sky's colors as one smooth function, only where photos share one lighting: elsewhere it degrades
+    words (docs/lab/short_and_long_runs.md). Without it the sky's Gaussians are trained like all others."""
 
     attributes = ("sky",)
 
@@ -92,8 +93,8 @@ class SmoothSky(Component):
 
 
 class CameraRefinement(Component):
-    """Corrections of the training cameras. nerfstudio's viewer wants an optimizer of cameras in any case:
-    without refinement it is one that is off."""
+    """Corrections of the training cameras. nerfstudio's viewer always requires a camera optimizer, so a model
+    without refinement has one that is off."""
 
     attributes = ("camera_optimizer",)
 
@@ -122,8 +123,7 @@ class CameraRefinement(Component):
 
 
 class Semantics(Component):
-    """Codes of the Gaussians, the feature decoder, and the downsampler of training; where there are
-    targets."""
+    """Codes of the Gaussians, the feature decoder, and the training-only downsampler; only with targets."""
 
     attributes = ("semantic_field", "downsampler")
 
@@ -196,7 +196,7 @@ class Semantics(Component):
 
 
 class Lighting(Component):
-    """Colors that depend on each photo's light."""
+    """Colors that depend on each photo's lighting."""
 
     attributes = ("appearance",)
 
@@ -210,7 +210,7 @@ class Lighting(Component):
         )
 
     def load(self, model: RenderingModel, state: Mapping[str, Any]) -> None:
-        """`auto` follows the checkpoint; `on` and `off` must agree with it."""
+        """Match the checkpoint if the setting is `auto`; require that `on` and `off` agree with it."""
         saved = "appearance.vectors" in state
         if saved == (model.appearance is not None):
             return
@@ -232,4 +232,4 @@ class Lighting(Component):
 
 
 COMPONENTS: tuple[Component, ...] = (SmoothSky(), CameraRefinement(), Semantics(), Lighting())
-"""In the order in which they are built: what draws random numbers draws the same ones in every version."""
+"""Components in the order in which they are built, so that random numbers are the same in every version."""

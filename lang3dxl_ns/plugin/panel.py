@@ -1,4 +1,4 @@
-"""The panel "Ask the scene" in nerfstudio's viewer, while training and with `ns-viewer`."""
+"""The panel "Ask the scene" in nerfstudio's viewer, during training and with `ns-viewer`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ INVITATION = (
 )
 NO_SEMANTICS = "This run has no semantics (it was trained with clip none)."
 LEAST = (320, 180)
-"""Fewest pixels of a frame while the camera moves: on a CPU the time budget alone would leave 30 rows."""
+"""Fewest pixels of a frame while the camera moves; on a CPU the time budget alone would leave 30 rows."""
 _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""
 
@@ -42,12 +42,12 @@ _TYPING = 0.5
 class AskPanel(ViewerControl):
     """A text box, heat maps over the view, and the views that show a match best.
 
-    nerfstudio's viewer finds it as an attribute of the pipeline, and sets it up on start.
+    nerfstudio's viewer finds the panel as an attribute of the pipeline, and sets it up on start.
 
     Args:
-        model: what is asked.
+        model: the model that is queried.
         scene_file: returns photos, cameras and CLIP.
-        query: returns the prompts to begin with.
+        query: returns the initial prompts.
         learn_words: gathers the photos' features onto the present Gaussians, and learns codes.
     """
 
@@ -58,12 +58,12 @@ class AskPanel(ViewerControl):
         query: Callable[[], str],
         learn_words: Callable[[], None],
     ) -> None:
-        guard_viewers()  # before nerfstudio starts a server
+        guard_viewers()  # must precede the server that nerfstudio starts
         keep_frames_recognizable()
         self._model, self._scene_file, self._query = model, scene_file, query
         self._learn_words = learn_words
         self._views: list[tuple[Found, int]] = []
-        """Views to fly to: a match and the number of its view, best first, prompt after prompt."""
+        """Views to fly to: pairs of a match and its view's number, all best views before all second ones."""
         self._place = -1
         self._first_frame = True
 
@@ -72,10 +72,11 @@ class AskPanel(ViewerControl):
         guard: Guard = self.viser_server._websock_server.guard  # type: ignore[attr-defined]
         guard.public = viewer.config.make_share_url
         if viewer.config.max_num_display_images == ViewerConfig().max_num_display_images:
-            # A viewer at a photo's position would look at that photo's frame, and ns-viewer read all photos.
+            # A viewer at a photo's position would see only that photo's frame, and ns-viewer would read all
+            # photos.
             viewer.config.max_num_display_images = 0
         if viewer.trainer is None:
-            viewer.pause_train.visible = False  # there is nothing to pause
+            viewer.pause_train.visible = False  # nothing can be paused
         self._leave_out_logo(guard.public)
         gui, model = self.viser_server.gui, self._model
         with gui.add_folder("Ask the scene", order=-1):
@@ -117,7 +118,7 @@ class AskPanel(ViewerControl):
             self._question.value = query
 
     def _leave_out_logo(self, share: bool) -> None:
-        """nerfstudio's title bar without its logo, which is loaded from the Internet."""
+        """Show nerfstudio's title bar without its logo, which would be loaded from the Internet."""
         address = "https://docs.nerf.studio"
         button = viser.theme.TitlebarButton(text="nerfstudio", icon="Description", href=address)
         self.viser_server.gui.configure_theme(
@@ -130,7 +131,7 @@ class AskPanel(ViewerControl):
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
     def _guarded(self, job: Callable[[], None]) -> Callable[[], None]:
-        """The same job, with errors shown in the panel: in a thread they would go unseen."""
+        """Wrap a job so that its errors appear in the panel; in a thread they would go unseen."""
 
         def guarded() -> None:
             try:
@@ -160,7 +161,7 @@ class AskPanel(ViewerControl):
             return
         self._say("Looking for the best views…")
         found = self.conversation.find()
-        if found is self.conversation.found:  # otherwise there is a newer question
+        if found is self.conversation.found:  # otherwise a newer question has replaced this one
             self._offer_views(found)
             self._say(self.conversation.summary())
             self.viewer._trigger_rerender()
@@ -174,15 +175,15 @@ class AskPanel(ViewerControl):
 
     @property
     def shows_bottleneck(self) -> bool:
-        """See `Answers`, which the panel is for the model."""
+        """Whether a viewer shows the picture of the codes; see `Answers`, whose methods the panel has."""
         return self.conversation.shows_bottleneck
 
     def channels(self) -> Tensor | None:
-        """See `Answers`."""
+        """Return the values that Gaussians carry in the next rendering; see `Answers.channels`."""
         return self.conversation.channels()
 
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """See `Answers`. Called by the render thread, which holds the lock."""
+        """Return further outputs; see `Answers.outputs`. The render thread calls this, and holds the lock."""
         found = self.conversation.outputs(rendering, seconds)
         self._status.content = self.conversation.status()
         if self._first_frame:
@@ -198,7 +199,7 @@ class AskPanel(ViewerControl):
         return {panel.output_render, panel.split_output_render if panel.split else panel.output_render}
 
     def _show_output(self, name: str) -> None:
-        """Select an output as if by hand; nerfstudio has no public way."""
+        """Select an output as the user would; nerfstudio has no public way to do so."""
         chosen = self.viewer.control_panel._output_render
         if chosen.value != name:
             chosen.value = name
@@ -207,12 +208,12 @@ class AskPanel(ViewerControl):
     # ── flying ──────────────────────────────────────────────────────────────────────────────────────
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """New clients start at an overview photo."""
+        """Place a new client's camera at the overview photo."""
         middle = tuple(self._model.means.detach().median(0).values.tolist())
         _place_camera(client, overview(self._photos, middle).camera, middle)
 
     def _fly_on(self, client: viser.ClientHandle | None) -> None:
-        """To the next view of the matches: the best of each prompt, then the second ones."""
+        """Fly to the next view of the matches: the best one of each prompt, then the second ones."""
         views = self._views
         if client is None or not views:
             return
@@ -238,7 +239,7 @@ def _place_camera(client: viser.ClientHandle, camera: Camera, target: tuple[floa
 
 
 def keep_frames_recognizable() -> None:
-    """Applies to all further viewers of this process."""
+    """Give all further viewers of this process frames of at least `LEAST` pixels while the camera moves."""
     from nerfstudio.viewer.render_state_machine import RenderStateMachine  # imports the models
 
     chosen = RenderStateMachine._calculate_image_res
@@ -258,7 +259,7 @@ def keep_frames_recognizable() -> None:
 
 
 def least_size(height: int, width: int, aspect_ratio: float, most: int) -> tuple[int, int]:
-    """Height and width enlarged to `LEAST`, if the longer side stays within `most`."""
+    """Enlarge height and width to `LEAST`, if the longer side stays within `most`."""
     rows = max(height, LEAST[1], round(LEAST[0] / aspect_ratio))
     rows = min(rows, most, int(most / aspect_ratio))
     return (rows, int(rows * aspect_ratio)) if rows > height else (height, width)

@@ -1,4 +1,4 @@
-"""Datasets of photos, read upright, undistorted and resized on demand; and all that can be read, in turn."""
+"""Datasets of photos, read upright, undistorted and resized on demand, and iteration over readable ones."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from lang3dxl_ns.scene.photo import Photo
 
 
 class PhotoDataset(InputDataset):
-    """nerfstudio's dataset over `Photo`s: upright, undistorted and resized on demand, pinhole cameras.
+    """nerfstudio's dataset over `Photo`s: upright, undistorted and resized on demand, with pinhole cameras.
 
     Args:
-        scale: of the pictures read, relative to the photos.
-        working: keeps photos at their size.
+        scale: scale of the pictures that are read, relative to the photos.
+        working: source of the photos at their size.
     """
 
     def __init__(self, outputs: DataparserOutputs, scale: float, working: WorkingPhotos):
@@ -35,7 +35,7 @@ class PhotoDataset(InputDataset):
         self.cameras = to_nerfstudio(lenses, outputs.cameras.camera_to_worlds)
 
     def read(self, index: int) -> dict[str, Tensor]:
-        """`image` [h, w, 3] uint8 and, if the photo has one, `mask` [h, w, 1] bool."""
+        """Read a photo: `image` [h, w, 3] uint8 and, if the photo has one, `mask` [h, w, 1] bool."""
         photo = self.photos[index]
         data = {"image": self.working.read(photo, self.scale)}
         mask = self.working.mask(photo, self.scale)
@@ -58,9 +58,9 @@ class EvalPhotos:
 
     Args:
         dataset: the photos.
-        ready: called when iteration begins; returns what gives a photo's camera and batch by its index, and
-            raises UserError for one that can't be used.
-        names: photos of it to evaluate; by default all.
+        ready: called when iteration begins; returns a function that reads a photo's camera and batch by its
+            index, and raises UserError for a photo that can't be used.
+        names: names of the photos to evaluate; default: all.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class EvalPhotos:
         return len(self._wanted)
 
     def cameras(self) -> Iterator[tuple[Cameras, Photo]]:
-        """Camera and photo of each, without reading files."""
+        """Yield every photo's camera and the photo, without reading files."""
         for index in self._wanted:
             yield self.dataset.cameras[index : index + 1], self.dataset.photos[index]
 

@@ -41,50 +41,50 @@ class RenderedAnswers:
     shows_bottleneck: bool = True
 
     def channels(self) -> Tensor:
-        """See `Answers`."""
+        """Return the values that Gaussians carry in a rendering; see `Answers.channels`."""
         return self.question.channels
 
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """See `Answers`."""
+        """Return the outputs that answer the question; see `Answers.outputs`."""
         return pictures(rendering, self.question)
 
 
 @dataclass
 class Lang3DXLPipelineConfig(EvaluationSettings, VanillaPipelineConfig):
-    """Configuration of the pipeline."""
+    """Settings of the pipeline."""
 
     _target: type = field(default_factory=lambda: Lang3DXLPipeline)
     datamanager: Lang3DXLDataManagerConfig = field(default_factory=Lang3DXLDataManagerConfig)
     model: Lang3DXLModelConfig = field(default_factory=Lang3DXLModelConfig)
     query: str = ""
-    """Prompts for `ns-render` ("rose window; dome"), and the viewer's initial ones; the environment variable
-    LANG3DXL_QUERY overrides it."""
+    """Prompts for `ns-render` ("rose window; dome"), and the viewer's initial ones. The environment variable
+    LANG3DXL_QUERY overrides this."""
 
 
 class Lang3DXLPipeline(VanillaPipeline):
-    """nerfstudio's pipeline; loads checkpoints strictly, evaluates colors, features and words."""
+    """nerfstudio's pipeline, which loads checkpoints strictly, and evaluates colors, features and words."""
 
     config: Lang3DXLPipelineConfig
     datamanager: Lang3DXLDataManager
     model: Lang3DXLModel
     last_losses: dict[str, Tensor]
-    """The weighted losses of the latest training step."""
+    """Weighted losses of the latest training step."""
 
     def __init__(self, *args, **kwargs):
         print_user_errors_plainly()
         super().__init__(*args, **kwargs)
-        # nerfstudio's viewer looks for controls here.
+        # nerfstudio's viewer looks for controls among the pipeline's attributes.
         self.panel = AskPanel(self.model, lambda: self.scene_file, lambda: self.query, self.learn_words)
 
     @cached_property
     def evaluation(self) -> Evaluation:
-        """Scores of the present model."""
+        """Evaluation of the present model."""
         return Evaluation(self.model, self.datamanager, self.config)
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """`scored`, for `ns-eval` and the trainer; the figures are printed as well for `ns-eval`."""
+        """Return `Evaluation.scored` for `ns-eval` and the trainer; for `ns-eval` also print the figures."""
         results = self.evaluation.scored(output_path, get_std)
         if get_std:
             means = {n: v for n, v in results.items() if isinstance(v, float) and not n.endswith("_std")}
@@ -92,7 +92,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         return results
 
     def get_train_loss_dict(self, step: int):
-        """Outputs, losses and metrics of the next photo. Codes that start from photos are learned first."""
+        """Compute outputs, losses and metrics of the next photo; codes that start from photos come first."""
         if self.model.codes_begin:
             if self.model.config.codes_from == "photos":
                 self.learn_words()
@@ -102,12 +102,12 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     @property
     def query(self) -> str:
-        """The prompts for renderings."""
+        """The prompts for renderings: the environment variable's, or else the configured ones."""
         return os.environ.get(QUERY_VARIABLE) or self.config.query
 
     @cached_property
     def scene_file(self) -> SceneFile:
-        """The photos' names and cameras, and the CLIP."""
+        """Description of the scene: the photos' names and cameras, and the CLIP."""
         run = self.datamanager.config.run
         if run is not None and (run / SCENE_FILE).is_file():
             return SceneFile.read(run / SCENE_FILE)
@@ -120,8 +120,8 @@ class Lang3DXLPipeline(VanillaPipeline):
             self.model.answers = self._answers()
 
     def scored_matches(self, photos: Sequence[str]) -> dict[str, dict[str, Match]]:
-        """What a user finds of every scored prompt in the views of some photos, by photo and prompt; nothing
-        without words or ground truth."""
+        """Find every scored prompt in the views of some photos as a user would, by photo and prompt. Without
+        words or ground truth there are no matches."""
         scorer = self.evaluation.scorer
         if scorer is None or self.model.carried is None:
             return {photo: {} for photo in photos}
@@ -137,7 +137,7 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     @property
     def has_words_to_learn(self) -> bool:
-        """Whether semantics are learned after the last iteration, not from renderings."""
+        """Whether semantics are learned after the last iteration instead of from renderings."""
         return self.model.semantic_field is not None and self.model.semantic_field.needs_lifting
 
     def learn_words(self) -> None:

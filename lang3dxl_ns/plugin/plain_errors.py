@@ -1,4 +1,4 @@
-"""Errors of the user's making end nerfstudio's commands with a message, not a traceback."""
+"""Plain messages for user errors in nerfstudio's commands, in place of tracebacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rendering of Gaussians in training, and of what viewers and evaluations see of them."""
+"""Rendering of Gaussians in training, and of the views that viewers and evaluations show."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ from lang3dxl_ns.scene.camera import Camera, in_view
 
 
 class Answers(Protocol):
-    """What a viewer or `ns-render` adds to the renderings it shows."""
+    """Interface of what a viewer or `ns-render` adds to the renderings it shows."""
 
     @property
     def shows_bottleneck(self) -> bool:
-        """Whether anyone views the picture of the codes, which costs three more channels."""
+        """Whether a viewer shows the picture of the codes, which costs three more channels."""
 
     def channels(self) -> Float[Tensor, "n d"] | None:
-        """Values of the Gaussians to composite; None without prompts."""
+        """Return values of the Gaussians to composite; None without prompts."""
 
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """Additional outputs, from a rendering with these channels that took so many seconds."""
+        """Return further outputs of a rendering with these channels, which took this many seconds."""
 
 
 class RenderingModel(SplatfactoModel):
@@ -63,31 +63,32 @@ class RenderingModel(SplatfactoModel):
     config: ModelSettings
     strategy: Densification
     extent: tuple[Float[Tensor, "3"], float]
-    """The scene's center, and the distance from it that contains most of the scene."""
+    """Center of the scene, and the distance from it that contains most of the scene."""
     semantic_field: Decoder | None
     downsampler: AttenuatedDownsampler | None
     clip_mean: Tensor
     dense_mean: Tensor
     appearance: AppearanceField | None
     sky: Sky | None
-    """The first Gaussians' colors; None: there is no sky, or it was trained like all Gaussians."""
+    """Colors of the sky's Gaussians, the first ones; None: there is no sky, or it was trained like the
+    rest."""
     answers: Answers | None = None
     codes_have_begun = False
-    """Whether training has come to the codes; part of a checkpoint's run state."""
+    """Whether training has reached the codes; part of a checkpoint's run state."""
 
     @property
     def facts(self) -> SceneFacts:
-        """What the data manager knows of the scene."""
+        """Facts about the scene from the data manager."""
         return SceneFacts.of(self.kwargs["metadata"])
 
     @property
     def backend(self) -> Backend:
-        """The requested rasterizer, which only a GPU has a choice of."""
+        """The requested rasterizer; only a GPU has a choice."""
         return self.config.rasterizer if self.means.is_cuda else "auto"
 
     @property
     def antialiased(self) -> bool:
-        """Whether small Gaussians are dimmed."""
+        """Whether small Gaussians are dimmed to prevent aliasing."""
         return self.config.rasterize_mode == "antialiased"
 
     @property
@@ -97,14 +98,14 @@ class RenderingModel(SplatfactoModel):
 
     @property
     def learns_from_renderings(self) -> bool:
-        """Whether semantics are trained with the scene, not gathered afterwards."""
+        """Whether semantics are trained with the scene instead of being gathered afterwards."""
         return self.semantic_field is not None and not self.semantic_field.needs_lifting
 
     # ── the scene so far ────────────────────────────────────────────────────────────────────────────
 
     @torch.no_grad()
     def splats(self) -> Splats:
-        """The present Gaussians, which share memory with the model: `scene` takes copies."""
+        """Return the present Gaussians, which share memory with the model; `scene` takes copies."""
         g = {name: parameter.detach() for name, parameter in self.gauss_params.items()}
         shapes = self.activated(g)
         harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
@@ -117,7 +118,7 @@ class RenderingModel(SplatfactoModel):
 
     @property
     def looks(self) -> Looks | None:
-        """The photos' looks; None where they share one lighting."""
+        """Looks of the photos; None where the photos share one lighting."""
         return None if self.appearance is None else Looks(self.appearance)
 
     @torch.no_grad()
@@ -130,10 +131,10 @@ class RenderingModel(SplatfactoModel):
         cache: Path | None = None,
         watch: Callable[[str], None] | None = None,
     ) -> Scene:
-        """The present state as a scene of its own, which later training doesn't change.
+        """Copy the present state to a separate scene, which later training doesn't change.
 
-        file: photos, cameras and CLIP. The rest: see `Scene`. Of a model that has learned no words yet the
-        scene has colors alone.
+        file: photos, cameras and CLIP. For the other arguments see `Scene`. While a model has no words yet,
+        its scene has colors only.
         """
         field, codes, looks = self.semantic_field, self.carried, self.looks
         return Scene(
@@ -156,7 +157,7 @@ class RenderingModel(SplatfactoModel):
     def get_outputs_for_camera(  # type: ignore[override]
         self, camera: Cameras, obb_box: OrientedBox | None = None
     ) -> dict[str, Tensor]:
-        """The camera's outputs, with those of `answers` first, in the order in which viewers list them."""
+        """Return the camera's outputs in the order of viewers' lists, with the outputs of `answers` first."""
         self.set_crop(obb_box)
         start, answers = time.perf_counter(), self.answers
         if answers is None:
@@ -168,7 +169,7 @@ class RenderingModel(SplatfactoModel):
         return {"rgb": outputs["rgb"], **found, **outputs}
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
-        """Render a camera: `rgb`, `accumulation`, `background`; in training `codes` [H, W, d] if the
+        """Render a camera: `rgb`, `accumulation`, `background`; in training also `codes` [H, W, d] if the
         decoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
         if self.training:
             return self._training_outputs(camera)
@@ -177,7 +178,7 @@ class RenderingModel(SplatfactoModel):
     def seen(
         self, camera: Cameras, look: Look | None = None, channels: Float[Tensor, "n d"] | None = None
     ) -> Rendering:
-        """The present Gaussians from a camera, under a look (default: by the appearance's rule).
+        """Render the present Gaussians from a camera, under a look (default: by the appearance's rule).
 
         channels: further values to composite.
         """
@@ -197,7 +198,7 @@ class RenderingModel(SplatfactoModel):
         asked: Float[Tensor, "n d"] | None,
         colors: Float[Tensor, "n 3"] | None,
     ) -> tuple[Rendering, dict[str, Tensor]]:
-        """A rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
+        """Return a rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
         parts = [part for part in (asked, colors) if part is not None]
         rendering = self.seen(camera, channels=torch.cat(parts, dim=1) if parts else None)
         background = self._get_background_color().expand_as(rendering.rgb)
@@ -209,7 +210,7 @@ class RenderingModel(SplatfactoModel):
             "depth": torch.where(rendering.alpha > 0, depth, depth.max())[..., None],
         }
         if self.semantic_field is not None:
-            # Present from the first rendering on, since viewers list its outputs.
+            # This output exists from the first rendering on, since viewers list that rendering's outputs.
             outputs["bottleneck"] = background
         if rendering.channels is not None and colors is not None:
             channels, outputs["bottleneck"] = rendering.channels.tensor_split([-3], dim=2)
@@ -217,7 +218,7 @@ class RenderingModel(SplatfactoModel):
         return rendering, outputs
 
     def composite(self, camera: Cameras, features: Float[Tensor, "n d"]) -> Float[Tensor, "H W d"]:
-        """Values of Gaussians composited over black in a camera; differentiable in the values alone."""
+        """Composite values of Gaussians over black in a camera; differentiable only in the values."""
         return composite(self.splats(), self._camera(camera).detach(), features, self.backend)
 
     def _code_colors(self) -> Float[Tensor, "n 3"] | None:
@@ -251,22 +252,22 @@ class RenderingModel(SplatfactoModel):
 
     @property
     def codes_begin(self) -> bool:
-        """Whether codes are about to be trained for the first time: once in a run, also if it is resumed or
-        prolonged."""
+        """Whether codes are about to be trained for the first time. This is so once per run, also if the run
+        is resumed or prolonged."""
         return self.learns_from_renderings and self._warm_up_is_over and not self.codes_have_begun
 
     def _pose(self, camera: Cameras) -> Float[Tensor, "3 4"]:
-        """Camera → world, refined in training. It stays where it is, on the CPU, unless it is refined."""
+        """Return camera → world, refined in training. Without refinement the pose stays on the CPU."""
         pose, metadata = camera.camera_to_worlds[0], camera.metadata or {}
         if self.training and self.camera_optimizer.config.mode != "off" and "cam_idx" in metadata:
             index, pose = metadata["cam_idx"], to_device(pose, self.device)
-            # A slice, since an index would be copied to the GPU first.
+            # A slice is used, since an index would be copied to the GPU first.
             change = self.camera_optimizer(slice(index, index + 1))[0]
             pose = torch.cat([change[:, :3] @ pose[:, :3], pose[:, 3:] + change[:, 3:]], dim=1)
         return pose
 
     def _camera(self, camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
-        """The camera for the rasterizer, at a pose (default: its own)."""
+        """Convert the camera for the rasterizer, at a pose (default: its own)."""
         downscale = self._get_downscale_factor()
         if downscale != 1:
             camera.rescale_output_resolution(1 / downscale)
@@ -276,12 +277,12 @@ class RenderingModel(SplatfactoModel):
         return view
 
     def activated(self, g: Mapping[str, Tensor]) -> Gaussians:
-        """Gaussians of the parameters `g`, which store log scales and logits of opacity."""
+        """Activate the parameters `g`, which store log scales and logits of opacity, to Gaussians."""
         scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
         return Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1))
 
     def _raster(self, camera: Cameras, features: Tensor | None) -> tuple[Raster, Float[Tensor, "3"]]:
-        """A training step's rendering, with gradients."""
+        """Render a training step, with gradients."""
         g, pose = self.gauss_params, self._pose(camera)
         view, pose = self._camera(camera, pose), to_device(pose, self.device)
         background = self._get_background_color()
@@ -308,7 +309,8 @@ class RenderingModel(SplatfactoModel):
         photo = rasterize(in_photo.seen_from(view), view, colors, background, absgrad=absgrad, **settings)
         if features is None and not depth:
             return photo, background
-        # Semantics, coverage and depth belong to the scene, not to a photo: they keep its opacities.
+        # Semantics, coverage and depth belong to the scene, not to a photo, so they keep the scene's
+        # opacities.
         carried = colors.detach()[:, :1] if features is None else features
         if moves:
             gaussians = replace(gaussians, opacities=gaussians.opacities.detach())
@@ -319,7 +321,7 @@ class RenderingModel(SplatfactoModel):
         return replace(photo, features=image, alpha=scene.alpha, depth=scene.depth), background
 
     def _vector(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
-        """Appearance vector of the training photo, or by the rule for other views."""
+        """Return the training photo's appearance vector, or for other views the one that the rule chooses."""
         assert self.appearance is not None
         position, direction = pose[:, 3].detach(), -pose[:, 2].detach()
         if camera.metadata and "cam_idx" in camera.metadata:
@@ -336,7 +338,7 @@ class RenderingModel(SplatfactoModel):
         return min(self.step // interval, self.config.sh_degree)
 
     def colors_from(self, g: Mapping[str, Tensor], camera_center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-        """Colors seen from a point. At degree 0 colors are logits, as in splatfacto."""
+        """Compute the colors seen from a point. At degree 0 colors are stored as logits, as in splatfacto."""
         if self.config.sh_degree == 0:
             return torch.sigmoid(g["features_dc"])
         directions = g["means"].detach() - camera_center
@@ -345,5 +347,5 @@ class RenderingModel(SplatfactoModel):
 
 
 def _frozen(module: Any) -> Any:
-    """A copy without gradients."""
+    """Copy a module without gradients, for evaluation."""
     return deepcopy(module).eval().requires_grad_(False)

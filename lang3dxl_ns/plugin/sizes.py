@@ -1,4 +1,4 @@
-"""Memory of training: an estimate by Gaussians and pixels, and the cap on Gaussians from it."""
+"""Memory of training: an estimate by Gaussians and pixels, and the cap on Gaussians that follows from it."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 
 PER_PARAMETER = 16.0
-"""Bytes per parameter: its value, its gradient, and Adam's two moments."""
+"""Bytes per parameter for its value, its gradient, and Adam's two moments."""
 PER_GAUSSIAN = 1_500.0
-"""Bytes of a step's other tensors per Gaussian, measured with 300,000 of them; learning words takes less."""
+"""Bytes of a step's other tensors per Gaussian, measured with 300,000 of them. Learning words takes less."""
 PER_LOOK = 3_000.0
-"""Bytes more per Gaussian in view, with appearance."""
+"""Additional bytes per Gaussian in view, with appearance."""
 PER_PIXEL = 480.0
 """Bytes of a step per pixel of the photo."""
 PER_CODE = 12.0
-"""Bytes of a step per number of a code that is rendered, for every Gaussian and every pixel."""
+"""Bytes of a step per number of a rendered code, for every Gaussian and every pixel."""
 WORDS = 1.5e9
-"""Bytes that learning words takes at most beside the model, when steps are over."""
+"""Most bytes, in addition to the model, that learning words takes after the last step."""
 CONTEXT = 0.8e9
 """Bytes of CUDA's context, its libraries, and gaps between tensors."""
 SHARE = 0.85
-"""Share of the free memory to plan with; densification copies a tensor at a time."""
+"""Share of the free memory to plan with, since densification copies a tensor at a time."""
 MAIN_SHARE = 0.5
-"""The same of the main memory, which photos and their targets share."""
+"""Share of the main memory to plan with; photos and their targets share this memory."""
 
 
 def bytes_of(model: Lang3DXLModel, pixels: int) -> tuple[float, float]:
-    """Bytes of training whatever the number of Gaussians, and per Gaussian, for photos of so many pixels."""
+    """Estimate the bytes of training, fixed and per Gaussian, for photos with this number of pixels."""
     count = model.num_points
     numbers = sum(p.numel() for p in model.gauss_params.values()) / count
     others = sum(p.numel() for p in model.parameters()) - numbers * count
@@ -41,14 +41,14 @@ def bytes_of(model: Lang3DXLModel, pixels: int) -> tuple[float, float]:
 
 
 def memory_to_plan_with(device: torch.device) -> float:
-    """Bytes of the device that training may fill."""
+    """Return the bytes of the device that training may fill."""
     if device.type == "cuda":
         return SHARE * torch.cuda.mem_get_info(device)[0] - CONTEXT
     return MAIN_SHARE * machine_memory()
 
 
 def plan(model: Lang3DXLModel, pixels: int, device: torch.device, wanted: int | None) -> tuple[int, str]:
-    """The cap on Gaussians (0: none) for the setting `max_gaussians`, and a line for the log."""
+    """Return the cap on Gaussians (0: none) for the setting `max_gaussians`, and a line for the log."""
     memory, now = memory_to_plan_with(device), model.num_points
     fixed, each = bytes_of(model, pixels)
     most = max(int((memory - fixed) / each), now) if wanted is None else wanted

@@ -1,4 +1,4 @@
-"""Trainer: atomic checkpoints, exact resume, stopping, guarded steps."""
+"""Trainer with atomic checkpoints, exact resume, stopping, and guarded steps."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 6.0}
-"""Time of an iteration in renderings of its photo, by whether semantics are trained with the scene: measured
-2.1 to 2.7 on a landmark and `castle`, and 3.5 to 8.4 for `feature3dgs` and `paper`, on a busy CPU."""
+"""Duration of an iteration in renderings of its photo, by whether semantics are trained with the scene: 2.1
+to 2.7 on a landmark and `castle`, and 3.5 to 8.4 for `feature3dgs` and `paper`, measured on a busy CPU."""
 RENDERINGS_PER_PHOTO = 30.0
-"""Time to read a photo's features onto the Gaussians, in renderings of it: measured 30 on one core for 160
-channels, 18,000 Gaussians, 240×180 pixels."""
+"""Duration of reading a photo's features onto the Gaussians, in renderings of it: measured 30 on one core for
+160 channels, 18,000 Gaussians, 240×180 pixels."""
 
 
 class _Stopped(BaseException):
-    """A signal arrived while words were learned."""
+    """Raised when a signal arrives while words are learned."""
 
 
 @contextmanager
 def _disk_kept_out_of_training() -> Iterator[None]:
-    """Let training continue where its log (tensorboard's events) can't be written, as on a full disk.
+    """Let training continue if its log (tensorboard's events) can't be written, as on a full disk.
 
     tensorboard's own thread keeps such an error, and raises it in the step that adds to the log.
     """
@@ -79,28 +79,27 @@ def _disk_kept_out_of_training() -> Iterator[None]:
 
 
 class Lang3DXLTrainer(Trainer):
-    """nerfstudio's trainer with atomic checkpoints, a resumed run that ends at the requested iteration, and a
+    """nerfstudio's trainer with atomic checkpoints, resumed runs that end at the requested iteration, and a
     guard against steps that are not finite."""
 
     config: Any
-    """`Lang3DXLTrainerConfig`, whose module knows this class."""
+    """Settings of the run, a `Lang3DXLTrainerConfig`; that class's module imports this one."""
     pipeline: Lang3DXLPipeline
     optimizers: GuardedOptimizers
     stages: Stages
-    """Announced while they run: `prepare`, `train`, `words`. A longer command puts a list of its own here."""
+    """Announced stages of the run: `prepare`, `train`, `words`. A longer command replaces this list."""
     interrupted: signal.Signals | None = None
     """The signal that stopped the run, if one did."""
     words_are_learned = False
-    """Whether the words of the run's end are learned; the viewer's of a run that goes on don't count."""
+    """Whether the final words of the run are learned. Words that a viewer learns during a run don't count."""
     _is_learning_words = False
     _last_iteration = -1
     _is_ending = False
     _run_state: dict[str, Any] | None = None
 
     def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
-        """Mixed precision means bfloat16 where the GPU has it: it has float32's range, so that gradients need
-        no scale, and no step is lost or waits for one. Older GPUs (before Ampere) take float16 with a
-        scale."""
+        """Set up mixed precision: bfloat16 where the GPU has it. Its range is float32's, so gradients need no
+        scale, and no step is lost or waits for one. Older GPUs (before Ampere) use float16 with a scale."""
         super().__init__(config, local_rank, world_size)
         self.stages = Stages({"prepare": 0.3, "train": 0.6, "words": 0.1})
         if self.mixed_precision:
@@ -110,9 +109,9 @@ class Lang3DXLTrainer(Trainer):
             self.grad_scaler = GradScaler(enabled=self.use_grad_scaler)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Set up, then seed, so that preparation does not affect the run's randomness. Writes a description
-        of the scene into the run's folder, so that it can be queried without the photos."""
-        # nerfstudio turns this on, and photos of many sizes would then be tuned for in nearly every step.
+        """Set up, then seed, so that preparation does not affect the run's randomness. A scene description is
+        written into the run's folder, so that it can be queried without the photos."""
+        # nerfstudio turns this on, and would then tune for photos of many sizes in nearly every step.
         torch.backends.cudnn.benchmark = False
         try:
             with self.stages.stage("prepare"):
@@ -139,24 +138,24 @@ class Lang3DXLTrainer(Trainer):
             restore_run_state(self.pipeline, self._run_state)
 
     def _forget_folder(self) -> None:
-        """Remove the folder of a run that could not begin, if it holds nothing but its settings, and the
+        """Remove the folder of a run that could not start, if it holds nothing but its settings, and the
         folders above that this leaves empty."""
         with suppress(OSError):
             if {path.name for path in self.base_dir.iterdir()} <= {"config.yml"}:
                 (self.base_dir / "config.yml").unlink(missing_ok=True)
                 for folder in (self.base_dir, *self.base_dir.parents[:3]):
-                    folder.rmdir()  # an error ends this at the first that holds something
+                    folder.rmdir()  # the first folder that is not empty raises, and ends the loop
 
     def _limit_gaussians(self) -> None:
-        """Set the cap of densification from the device's memory, and log what training will take."""
+        """Set the cap of densification from the device's memory, and log how much training will take."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         pixels, wanted = int((cameras.width * cameras.height).max()), self.config.pipeline.model.max_gaussians
         model.strategy.most, message = plan(model, pixels, torch.device(self.device), wanted)
         CONSOLE.log(escape(message))
 
     def _load_checkpoint(self) -> None:
-        """As nerfstudio's, but keeps the run state until everything is set up. Raises UserError for
-        a damaged checkpoint, or another file."""
+        """Load a checkpoint as nerfstudio does, but keep the run state until everything is set up. Raises
+        UserError for a damaged checkpoint, or another file."""
         path = self._checkpoint_to_load()
         if path is None:
             return
@@ -168,19 +167,19 @@ class Lang3DXLTrainer(Trainer):
             self.optimizers.load_optimizers(state["optimizers"])
             if self.config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
-            if state["scalers"]:  # empty in a run without a loss scale
+            if state["scalers"]:  # a run without a loss scale has none
                 self.grad_scaler.load_state_dict(state["scalers"])
         except NOT_A_CHECKPOINT as error:
             raise UserError(
                 f"{path} is not a checkpoint of lang3dxl ({error}): give --load-dir the "
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
             ) from error
-        self._run_state = state.get("run")  # absent from checkpoints of earlier versions
+        self._run_state = state.get("run")  # earlier versions' checkpoints lack it
         self.words_are_learned = state.get("words", "codes" in self.pipeline.model.gauss_params)
         CONSOLE.log(f"Loaded {path}")
 
     def _checkpoint_to_load(self) -> Path | None:
-        """Raises UserError if a requested checkpoint doesn't exist."""
+        """Find the requested checkpoint, if any. Raises UserError if it doesn't exist."""
         folder, path = self.config.load_dir, self.config.load_checkpoint
         if folder is not None:
             step = "*" if self.config.load_step is None else f"{self.config.load_step:09d}"
@@ -190,7 +189,7 @@ class Lang3DXLTrainer(Trainer):
         return path
 
     def setup_optimizers(self) -> Optimizers:
-        """The optimizers, with the guard before them."""
+        """Build the optimizers, with the guard before them."""
         self.guard = StepGuard(self.config.max_skipped_steps, lambda message: CONSOLE.log(escape(message)))
         groups = self.pipeline.get_param_groups()
         return GuardedOptimizers(self.config.optimizers.copy(), groups, self._step_is_sound)
@@ -204,7 +203,8 @@ class Lang3DXLTrainer(Trainer):
             self.optimizers.live_parameters(),
             scale,
         )
-        # Densification accumulates the gradients of the screen positions, just as broken, and as scaled.
+        # Densification accumulates the gradients of screen positions, which are just as broken, and scaled
+        # alike.
         self.pipeline.model.step_is_sound = sound
         self.pipeline.model.strategy.loss_scale = scale
         return sound
@@ -217,7 +217,7 @@ class Lang3DXLTrainer(Trainer):
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run), then
-        learn words; a run that was stopped between the two learns words only.
+        learn words. A run that was stopped between the two learns words only.
 
         Raises SystemExit after a signal stopped the run: 130 for Ctrl-C, 143 for SIGTERM.
         """
@@ -234,7 +234,7 @@ class Lang3DXLTrainer(Trainer):
         self._last_iteration = self._start_step - 1
         self.step = max(self._last_iteration, 0)
         if self._start_step < total:
-            self.words_are_learned = False  # those of the checkpoint will be out of date
+            self.words_are_learned = False  # the checkpoint's words will be out of date
         try:
             self._announce_time()
             self.stages.begin("train")
@@ -256,11 +256,11 @@ class Lang3DXLTrainer(Trainer):
 
     @torch.no_grad()
     def _announce_time(self) -> None:
-        """Log about how long training and learning words will take with the present Gaussians, by rendering a
-        photo's view: the second time, since the first may compile kernels."""
+        """Log how long training and learning words will take with the present Gaussians. The estimate comes
+        from rendering a photo's view for the second time, since the first may compile kernels."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         middle = int((cameras.width * cameras.height).flatten().argsort()[len(cameras) // 2])
-        with self.train_lock:  # the viewer may render too
+        with self.train_lock:  # the viewer may render at the same time
             model.eval()
             for _ in range(2):
                 start = perf_counter()
@@ -286,11 +286,11 @@ class Lang3DXLTrainer(Trainer):
 
     @contextmanager
     def _stoppable(self) -> Iterator[None]:
-        """Let Ctrl-C or SIGTERM end training after the current iteration, with a checkpoint, and learning
-        words, before which there is one, at once; a second one ends anything at once."""
+        """Let Ctrl-C or SIGTERM end training after the current iteration, with a checkpoint. Learning words,
+        which a checkpoint precedes, ends at once. A second signal ends anything at once."""
 
         def restore(number: signal.Signals) -> None:
-            # None: a handler that Python did not install, and can't.
+            # None stands for a handler that Python did not install, and cannot restore.
             signal.signal(number, signal.SIG_DFL if previous[number] is None else previous[number])
 
         def stop(number: int, _frame: FrameType | None) -> None:
@@ -299,7 +299,7 @@ class Lang3DXLTrainer(Trainer):
             if self._is_learning_words:
                 raise _Stopped
 
-        if threading.current_thread() is not threading.main_thread():  # only it may handle signals
+        if threading.current_thread() is not threading.main_thread():  # only this thread may handle signals
             yield
             return
         previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -312,7 +312,7 @@ class Lang3DXLTrainer(Trainer):
                 restore(number)
 
     def _stop_early(self) -> str:
-        """Save a checkpoint when training can't continue; returns a message about it."""
+        """Save a checkpoint when training can't continue, and return a message about it."""
         self._is_ending = True
         if self._last_iteration < self._start_step:
             return "Nothing was learned yet"
@@ -323,8 +323,8 @@ class Lang3DXLTrainer(Trainer):
         )
 
     def _out_of_memory(self) -> str:
-        """What happened and what helps. The interrupted step may have left half-made tensors, so the latest
-        checkpoint stays as it is."""
+        """Describe what happened and what helps. The latest checkpoint is not replaced, since the interrupted
+        step may have left incomplete tensors."""
         count = self.pipeline.model.num_points
         when = "while learning words" if self._is_ending else f"at iteration {self.step}"
         saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
@@ -340,12 +340,12 @@ class Lang3DXLTrainer(Trainer):
         )
 
     def _after_train(self) -> None:
-        """Save, learn words, save again; after an interruption print how to resume, and don't wait in the
+        """Save, learn words, save again. After an interruption, print how to resume, and don't wait in the
         viewer."""
         self._is_ending = True
         self.stages.end()
         if self.interrupted:
-            self.step = max(self._last_iteration, 0)  # not the one that was about to begin
+            self.step = max(self._last_iteration, 0)  # not the iteration that was about to begin
         elif self.pipeline.has_words_to_learn:
             self.save_checkpoint(self.step)
             self._learn_words()
@@ -359,8 +359,8 @@ class Lang3DXLTrainer(Trainer):
         super()._after_train()  # saves first
 
     def write_scene(self) -> None:
-        """Write the trained scene as one file into the run's folder, to ask and to share. It keeps the words
-        taught in an earlier file there, or in that of the run that this one resumed."""
+        """Write the trained scene as one file into the run's folder, for queries and sharing. It keeps the
+        words taught in an earlier file there, or in the folder of the run that this one resumed."""
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
         how = f"{self.config.method_name}, {config.decoder.name}, {self.config.max_num_iterations} iterations"
@@ -373,7 +373,7 @@ class Lang3DXLTrainer(Trainer):
         say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)", *self._next_steps())
 
     def _learn_words(self) -> None:
-        # Locked, since the viewer may be learning words too, for a question of a moment ago.
+        # Hold the lock, since the viewer may be learning words for a recent question.
         with suppress(_Stopped), self.stages.stage("words"), self.train_lock:
             try:
                 self._is_learning_words = True
@@ -393,7 +393,7 @@ class Lang3DXLTrainer(Trainer):
     def save_checkpoint(self, step: int) -> None:
         """Write the checkpoint beside its folder and move it in, so that a killed run leaves no partial one.
 
-        If it can't be written training continues; at its end that is a UserError.
+        If it can't be written, training continues; at the end of training, UserError is raised.
         """
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         partial = self.base_dir / f"{path.name}.partial"
@@ -401,7 +401,7 @@ class Lang3DXLTrainer(Trainer):
             self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
             self._write_checkpoint(step, partial)
             replace_durably(partial, path)
-        except (OSError, RuntimeError) as error:  # torch raises the latter for a full disk
+        except (OSError, RuntimeError) as error:  # torch raises RuntimeError for a full disk
             with suppress(OSError):
                 partial.unlink(missing_ok=True)
             free = shutil.disk_usage(self.base_dir).free / 1e9 if self.base_dir.is_dir() else 0.0

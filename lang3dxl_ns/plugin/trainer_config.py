@@ -1,4 +1,4 @@
-"""Settings of a training run, fitted to its length, its data and the run that it resumes; opening of runs."""
+"""Settings of a training run, fitted to its length, data and resumed run; opening of finished runs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
 from lang3dxl_ns.scene.camera import Camera
 
 LONG_RUN_S = 3_600.0
-"""Seconds of training that are not begun on a warning."""
+"""Seconds of training on a slow GPU rasterizer above which a run is refused."""
 
 
 @showing(
@@ -47,22 +47,22 @@ LONG_RUN_S = 3_600.0
 )
 @dataclass
 class Lang3DXLTrainerConfig(TrainerConfig):
-    """Training configuration; `--max-num-iterations` alone rescales every schedule."""
+    """Settings of a training run. `--max-num-iterations` alone rescales every schedule."""
 
     _target: type = field(default_factory=lambda: Lang3DXLTrainer)
     pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
     max_skipped_steps: int = 20
-    """A step whose loss or gradient is not finite is skipped; after this many in a row the run stops."""
+    """Most steps in a row that are skipped, because loss or gradient is not finite, before the run stops."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """When config.yml is read: tell the data manager the run's folder, which only this class knows."""
+        """Restore settings from config.yml, and tell the data manager the run's folder, known only here."""
         self.__dict__.update(state)
         if self.timestamp != "{timestamp}":
             self.pipeline.datamanager.run = self.get_base_dir()
 
     def get_base_dir(self) -> Path:
-        """The run's folder: where nerfstudio's `ns-eval --load-config` and others found config.yml, which may
-        be a copy of the run, or where the settings say."""
+        """Return the run's folder. This is the folder in which nerfstudio's commands with `--load-config`
+        found config.yml, which may be a copy of the run, or the one that the settings name."""
         if self.timestamp != "{timestamp}" and not Path(sys.argv[0]).stem.startswith("ns-train"):
             for path in load_configs(sys.argv[1:]):
                 if path.is_file() and path.with_name(SCENE_FILE).is_file():
@@ -70,15 +70,15 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         return super().get_base_dir()
 
     def print_to_terminal(self) -> None:
-        """Say where the settings are; LANG3DXL_VERBOSE=1 prints all of them, as other methods do."""
+        """Print where the settings are; with LANG3DXL_VERBOSE=1 print all of them, as other methods do."""
         if os.environ.get("LANG3DXL_VERBOSE") == "1":
             super().print_to_terminal()
         else:
             say(f"Settings: {self.get_base_dir() / 'config.yml'} (LANG3DXL_VERBOSE=1 prints them)")
 
     def set_timestamp(self) -> None:
-        """Called once before the configuration is printed and saved: settle what depends on the run, and make
-        sure that the encoders can be had before a folder is made for it."""
+        """Resolve what depends on the run, and check that the encoders are available before a folder is made
+        for it. nerfstudio calls this once, before the configuration is printed and saved."""
         print_user_errors_plainly()
         check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
         if self.pipeline.model.max_gaussians is not None:
@@ -89,7 +89,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         if self.is_viewer_enabled():
             check_address(self.viewer.websocket_host, self.viewer.websocket_port)
         fresh = self.timestamp == "{timestamp}"
-        if fresh:  # a run's config.yml has what these settings came to
+        if fresh:  # a run's config.yml contains resolved values
             check_inert(self.pipeline.model, self.pipeline.datamanager)
         super().set_timestamp()
         self.fit_to_run()
@@ -100,7 +100,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             self._claim_folder()
 
     def _check_device(self) -> None:
-        """Before anything is prepared: say if a GPU stays unused, and build gsplat if it is needed."""
+        """Warn about an unused GPU, and build gsplat if it is needed, before anything is prepared."""
         if self.machine.device_type == "cuda" and not torch.cuda.is_available():
             raise UserError(f"torch can't use a GPU here: {unused_gpu() or 'there is none'}")
         warn_of_unused_gpu()
@@ -111,7 +111,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             self._refuse_hours_of_torch()
 
     def _refuse_hours_of_torch(self) -> None:
-        """Raises UserError if this GPU would take hours without gsplat, judged by one rendering."""
+        """Raise UserError if this GPU would take hours without gsplat, judged by one rendering."""
         seconds = RENDERINGS_PER_STEP[False] * self.max_num_iterations * _torch_rendering_seconds()
         if seconds > LONG_RUN_S:
             raise UserError(
@@ -131,8 +131,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
                 self.timestamp = f"{second}-{tries}"
 
     def get_checkpoint_dir(self) -> Path:
-        """Folder of the checkpoints. Every command that loads a run calls this, so it also checks the
-        latest one. Raises UserError if that is damaged."""
+        """Return the folder of the checkpoints, after checking the latest one, since every command that loads
+        a run calls this. Raises UserError if that checkpoint is damaged."""
         folder = super().get_checkpoint_dir()
         print_user_errors_plainly()
         warn_of_unused_gpu()
@@ -140,8 +140,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         return folder
 
     def fit_to_run(self) -> None:
-        """Resolve rates, schedules and presets for this number of iterations; make paths absolute, so
-        that config.yml is complete and can be read from any folder."""
+        """Resolve rates, schedules and presets for this number of iterations. Paths become absolute, so that
+        config.yml is complete and can be read from any folder."""
         if self.machine.num_devices * self.machine.num_machines > 1:
             print_user_errors_plainly()
             raise UserError(
@@ -172,7 +172,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.output_dir = expanded(self.output_dir).absolute()
 
     def _follow(self, run: Path) -> None:
-        """A resumed run keeps what `auto` resolved to when it began."""
+        """Set each `auto` of a resumed run to what it resolved to when the run began."""
         if not (run / "config.yml").is_file():
             return
         earlier: Any = read_config(run / "config.yml").pipeline
@@ -195,9 +195,9 @@ class Lang3DXLTrainerConfig(TrainerConfig):
 
 
 def read_config(path: Path) -> TrainerConfig:
-    """The configuration of a run, read as `read_settings` does.
+    """Read the configuration of a run as `read_settings` does.
 
-    Raises UserError for a missing or damaged file, one of another version, and one that asks for more.
+    Raises UserError for a missing or damaged file, one of another version, and one that requests more.
     """
     (config,) = read_settings(path, [()])
     if not isinstance(config, TrainerConfig):
@@ -206,11 +206,11 @@ def read_config(path: Path) -> TrainerConfig:
 
 
 def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPipeline, int]:
-    """Settings, pipeline (in evaluation mode) and iteration of a run's latest checkpoint, without executing
-    code; nerfstudio's own `eval_setup` trusts config.yml.
+    """Open a run: return settings, pipeline (in evaluation mode) and iteration of its latest checkpoint. No
+    code is executed, while nerfstudio's own `eval_setup` trusts config.yml.
 
-    run: as for `find_config`. Raises UserError for a config.yml that is damaged, asks for more than settings,
-    or is of another method; and for a checkpoint that is missing, damaged, or does not fit the settings.
+    run: as for `find_config`. Raises UserError for a config.yml that is damaged, requests more than settings,
+    or is of another method; and for a checkpoint that is missing, damaged, or does not match the settings.
     """
     config_path = find_config(run).absolute()
     config = read_config(config_path)
@@ -218,7 +218,7 @@ def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPip
         raise UserError(f"{config_path} is a run of another method: use nerfstudio's own commands")
     folder = config_path.parent
     path, state = latest_checkpoint(folder / config.relative_model_dir)
-    # The folder may have moved: nerfstudio composes its path from these.
+    # The folder may have moved; nerfstudio composes its path from these settings.
     config.output_dir, config.experiment_name, config.method_name = folder.parent, "", ""
     config.timestamp, config.load_dir, config.pipeline.datamanager.run = folder.name, path.parent, folder
     pipeline = config.pipeline.setup(device=best_device(), test_mode="test")
@@ -230,7 +230,7 @@ def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPip
 
 
 def _torch_rendering_seconds(count: int = 50_000, size: tuple[int, int] = (1000, 700)) -> float:
-    """Seconds of a rendering of random Gaussians by torch on the GPU; the second one, warm."""
+    """Measure the seconds of the second rendering, which is warm, of random Gaussians by torch on the GPU."""
     draw = torch.Generator().manual_seed(0)
     means = torch.rand(count, 3, generator=draw) * 4 - torch.tensor([2.0, 2.0, -3.0])
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)

@@ -13,11 +13,11 @@ from lang3dxl_ns.rendering.render import Rendering
 
 @torch.no_grad()
 def pictures(rendering: Rendering, question: Question | None) -> dict[str, Float[Tensor, "h w k"]]:
-    """`overlay`, the heat map of all prompts over the rendering, and `relevancy_0` … [h, w, 1].
+    """Draw a view's answers: `overlay`, all prompts' heat over the colors, and `relevancy_0` … [h, w, 1].
 
     Args:
-        rendering: a view, rendered with the question's channels.
-        question: the prompts; None: the overlay is the rendering itself.
+        rendering: the view, rendered with the question's channels.
+        question: the prompts; if None, the overlay is the rendering itself.
     """
     if question is None or rendering.channels is None:
         return {"overlay": rendering.rgb}

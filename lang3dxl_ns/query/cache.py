@@ -16,7 +16,7 @@ from lang3dxl_ns.common.files import check_regular, write_atomically
 
 
 def fingerprint(state: Mapping[str, Any], settings: object) -> str:
-    """16 hex digits of a state (tensors, or anything `str` can represent) and settings (as JSON)."""
+    """Hash a state (tensors, or anything `str` can represent) and settings (as JSON) to 16 hex digits."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
     for name, value in sorted(state.items()):
         if not isinstance(value, Tensor):
@@ -28,8 +28,7 @@ def fingerprint(state: Mapping[str, Any], settings: object) -> str:
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], key: str, notes: object) -> None:
-    """Write tensors with their key, atomically. If that fails they are not kept, and made again the next
-    time."""
+    """Write tensors with their key, atomically. If that fails, log it; they are computed again next time."""
     from safetensors.torch import save
 
     stored = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
@@ -41,7 +40,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], key: str, notes: obj
 
 
 def load_tensors(path: Path, key: str) -> tuple[dict[str, Tensor], object] | None:
-    """Tensors and notes of a file with this key; None if there is none, or it is damaged."""
+    """Load the tensors and notes of a file with this key; None if there is none, or it is damaged."""
     from safetensors import SafetensorError, safe_open
 
     try:

@@ -15,8 +15,8 @@ _LEAST_PART = 1e-4
 
 
 def run_lengths(mask: Bool[Array, "h w"]) -> list[int]:
-    """Lengths of alternating runs of a mask, column by column, beginning with the pixels outside: COCO's
-    uncompressed RLE."""
+    """Return the lengths of a mask's alternating runs, column by column, beginning with the pixels outside,
+    as in COCO's uncompressed RLE."""
     flat = mask.ravel(order="F")
     ends = np.flatnonzero(np.diff(flat)) + 1
     lengths = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
@@ -24,7 +24,7 @@ def run_lengths(mask: Bool[Array, "h w"]) -> list[int]:
 
 
 def mask_of(lengths: Sequence[int], size: tuple[int, int]) -> Bool[Array, "h w"]:
-    """The mask (height, width) with these `run_lengths`. Raises ValueError if they don't fit its size."""
+    """Build the mask (height, width) with these `run_lengths`. Raises ValueError if the sizes differ."""
     counts = np.asarray(lengths, np.int64)
     if (counts < 0).any() or counts.sum() != size[0] * size[1]:
         raise ValueError("run lengths don't fit the size of their mask")
@@ -35,7 +35,7 @@ class CocoLabels:
     """A data set in COCO's format, with an annotation for each connected part of each mask.
 
     Args:
-        categories: their names.
+        categories: names of the categories.
     """
 
     def __init__(self, categories: Sequence[str]) -> None:
@@ -47,8 +47,8 @@ class CocoLabels:
         """Add a photo.
 
         Args:
-            photo: its name.
-            masks: one per category, at the size of the photo's file.
+            photo: name of the photo.
+            masks: one mask per category, at the size of the photo's file.
         """
         height, width = masks[0].shape
         image = {"id": len(self._images) + 1, "file_name": photo, "width": width, "height": height}
@@ -60,7 +60,7 @@ class CocoLabels:
 
     @property
     def content(self) -> dict[str, Any]:
-        """The file's content."""
+        """Content of the COCO file."""
         return {
             "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
             "images": self._images,

@@ -1,4 +1,4 @@
-"""Questions to snapshots of a model that may be in training, without user interface."""
+"""Questions to snapshots of a model that may be in training, without a user interface."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ from lang3dxl_ns.rendering import Rendering
 
 
 class Conversation:
-    """Questions to a model, which may be in training in another thread.
+    """Questions to a model that may be in training in another thread.
 
-    A question is put to a snapshot of the model, a scene of its own, so that nothing but taking the snapshot
-    waits for training. If the model trains and its words don't, they are learned from the photos first.
+    Each question is put to a snapshot of the model, a separate scene, so that only taking the snapshot waits
+    for training. If the model is in training and its decoder learns from lifted features, taking the snapshot
+    learns words from the photos first.
 
     Args:
         model: a `Lang3DXLModel`, trained or in training.
         file: photos, cameras and CLIP.
-        run: folder of the run, for what is computed once.
+        run: folder of the run, which keeps results that are computed once.
         lock: held while using the model.
-        learning: whether the model still changes.
+        learning: returns whether the model still changes.
         learn: makes the Gaussians' codes for the present model, for decoders that need it.
-        shown: names of the outputs that the viewer shows.
+        shown: returns the names of the outputs that the viewer shows.
         watch: called with a short description of slow work.
     """
 
@@ -54,13 +55,13 @@ class Conversation:
         watch: Callable[[str], None],
     ) -> None:
         self._asked: tuple[Scene, Question] | None = None
-        """The question and the snapshot that it was put to, replaced together: other threads read them."""
+        """The question with its snapshot: one tuple, replaced as a whole because other threads read it."""
         self._drawn: tuple[Scene, Question] | None = None
-        """Those of the frame under way."""
+        """The question and the snapshot of the frame being drawn."""
         self.found: list[Found] | None = None
-        """None: not searched yet."""
+        """Matches of the question; None: not searched yet."""
         self.seconds: float | None = None
-        """Duration of the latest frame, matches included."""
+        """Duration of the latest frame in seconds, matches included."""
         self._model, self._file, self._run, self._lock = model, file, run, lock
         self._learning, self._learn, self._shown, self._watch = learning, learn, shown, watch
         self._making = Lock()
@@ -73,12 +74,12 @@ class Conversation:
 
     @property
     def question(self) -> Question | None:
-        """The latest question."""
+        """The latest question, if any."""
         return None if self._asked is None else self._asked[1]
 
     def ask(self, text: str) -> Question:
-        """Set the question: prompts as for `parse_prompts`. Raises UserError if there is none, or nothing can
-        be asked."""
+        """Set the question to prompts as `parse_prompts` reads them. Raises UserError if there is none, or
+        the model cannot be queried."""
         scene = self._scene_now()
         question = scene.ask(text)
         self._asked, self.found = (scene, question), None
@@ -89,7 +90,7 @@ class Conversation:
         self._asked = self.found = None
 
     def find(self) -> list[Found]:
-        """Matches of each prompt in the scene. First examines the scene, which takes long once."""
+        """Find matches of each prompt in the scene. The first search examines the scene, which takes long."""
         assert self._asked is not None
         scene, question = self._asked
         found = scene.places(question)
@@ -98,8 +99,8 @@ class Conversation:
         return found
 
     def _scene_now(self) -> Scene:
-        """A snapshot of the present model: after training the last one, in training one that is at most a
-        tenth of the run old."""
+        """Return a snapshot of the present model. After training there is one final snapshot; during training
+        a snapshot is reused for at most a tenth of the run."""
         with self._making:
             learning, step = self._learning(), self._model.step
             behind = self._model.config.total_steps / 10
@@ -114,7 +115,7 @@ class Conversation:
             return self._scene
 
     def _snapshot(self, learning: bool) -> Scene:
-        # Examined anew for every snapshot in training, so keep that brief.
+        # In training every snapshot is examined anew, so keep that brief.
         config = QueryConfig(views=24, view_side=160) if learning else QueryConfig()
         cache = None if learning else self._run / "lang3dxl_visible.safetensors"
         field = self._model.semantic_field
@@ -137,21 +138,20 @@ class Conversation:
 
     @property
     def shows_bottleneck(self) -> bool:
-        """Whether anyone views the picture of the codes."""
+        """Whether a viewer shows the picture of the codes."""
         return "bottleneck" in self._shown()
 
     def channels(self) -> Tensor | None:
-        """Values that Gaussians carry in the next rendering; None where they may not be the snapshot's: the
-        question was asked in training."""
+        """Return the values that Gaussians carry in the next rendering; None if the question was asked in
+        training, since they may then not be the snapshot's."""
         self._drawn = self._asked
         if self._drawn is None or self._drawn[0] is not self._scene or self._scene_step is not None:
             return None
         return self._drawn[1].channels
 
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """`overlay` and the relevancy of a rendering that took so many seconds, for the question at the call
-        of `channels` before it. There is always an `overlay`, since viewers break if an output they show is
-        missing."""
+        """Return `overlay` and the relevancies of a rendering that took `seconds`, for the question at the
+        preceding call of `channels`. `overlay` is always present, since viewers break without it."""
         start, (scene, question) = time.perf_counter(), self._drawn or (None, None)
         if question is not None and scene is not None and rendering.channels is None:
             of_snapshot = scene.draw(rendering.camera, question.channels)
@@ -163,7 +163,7 @@ class Conversation:
     # ── saying how it went ──────────────────────────────────────────────────────────────────────────
 
     def summary(self) -> str:
-        """What was found, in Markdown: a line for each prompt, and one about a doubtful one."""
+        """Describe what was found, in Markdown: a line for each prompt, and one for each warning about it."""
         lines = []
         for found in self.found or ():
             count, text = len(found.views), shortened(found.prompt.text)
@@ -175,7 +175,7 @@ class Conversation:
         return "  \n".join(lines)
 
     def status(self) -> str:
-        """How long a frame takes, and what training still lacks."""
+        """Describe how long a frame takes, and what training still lacks."""
         parts = [] if self.seconds is None else [f"{self.seconds * 1e3:.0f} ms per frame"]
         if self._scene_step is not None and self._learning():
             parts.append(f"words as of iteration {self._scene_step}, since the model still learns")
@@ -183,10 +183,10 @@ class Conversation:
 
 
 def plain(text: str) -> str:
-    """A text escaped for Markdown."""
+    """Escape a text for Markdown."""
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
 def shortened(text: str) -> str:
-    """A text of at most 40 characters, to fit on a button."""
+    """Shorten a text to at most 40 characters, so that it fits on a button."""
     return text if len(text) <= 40 else text[:39] + "…"

@@ -1,7 +1,7 @@
 """Query engines: prompts to relevancy maps, decoding Gaussian by Gaussian or pixel by pixel.
 
-Callers treat both alike: they composite the engine's channels in the pass that renders colors, and let the
-engine compute maps from the result.
+Callers treat both alike: they composite the engine's channels in the pass that renders colors, and the engine
+computes maps from the result.
 """
 
 from __future__ import annotations
@@ -26,34 +26,35 @@ from lang3dxl_ns.query.relevancy import (
 )
 
 _SAMPLE = 4096
-"""Gaussians that a calibration is read from."""
+"""Number of Gaussians that a calibration uses."""
 
 
 class QueryEngine(Protocol):
-    """Answers prompts about a scene."""
+    """Interface of an engine that answers prompts about a scene."""
 
     @property
     def temperature(self) -> float:
         """Temperature of the relevancies, for cosines as they are."""
 
     def channels(self, queries: Queries) -> Float[Tensor, "n d"]:
-        """Values that Gaussians carry in a rendering that answers these prompts."""
+        """Return the values that Gaussians carry in a rendering that answers these prompts."""
 
     def maps(self, rendered: Float[Tensor, "h w d"], queries: Queries) -> Float[Tensor, "q h w"]:
-        """Relevancy of every pixel, 0…1, from these channels composited over black."""
+        """Compute the relevancy of every pixel, 0…1, from these channels composited over black."""
 
     def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
-        """Relevancy of every Gaussian by itself, 0…1."""
+        """Compute the relevancy of every Gaussian by itself, 0…1."""
 
     def features(self, rows: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
-        """Unit CLIP features of some Gaussians; 0 for those visible in no photo."""
+        """Decode the unit CLIP features of some Gaussians; 0 for those visible in no photo."""
 
     @property
     def head(self) -> Float[Tensor, "r c"] | None:
-        """Vectors that all features are combinations of, if they are fewer than CLIP's channels."""
+        """Vectors that span all features, if they are fewer than CLIP's channels; otherwise None."""
 
     def calibrated(self, words: Queries) -> QueryEngine:
-        """The same with a temperature that suits the encoder: `relevancy.calibrated`.
+        """Return this engine with a temperature that suits the encoder, as computed by
+        `relevancy.calibrated`.
 
         words: a fixed set for all scenes and encoders, `TextEncoder.yardstick`.
         """
@@ -61,8 +62,8 @@ class QueryEngine(Protocol):
 
 @dataclass(frozen=True)
 class PerGaussian:
-    """One relevancy per Gaussian and prompt, composited: Σ w ρ, not divided by coverage. A pixel's value is
-    the share of it covered by matching Gaussians, also at edges and half-transparent places."""
+    """Engine that composites one relevancy per Gaussian and prompt: Σ w ρ, not divided by coverage. A pixel's
+    value is the share of it covered by matching Gaussians, also at edges and half-transparent places."""
 
     decoded: GaussianFeatures
     temperature: float = TEMPERATURE
@@ -90,7 +91,7 @@ class PerGaussian:
 
 @dataclass(frozen=True)
 class PerPixel:
-    """Codes are composited, then decoded pixel by pixel, as in Lang3D-XL."""
+    """Engine that composites codes, then decodes them pixel by pixel, as in Lang3D-XL."""
 
     decode: Decode
     codes: Float[Tensor, "n d"]
@@ -118,7 +119,7 @@ class PerPixel:
 def make_engine(
     decoder: Decoder, codes: Float[Tensor, "n d"], temperature: float = TEMPERATURE
 ) -> QueryEngine:
-    """The engine for a feature decoder, with its own order of compositing and decoding."""
+    """Build the engine for a feature decoder, in the decoder's order of compositing and decoding."""
     if decoder.per_gaussian:
         return PerGaussian(GaussianFeatures.of(decoder, codes), temperature)
     return PerPixel(decoder.decode_clip, codes, temperature)

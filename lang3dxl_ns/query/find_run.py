@@ -1,4 +1,4 @@
-"""Finding a run: a folder, a config.yml, or the newest run under outputs/."""
+"""Search for a run: a folder, a config.yml, or the newest run under outputs/."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.query.run_file import SCENE_FILE
 
 OUTPUTS = Path("outputs")
-"""Where `ns-train` puts runs."""
+"""Folder in which `ns-train` creates runs."""
 _DEEPEST = 4
-"""Folders between the one given and a run's: SCENE/METHOD/TIME in outputs/."""
+"""Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
 
 
 def find_config(run: str | Path | None = None) -> Path:
-    """The config.yml of a run.
+    """Find the config.yml of a run.
 
-    run: the file, the run's folder, or a folder above it, whose newest run is taken; None: the newest under
-    outputs/. Runs of other methods, which lack a description of the scene, are skipped. Raises UserError if
-    there is none.
+    run: the file, the run's folder, or a folder above it, whose newest run is taken; None: the newest run
+    under outputs/. Runs of other methods, which lack a scene description, are skipped. Raises UserError if
+    there is no run.
     """
     place = OUTPUTS if run is None else expanded(run)
     if place.is_dir():

@@ -1,4 +1,4 @@
-"""Relevancy of Gaussians: features are decoded once per scene, a prompt is then one matrix product."""
+"""Relevancy of Gaussians: features are decoded once per scene, and a prompt then takes one matrix product."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _CHUNK_MB = 64
 
 @dataclass(frozen=True)
 class GaussianFeatures:
-    """The direction of every Gaussian's CLIP feature, exact, in as few numbers as its decoder allows.
+    """The exact direction of every Gaussian's CLIP feature, in as few numbers as its decoder allows.
 
-    A decoder whose last layer is linear, d = W h + b, gives cos(d, t) = ((h, 1) · (Wᵀt, b·t)) / |d|: it takes
-    the hidden activations h and |d|, whatever the width of CLIP is. Rows are (h, 1) / |d|.
+    A decoder whose last layer is linear, d = W h + b, gives cos(d, t) = ((h, 1) · (Wᵀt, b·t)) / |d|. The
+    hidden activations h and |d| therefore suffice, whatever the width of CLIP is. Rows are (h, 1) / |d|.
     """
 
     rows: Float[Tensor, "n r"]
-    """Half precision; 0 for unknown Gaussians."""
+    """Half-precision row of each Gaussian; 0 for unknown Gaussians."""
     head: Float[Tensor, "r c"] | None
-    """(Wᵀ; b), which turns a row into a unit feature. None if rows are unit features already."""
+    """Matrix (Wᵀ; b), which turns a row into a unit feature. None if rows are unit features already."""
     known: Bool[Tensor, " n"]
-    """Which Gaussians have a feature: the others are visible in no photo."""
+    """Which Gaussians have a feature; the others are visible in no photo."""
 
     @classmethod
     @torch.no_grad()
     def of(cls, decoder: Decoder, codes: Float[Tensor, "n d"]) -> GaussianFeatures:
-        """Decode the codes of Gaussians; a NaN marks an unknown one."""
+        """Decode the codes of Gaussians, where NaN marks an unknown one."""
         layer = decoder.clip_head()
         narrow = layer is not None and layer[0].shape[1] < layer[0].shape[0]
         head = torch.cat([layer[0].T, layer[1][None]]) if narrow and layer else None
@@ -48,32 +48,32 @@ class GaussianFeatures:
             else:
                 rows = F.pad(decoder.hidden(part), (0, 1), value=1.0)
                 rows = rows / ((rows @ gram) * rows).sum(1, keepdim=True).clamp_min(1e-12).sqrt()
-            # A feature that all but vanishes says nothing, and its row may exceed half precision.
+            # A feature that all but vanishes carries no information, and its row may exceed half precision.
             return torch.where(seen & (rows.abs() < 6e4).all(1, keepdim=True), rows, 0.0).half()
 
         rows = _in_chunks(decode, codes, decoder.clip_dim)
         return cls(rows, head, (rows != 0).any(1))
 
     def some(self, count: int) -> GaussianFeatures:
-        """About `count` of the known Gaussians, evenly chosen."""
+        """Return about `count` of the known Gaussians, evenly chosen."""
         rows = self.rows[self.known]
         rows = rows[:: max(len(rows) // count, 1)]
         return GaussianFeatures(rows, self.head, torch.ones_like(rows[:, 0], dtype=torch.bool))
 
     @torch.no_grad()
     def features(self, which: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
-        """Unit features of some Gaussians; 0 where unknown."""
+        """Return the unit features of some Gaussians; 0 where unknown."""
         rows = self.rows[which].float()
         return rows if self.head is None else rows @ self.head
 
     @torch.no_grad()
     def cosines(self, queries: Queries) -> Float[Tensor, "n v"]:
-        """Cosine of every Gaussian with every vector; 0 where unknown."""
+        """Compute the cosine of every Gaussian with every vector; 0 where unknown."""
         vectors = queries.vectors.T if self.head is None else self.head @ queries.vectors.T
         return _in_chunks(lambda part: part.float() @ vectors, self.rows, self.rows.shape[1])
 
     def relevancy(self, queries: Queries, temperature: float = TEMPERATURE) -> Float[Tensor, "q n"]:
-        """Relevancy of every Gaussian to every prompt, 0…1; 0 where unknown."""
+        """Compute the relevancy of every Gaussian to every prompt, 0…1; 0 where unknown."""
         return queries.relevancy_of_cosines(self.cosines(queries), temperature) * self.known
 
 

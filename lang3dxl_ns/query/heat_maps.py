@@ -15,16 +15,16 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 
 _OPACITY = 0.7
-"""Share of the heat in the color of a pixel that matches."""
+"""Opacity of the heat over a pixel that matches."""
 
 
 def heat(relevancy: Float[Tensor, "h w"], threshold: float = 0.5) -> Float[Tensor, "h w"]:
-    """Relevancy above the threshold stretched to 0…1, which the map's highest is."""
+    """Stretch relevancies to 0…1, from the threshold to the map's maximum."""
     return ((relevancy - threshold) / max(float(relevancy.max()) - threshold, 1e-6)).clamp(0, 1)
 
 
 def color(values: Float[Tensor, "*shape"], color_map: str = "turbo") -> Float[Tensor, "*shape 3"]:
-    """Values in 0…1 as colors of a matplotlib color map. Raises UserError for an unknown one."""
+    """Map values in 0…1 to colors of a matplotlib color map. Raises UserError for an unknown map."""
     table = _colors(color_map).to(values)
     return table[(values.clamp(0, 1) * (len(table) - 1)).round().long()]
 
@@ -37,14 +37,14 @@ def overlay(
     opacity: float = _OPACITY,
     color_map: str = "turbo",
 ) -> Float[Tensor, "h w 3"]:
-    """The heat map over matching pixels, the image elsewhere.
+    """Draw the heat map over the pixels that match, and keep the image elsewhere.
 
     Args:
         image: colors, 0…1.
-        relevancy: 0…1.
+        relevancy: relevancy of every pixel, 0…1.
         mask: pixels that match.
-        threshold: relevancy of the color map's first color; the highest gets its last.
-        opacity: of the heat map, 0…1.
+        threshold: relevancy of the color map's first color; the highest relevancy gets its last.
+        opacity: opacity of the heat map, 0…1.
         color_map: name of a matplotlib color map.
 
     Raises:
@@ -68,8 +68,7 @@ def _colors(name: str) -> Float[Tensor, "256 3"]:
 def strongest(
     maps: Float[Tensor, "q ..."], masks: Bool[Tensor, "q ..."]
 ) -> tuple[Float[Tensor, "..."], Int64[Tensor, "..."]]:
-    """The highest relevancy of the prompts that match a place, 0 where none does; and which prompt that
-    is."""
+    """Return the highest relevancy of the prompts that match a place (0 for none), and its prompt's index."""
     best, which = torch.where(masks, maps, -1.0).max(0)
     return best.clamp_min(0), which
 
@@ -80,7 +79,7 @@ PROMPT_COLORS = (
 )
 """Distinct colors, one per prompt; they repeat after the tenth."""
 _FONT_SHARE = 32
-"""Height of a legend's letters: the picture's width divided by this, at least 11 pixels."""
+"""Ratio of the picture's width to the height of a legend's letters, which is at least 11 pixels."""
 
 
 def tinted(
@@ -89,8 +88,8 @@ def tinted(
     masks: Bool[Tensor, "q h w"],
     threshold: float,
 ) -> Float[Tensor, "h w 3"]:
-    """The image with each prompt's matches in its own color: that of the most relevant where several match,
-    stronger with relevancy above the threshold."""
+    """Tint each prompt's matches in its own color, in the most relevant prompt's where several match. The
+    tint is stronger with relevancy above the threshold."""
     best, which = strongest(maps, masks)
     colors = torch.tensor([PROMPT_COLORS[i % len(PROMPT_COLORS)] for i in range(len(maps))]).to(image) / 255
     strength = _OPACITY * masks.any(0) * (0.5 + 0.5 * heat(best, threshold))
@@ -100,7 +99,7 @@ def tinted(
 def with_legend(
     picture: UInt8[Array, "h w 3"], labels: Sequence[str], colors: Sequence[tuple[int, int, int]]
 ) -> UInt8[Array, "h+legend w 3"]:
-    """A picture with a line below for each label: a square of its color, and the words."""
+    """Add a line for each label below a picture, with a square of the label's color and its text."""
     height, width = picture.shape[:2]
     size = max(width // _FONT_SHARE, 11)
     line = size + size // 2

@@ -1,4 +1,4 @@
-"""Words taught in a scene's earlier file, kept when the scene is made anew."""
+"""Words taught in a scene's earlier file, which are kept when the scene is made anew."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lang3dxl_ns.query.teach import TaughtWord, known_word
 
 
 def with_words_of(scene: Scene, earlier: Path) -> Scene:
-    """The scene with the words taught in an earlier file that it doesn't know; says which are kept, and how.
+    """Return the scene with the words of an earlier file that it doesn't know; log which are kept, and how.
 
     Args:
         scene: the scene that takes the file's place.

@@ -1,8 +1,8 @@
 """Learning of a word from marks: a direction in CLIP's space, from the Gaussians that the marks show.
 
 A word is a linear score of unit CLIP features, fitted by logistic regression to the Gaussians that the marked
-pixels show. It joins the text's own relevancy in proportion to how well that separates the marked from the
-rest: docs/teach.md.
+pixels show. The text's own relevancy joins it, with a weight for how well that separates the marked from the
+rest; see docs/teach.md.
 """
 
 from __future__ import annotations
@@ -30,37 +30,37 @@ from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import resized
 
 _ROWS = 20_000
-"""Gaussians that a word is fitted to, at most; more are sampled by their weight."""
+"""Most Gaussians of the word, and of the rest, that are fitted; of more, every k-th one is used."""
 _AXES = 64
-"""Principal components of the scene's features that a word is fitted in."""
+"""Number of principal components of the scene's features in which a word is fitted."""
 _TYPICAL = 4096
-"""Gaussians, evenly spaced, that the components are taken from."""
+"""Number of evenly spaced Gaussians from which the components are computed."""
 _LEAST_SPREAD = 1e-3
-"""Spread of a coordinate that takes part, relative to the largest."""
+"""Smallest spread of a coordinate that takes part, relative to the largest spread."""
 _RIDGE, _LEAST_RIDGE = 0.3, 0.01
-"""Penalty of the squared coefficients, per standardized coordinate, after one click; and at least."""
+"""Penalty of the squared coefficients, per standardized coordinate: after one click, and its lower bound."""
 _UP = 0.6
-"""Part of the way from the mean score of a clicked photo to that of the clicks where the word begins."""
+"""Position of a word's threshold between the mean score of a clicked photo (0) and that of the clicks (1)."""
 _GAIN = 1.5
 """Weight of a text whose average precision is 1."""
 _TRUST = 3
-"""Clicks that the belief in a word's text is worth before anything is marked."""
+"""Number of clicks that the prior trust in a word's text is worth."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Pixels of an example's photo that each Gaussian fills."""
+    """Pixels that each Gaussian fills in an example's photo."""
 
     word: Float[Tensor, " n"]
-    """Pixels marked as the word."""
+    """Pixels of each Gaussian that are marked as the word."""
     other: Float[Tensor, " n"]
-    """Pixels marked as something else."""
+    """Pixels of each Gaussian that are marked as something else."""
     seen: Float[Tensor, " n"]
-    """All pixels."""
+    """All pixels of each Gaussian."""
 
     @classmethod
     def of(cls, example: Example, photo: ScenePhoto, splats: Splats, backend: Backend = "auto") -> Weights:
-        """Those that an example marks in its photo's foreground. Raises UserError as `marks`."""
+        """Measure what an example marks in its photo's foreground. Raises UserError as `marks` does."""
         camera = resized(photo.full_camera, MARK_SIDE)
         size = (camera.height, camera.width)
         foreground = photo.foreground(size)
@@ -71,7 +71,7 @@ class Weights:
         return cls(*parts.unbind(1))
 
     def check(self, photo: str, word: str) -> None:
-        """Raises UserError where the marks show nothing, or everything."""
+        """Raise UserError if the marks show nothing, or everything."""
         marked, everything = float(self.word.sum()), float(self.seen.sum())
         if marked <= 1e-6 * max(everything, 1.0):
             raise UserError(f"the marks of {word!r} in {photo} lie where the scene shows nothing")
@@ -80,7 +80,7 @@ class Weights:
 
     @property
     def rest(self) -> Float[Tensor, " n"]:
-        """Shares of what is not the word. Pixels marked so weigh as much as the rest of their photo."""
+        """Shares of what is not the word. Pixels marked as something else weigh as much as all others."""
         rest = (self.seen - self.word).clamp_min(0).double()
         rest, marked = rest / rest.sum().clamp_min(1e-12), self.other.double()
         return rest if float(marked.sum()) <= 0 else 0.5 * (rest + marked / marked.sum())
@@ -93,14 +93,14 @@ def learn(
     engine: QueryEngine,
     queries: Queries,
 ) -> TaughtWord:
-    """The word that examples teach; their order doesn't matter.
+    """Learn a word from examples, whose order doesn't matter.
 
     Args:
         name: the word.
-        examples: the marks, for the record.
-        weights: what they show, one per example.
-        engine: has the features of the scene's Gaussians, and the temperature of its relevancies.
-        queries: of the word's text, without synonyms.
+        examples: the marks, which the word keeps as a record.
+        weights: what the marks show, one per example.
+        engine: engine with the features of the scene's Gaussians, and the temperature of its relevancies.
+        queries: the query of the word's text, without synonyms.
 
     Raises:
         UserError: there is no example, or the marks show nothing, or everything.
@@ -111,13 +111,13 @@ def learn(
         one.check(example.photo, name)
     rows, photos = _sampled(examples, weights)
     sample = engine.features(rows).double()
-    # Margins of the text: the cosine minus that of the best competitor.
+    # Margin of the text: the cosine minus the best competitor's.
     text = queries.relevancy_of_cosines(queries.cosines(sample.float()), 1.0)[0].logit().double()
     everywhere = torch.linspace(0, len(weights[0].seen) - 1, _TYPICAL).long().to(rows.device)
     axes = _Axes.of(engine.features(everywhere).double(), engine.head)
     fit = partial(_fitted, name, sample, text, axes, engine.temperature)
     word = fit(photos)
-    # Each photo is judged by what the others teach.
+    # Each photo is judged by a word that the others teach.
     judges = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))] if len(photos) > 1 else [word]
     precision = {
         photo.name: photo.precision(judge.margins(sample, text))
@@ -133,16 +133,16 @@ class _Photo:
 
     name: str
     word: Float[Tensor, " m"]
-    """Weights of what is the word; they sum to 1."""
+    """Weights of the word; they sum to 1."""
     rest: Float[Tensor, " m"]
-    """Weights of what is not; they sum to 1."""
+    """Weights of the rest; they sum to 1."""
     share: float
     """Share of the photo that is marked as the word."""
     evidence: int
     complete: bool
 
     def precision(self, score: Float[Tensor, " m"]) -> float:
-        """Average precision of a score, of Gaussians weighted by the pixels that they fill."""
+        """Compute a score's average precision, with Gaussians weighted by the pixels that they fill."""
         from sklearn.metrics import average_precision_score
 
         rest = (1 - self.share) * self.rest
@@ -150,7 +150,7 @@ class _Photo:
         return average_precision_score(labels, scores, sample_weight=weights)
 
     def separation(self, score: Float[Tensor, " m"]) -> float:
-        """Chance that the word scores above the rest; equal scores share."""
+        """Compute the probability that the word scores above the rest; ties count half."""
         from sklearn.metrics import roc_auc_score
 
         labels, scores, weights = _labeled(score, self.word, self.rest)
@@ -160,7 +160,7 @@ class _Photo:
 def _labeled(
     values: Float[Tensor, "m ..."], word: Float[Tensor, " m"], rest: Float[Tensor, " m"]
 ) -> tuple[Float[Array, " k"], Float[Array, "k ..."], Float[Array, " k"]]:
-    """Labels, values and weights for scikit-learn: every Gaussian as the word (1), and as the rest (0)."""
+    """Return labels, values and weights for scikit-learn: every Gaussian as word (1) and as rest (0)."""
     labels = torch.cat([torch.ones_like(word), torch.zeros_like(rest)])
     weights = torch.cat([word, rest])
     found = [part[weights > 0].cpu().numpy() for part in (labels, torch.cat([values, values]), weights)]
@@ -170,8 +170,8 @@ def _labeled(
 def _sampled(
     examples: Sequence[Example], weights: Sequence[Weights]
 ) -> tuple[Int[Tensor, " m"], list[_Photo]]:
-    """Gaussians to fit, and their weights in every photo: evenly spaced ones of those that are the word, then
-    of those that are not (a Gaussian at an edge may be both)."""
+    """Choose Gaussians to fit, and their weights in every photo: evenly spaced ones of the word, then evenly
+    spaced ones of the rest (a Gaussian at an edge may be in both)."""
     words = [one.word.double() / one.word.double().sum() for one in weights]
     rests = [one.rest for one in weights]
     first, second = (_spaced(torch.stack(parts).sum(0)) for parts in (words, rests))
@@ -192,14 +192,14 @@ def _spaced(weight: Float[Tensor, " n"]) -> Int[Tensor, " m"]:
 
 @dataclass(frozen=True)
 class _Axes:
-    """Standardized coordinates of features."""
+    """Standardized coordinates of a scene's features."""
 
     middle: Float[Tensor, " c"]
     matrix: Float[Tensor, "c k"]
 
     @classmethod
     def of(cls, features: Float[Tensor, "n c"], head: Float[Tensor, "k c"] | None) -> _Axes:
-        """From features of a scene, and the rows that all of them are made of; None: principal components."""
+        """Build the axes from a scene's features and the rows that span them (None: principal components)."""
         known = features[features.abs().sum(1) > 0]
         middle = known.mean(0)
         if head is None:
@@ -210,7 +210,7 @@ class _Axes:
         return cls(middle, axes * torch.where(spread > _LEAST_SPREAD * spread.max(), 1 / spread, 0.0))
 
     def places(self, features: Float[Tensor, "m c"]) -> Float[Tensor, "m k"]:
-        """Coordinates of features."""
+        """Compute the coordinates of features."""
         return (features - self.middle) @ self.matrix
 
 
@@ -234,8 +234,8 @@ def _fitted(
 
 
 def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
-    """Weight of a text, by how well it tells the word from the rest: its average precision in photos where
-    all of the word is marked, or how far it ranks clicks above the rest."""
+    """Compute the weight of a text from how well it separates the word from the rest: its average precision
+    in photos where all of the word is marked, otherwise how far it ranks clicks above the rest."""
     complete = [photo.precision(text) for photo in photos if photo.complete]
     if complete:
         return _GAIN * _mean(complete)
@@ -245,8 +245,8 @@ def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
 def _logistic(
     places: Float[Tensor, "m k"], word: Float[Tensor, " m"], rest: Float[Tensor, " m"], ridge: float
 ) -> tuple[Float[Tensor, " k"], float]:
-    """Slope and bias of a logistic regression with both classes weighing the same:
-    minimizes ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
+    """Fit slope and bias of a logistic regression in which both classes weigh the same:
+    minimize ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
     from sklearn.linear_model import LogisticRegression
 
     labels, inputs, weights = _labeled(places, word / 2, rest / 2)
@@ -256,8 +256,8 @@ def _logistic(
 
 
 def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
-    """The score above which the word is: where intersection over union is best in photos whose marks are
-    complete; without any, part of the way from what is not clicked to what is."""
+    """Choose the score above which the word begins: where intersection over union is best in photos whose
+    marks are complete; without any, part of the way from what is not clicked to what is."""
     complete = [photo for photo in photos if photo.complete]
     if not complete:
         on = _mean([float(score @ photo.word) for photo in photos])
@@ -268,7 +268,7 @@ def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
         found = photo.share * photo.word[order].cumsum(0)
         overlap += found / (photo.share + (1 - photo.share) * photo.rest[order].cumsum(0))
     falls = -score[order].diff()
-    overlap[:-1][falls <= 1e-4 * falls.sum()] = 0.0  # equal scores can't be told apart
+    overlap[:-1][falls <= 1e-4 * falls.sum()] = 0.0  # no threshold separates equal scores
     best = min(int(overlap.argmax()), len(order) - 2)
     return 0.5 * float(score[order[best]] + score[order[best + 1]])
 

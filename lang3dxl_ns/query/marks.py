@@ -1,4 +1,4 @@
-"""Marks of an example, drawn into the views that the scene is measured in."""
+"""Marks of an example, drawn into the views in which the scene is measured."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.teach import MASK_SIDE, Box, Example, Point
 
 MARK_SIDE = 320
-"""Longer side in pixels of the views that marks are gathered in."""
+"""Longer side in pixels of the views in which marks are gathered."""
 _REACH = 0.01
-"""Radius of a click, in longer sides of the photo."""
+"""Radius of a click, as a fraction of the photo's longer side."""
 
 
 def marks(example: Example, photo: ScenePhoto, size: tuple[int, int]) -> Float[Tensor, "2 h w"]:
-    """Shares of the pixels of a view (height, width) that are marked as the word, and as not the word.
+    """Compute the share of each pixel of a view (height, width) marked as the word, and as not the word.
 
-    Marks are drawn on the file, and views are undistorted.
+    Marks are drawn on the photo's file, while views are undistorted.
 
     Raises:
         UserError: marks lie outside the photo, or have other proportions.
@@ -35,7 +35,7 @@ def marks(example: Example, photo: ScenePhoto, size: tuple[int, int]) -> Float[T
 
 
 def _drawn(example: Example, width: int, height: int) -> Int[Tensor, "h w"]:
-    """1 on the word, 2 on what is not, 0 elsewhere, at most `MASK_SIDE` pixels wide and high."""
+    """Draw 1 on the word, 2 on what is not the word, 0 elsewhere, on at most `MASK_SIDE` pixels a side."""
     if example.mask is not None:
         rows, columns = example.mask.shape
         if abs(columns * height - rows * width) > 0.01 * rows * width + max(width, height):
@@ -62,7 +62,7 @@ def _drawn(example: Example, width: int, height: int) -> Int[Tensor, "h w"]:
 
 
 def _cut(box: Box, width: int, height: int, place: str) -> Box:
-    """A box without what lies outside the photo. Raises UserError if nothing is left."""
+    """Clip a box to the photo. Raises UserError if nothing is left."""
     left, top, right, bottom = box
     cut = (max(left, 0), max(top, 0), min(right, width), min(bottom, height))
     if not (cut[0] < cut[2] and cut[1] < cut[3]):

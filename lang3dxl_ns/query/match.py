@@ -1,4 +1,4 @@
-"""Results of queries: views, matches, places, and their pictures. Arrays are NumPy's."""
+"""Results of queries: views, matches, places, and their pictures. Arrays are NumPy arrays."""
 
 from __future__ import annotations
 
@@ -26,62 +26,62 @@ from lang3dxl_ns.scene.camera import Camera
 
 @dataclass(frozen=True, eq=False, repr=False)
 class View:
-    """A rendering of the scene, shared by several prompts."""
+    """A rendering of the scene, which several prompts may share."""
 
     rendering: Rendering
-    """Its maps as tensors, on the scene's device."""
+    """The rendered maps as tensors, on the scene's device."""
     name: str | None = None
-    """The photo that was taken here; None for other cameras."""
+    """Name of the photo that was taken from here; None for other cameras."""
     seconds: float = 0.0
-    """Rendering time."""
+    """Time that the rendering took."""
 
     def __repr__(self) -> str:
         return f"View({_where(self)}, {self.camera.width} × {self.camera.height} pixels)"
 
     @property
     def camera(self) -> Camera:
-        """Where the view is rendered from."""
+        """The camera that the view is rendered from."""
         return self.rendering.camera
 
     @cached_property
     def pixels(self) -> UInt8[Array, "h w 3"]:
-        """The colors as bytes."""
+        """Colors of the view as bytes."""
         return as_bytes(self.rendering.rgb)
 
     @cached_property
     def alpha(self) -> Float[Array, "h w"]:
-        """Coverage, 0…1."""
+        """Coverage of every pixel, 0…1."""
         return self.rendering.alpha.cpu().numpy()
 
     @cached_property
     def depth(self) -> Float[Array, "h w"]:
-        """Distance along the camera's axis, units of the model's frame; 0 where nothing is rendered."""
+        """Distance along the camera's axis in units of the model's frame; 0 where nothing is rendered."""
         return self.rendering.depth.cpu().numpy()
 
     def save(self, path: str | Path) -> Path:
-        """Write the rendering as a picture."""
+        """Write the rendering as a picture and return its path."""
         return save_picture(self.pixels, path)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Match:
-    """Match of a prompt in a view."""
+    """Match of a prompt in one view."""
 
     prompt: Prompt
     synonyms: list[str]
     """Synonyms searched along with the prompt."""
     doubt: float
-    """Share of unrelated words that fit the scene as well: above 0.1 the scene hardly shows the prompt, or
-    CLIP doesn't know it."""
+    """Share of unrelated words that match the scene as well. Above 0.1 the scene probably does not show the
+    prompt, or CLIP does not know it."""
     view: View
     relevancy: Float[Array, "h w"]
-    """0…1; above 0.5 where the prompt beats all its competitors, 0 where nothing is rendered."""
+    """Relevancy of every pixel, 0…1: above 0.5 where the prompt beats all competitors; 0 where nothing is."""
     mask: Bool[Array, "h w"]
     """Pixels that matching Gaussians cover."""
     threshold: float
     """Relevancy above which Gaussians match."""
     seconds: float
-    """For all prompts of the call, without rendering."""
+    """Time for all prompts of the call, without rendering."""
 
     def __repr__(self) -> str:
         return (
@@ -106,13 +106,13 @@ class Match:
         return float(self.mask.mean())
 
     def overlay(self, opacity: float = 0.7, color_map: str = "turbo") -> UInt8[Array, "h w 3"]:
-        """The heat map over the rendering. Raises UserError for an unknown matplotlib color map."""
+        """Draw the heat map over the rendering. Raises UserError for an unknown matplotlib color map."""
         image, mask = self.view.rendering.rgb.cpu(), torch.from_numpy(self.mask)
         relevancy = torch.from_numpy(self.relevancy)
         return as_bytes(overlay(image, relevancy, mask, self.threshold, opacity, color_map))
 
     def save(self, path: str | Path) -> Path:
-        """Write the overlay as a picture or, if the name ends in .npy, the relevancy (float32)."""
+        """Write the overlay as a picture or, for a name that ends in .npy, the relevancy (float32)."""
         path = Path(path)
         if path.suffix != ".npy":
             return save_picture(self.overlay(), path)
@@ -123,8 +123,8 @@ class Match:
 
 
 def together(matches: Sequence[Match]) -> UInt8[Array, "h+legend w 3"]:
-    """Several prompts in one view: each in a color of its own, the strongest where they overlap, and a legend
-    below. Raises UserError if there is none, or they are of different views."""
+    """Draw several prompts in one view, each in its own color, the strongest where they overlap, with a
+    legend below. Raises UserError if there is no match, or the matches are of different views."""
     if not matches or any(match.view.pixels.shape != matches[0].view.pixels.shape for match in matches):
         raise UserError("one picture shows the prompts of one view: pass the matches of a single query")
     maps = torch.stack([torch.from_numpy(match.relevancy) for match in matches])
@@ -139,14 +139,14 @@ class Viewpoint:
     """A training camera that shows a match."""
 
     name: str
-    """Name of the photo."""
+    """Name of the training photo."""
     camera: Camera
     area: float
     """Share of the view that matches."""
     score: float
     """Mean relevancy of the most relevant thousandth of the view."""
     rank: float
-    """How well the view shows the match, 0…1 (`rank_views`)."""
+    """How well the view shows the match, 0…1, as computed by `rank_views`."""
 
     def __repr__(self) -> str:
         return f"Viewpoint({self.name!r}, rank {self.rank:.2f}, {self.area:.1%} of it matches)"
@@ -154,23 +154,23 @@ class Viewpoint:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Found:
-    """Match of a prompt in the scene."""
+    """Match of a prompt in the whole scene."""
 
     prompt: Prompt
     views: list[Viewpoint]
-    """Training views that show it, best first; empty if nothing matches."""
+    """Training views that show the match, best first; empty if nothing matches."""
     box: Box | None
-    """Around the strongest connected match; None if nothing matches."""
+    """Box around the strongest connected match; None if nothing matches."""
     relevancy: Float[Array, " n"]
     """Relevancy of every Gaussian, 0…1."""
     gaussians: Bool[Array, " n"]
-    """Those that match: the selection that masks show in 2D."""
+    """Which Gaussians match; the masks of views show the same selection in 2D."""
     doubt: float
-    """As in `Match`."""
+    """Share of unrelated words that match the scene as well, see `Match.doubt`."""
     threshold: float
     """Relevancy above which Gaussians match."""
     closest: list[Viewpoint] = field(default_factory=list)
-    """The same ranking, also of views in which nothing matches."""
+    """Best-ranked training views, including views in which nothing matches."""
 
     def __repr__(self) -> str:
         best = f"best {self.views[0].name!r}" if self.views else "nothing matches"
@@ -179,12 +179,12 @@ class Found:
 
 
 def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Array, "h w 3"]:
-    """Colors in 0…1 as bytes."""
+    """Convert colors in 0…1 to bytes."""
     return (image.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 
 def save_picture(pixels: UInt8[Array, "h w *c"], path: str | Path) -> Path:
-    """Write a picture, in the format that its name says. Raises UserError for a format without pictures."""
+    """Write a picture in the format that its name says. Raises UserError if that is no picture format."""
     path, content = Path(path), io.BytesIO()
     form = Image.registered_extensions().get(path.suffix.lower())
     if form not in ("PNG", "JPEG", "WEBP", "TIFF", "BMP"):

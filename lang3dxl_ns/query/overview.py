@@ -1,4 +1,4 @@
-"""The photo that shows a scene as a whole."""
+"""Choice of the photo that shows a scene as a whole."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lang3dxl_ns.query.run_file import ScenePhoto
 
 
 def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePhoto:
-    """The farthest photo that sees the scene's center near its own; otherwise the first."""
+    """Choose the farthest photo that sees the scene's center near its own, or else the first photo."""
     best, farthest = photos[0], 0.0
     for photo in photos:
         camera, lens = photo.camera, photo.lens

@@ -12,11 +12,11 @@ from torch import Tensor
 _OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
 STRONG = 0.5
-"""The match itself is above this fraction of the way from the threshold to the highest relevancy."""
+"""Fraction of the way from the threshold to the highest relevancy from which Gaussians are the match."""
 _CORE = 0.002
 """Share of a match's weight that a neighborhood must hold to belong to a group."""
 _MOST_POINTS = 20_000
-"""Heaviest Gaussians that are grouped: DBSCAN keeps all their neighborhoods in memory."""
+"""Most Gaussians that are grouped, the heaviest ones: DBSCAN keeps all their neighborhoods in memory."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -26,7 +26,7 @@ class Box:
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     share: float
-    """Share of the total match weight that is connected to it, 0…1."""
+    """Share of the total match weight that this box's group holds, 0…1."""
 
     def __repr__(self) -> str:
         low, high = (tuple(round(x, 3) for x in corner) for corner in (self.low, self.high))
@@ -34,7 +34,7 @@ class Box:
 
     @property
     def center(self) -> tuple[float, ...]:
-        """The box's center."""
+        """Center of the box."""
         return tuple((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
 
 
@@ -45,15 +45,15 @@ def strongest_match(
     threshold: float,
     gap: float,
 ) -> Box | None:
-    """Box of the connected Gaussians that match best; None if none does.
+    """Find the box of the connected Gaussians that match best; None if none does.
 
     Only Gaussians more than half-way from the threshold to the best count, so that weaker matches beside the
-    strongest don't widen its box. DBSCAN tells groups apart.
+    strongest don't widen its box. DBSCAN separates the groups.
 
     Args:
         means: centers, world units.
-        scores: relevancy, 0…1.
-        mass: pixels that each fills, over all views.
+        scores: relevancy of each Gaussian, 0…1.
+        mass: pixels that each Gaussian fills, over all views.
         threshold: relevancy above which a Gaussian matches.
         gap: world units that divide two groups.
     """
@@ -67,19 +67,19 @@ def strongest_match(
 
 
 def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
-    """Boxes of the groups that points form, each point within `gap` of others of its group.
+    """Group points, each within `gap` of others of its group, and return the groups' boxes.
 
     Args:
         means: centers, world units; at least one.
-        weight: of each, above 0.
+        weight: weight of each point, above 0.
         gap: world units that divide two groups.
     """
     heaviest = weight.argsort(descending=True)[:_MOST_POINTS]
     points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
-    from sklearn.cluster import DBSCAN  # takes a second to import
+    from sklearn.cluster import DBSCAN  # imported here, since the import takes a second
 
     found = DBSCAN(eps=gap, min_samples=1).fit_predict(points, sample_weight=share / (share.sum() * _CORE))
-    if (found < 0).all():  # no dense place: the heaviest Gaussian
+    if (found < 0).all():  # no place is dense: take the heaviest Gaussian
         found = np.where(np.arange(len(found)) == share.argmax(), 0, -1)
     totals = np.bincount(found[found >= 0], weights=share[found >= 0]) / share.sum()
     return [_around(points[found == i], float(total)) for i, total in enumerate(totals)]
@@ -91,7 +91,7 @@ def _around(points: Float64[Array, "n 3"], share: float) -> Box:
 
 
 def _high(scores: Float[Tensor, " n"], mass: Float[Tensor, " n"]) -> float:
-    """Relevancy that 2 % of the matching mass exceed: the highest, without stray Gaussians."""
+    """Return the relevancy that 2 % of the matching mass exceed: the highest, apart from stray Gaussians."""
     order = scores.argsort(descending=True)
     share = mass[order].cumsum(0) / mass.sum()
     return float(scores[order][int((share < _OUTLIERS).sum().clamp_max(len(order) - 1))])

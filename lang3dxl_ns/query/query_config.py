@@ -16,26 +16,26 @@ class QueryConfig:
     """Settings of queries."""
 
     text: TextConfig = field(default_factory=TextConfig)
-    """Synonyms, their combination, canonical phrases."""
+    """How prompts become vectors: synonyms, their combination, and negatives."""
     temperature: float = TEMPERATURE
     """Softmax temperature of the relevancy, for an encoder whose cosines spread like the built-in CLIP's;
-    those of others are scaled. Changes neither the ranking of Gaussians nor what matches."""
+    cosines of other encoders are scaled. It changes neither the ranking of Gaussians nor what matches."""
     threshold: float | None = None
-    """Relevancy above which Gaussians match (default: what stands out in the scene, at most 0.5)."""
+    """Relevancy above which Gaussians match. Default: set by what stands out in the scene, at most 0.5."""
     min_alpha: float = 0.3
-    """Coverage below which a pixel can't match."""
+    """Coverage below which a pixel cannot match."""
     foreground: str = ""
-    """Restrict matches to what this prompt finds, such as `building`; for views without a mask. The view of a
-    photo with a foreground mask is always restricted to it."""
+    """Restrict matches in views without a mask to what this prompt finds, such as `building`. The view of a
+    photo with a foreground mask is always restricted to that mask."""
     size: int | None = None
-    """Longer side of pictures in pixels (default: the photo's own, at most 1920)."""
+    """Longer side of pictures in pixels. Default: the photo's own, at most 1920."""
     views: int = 100
     """Number of training views, evenly spread, that `find` chooses from."""
     view_side: int = 256
-    """Pixels of their longer side, for measuring which Gaussians they show."""
+    """Longer side in pixels of the views in which visible Gaussians are measured."""
 
     def __post_init__(self) -> None:
-        """Raises UserError for invalid options."""
+        """Raise UserError if an option is invalid."""
         check_numbers(self, _BOUNDS)
 
 

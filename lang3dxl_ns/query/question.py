@@ -1,7 +1,7 @@
 """A question: prompts put to one scene, and everything that their answers share.
 
-Whoever shows matches, in pixels or in Gaussians, goes through a question. So thresholds, doubt and the
-restriction to a foreground are decided here and nowhere else.
+All code that shows matches, in pixels or in Gaussians, goes through a question. Thresholds, doubt and the
+restriction to a foreground are therefore decided here and nowhere else.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from lang3dxl_ns.rendering.render import Rendering
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Question:
-    """Prompts, their vectors, and the levels from which places of the scene match them."""
+    """Prompts, their vectors, and the thresholds above which places of the scene match them."""
 
     engine: QueryEngine
     prompts: tuple[Prompt, ...]
     queries: Queries
-    """Vectors of the prompts, then those of the foreground prompts, if any."""
+    """Vectors of the prompts, followed by those of the foreground prompts, if any."""
     doubts: tuple[float, ...] = ()
-    """Per prompt, the share of unrelated words that fit the scene as well."""
+    """Share of unrelated words that match the scene as well, one per prompt."""
     thresholds: tuple[float, ...] = ()
     """Relevancy above which Gaussians match, one per prompt."""
     foreground_thresholds: tuple[float, ...] = ()
-    """The same for the foreground prompts."""
+    """Relevancy above which Gaussians match, one per foreground prompt."""
     min_alpha: float = 0.3
     """Coverage below which a pixel matches nothing."""
 
@@ -43,8 +43,8 @@ class Question:
 
     @cached_property
     def channels(self) -> Float[Tensor, "n d"]:
-        """Values that Gaussians carry in a rendering that answers the question: the engine's, then a 1 for
-        each prompt that they match."""
+        """Values that Gaussians carry in a rendering that answers the question: the engine's channels, then a
+        1 for each prompt that they match."""
         own = self.engine.channels(self.queries)
         return torch.cat([own, self.gaussians.T.to(own)], dim=1)
 
@@ -55,21 +55,21 @@ class Question:
 
     @cached_property
     def gaussians(self) -> Bool[Tensor, "q n"]:
-        """Which Gaussians match each prompt."""
+        """Mask of the Gaussians that match each prompt."""
         return matching(self.relevancy, self.thresholds)
 
     @torch.no_grad()
     def maps(
         self, rendering: Rendering, foreground: Bool[Tensor, "h w"] | None = None
     ) -> tuple[Float[Tensor, "q h w"], Bool[Tensor, "q h w"]]:
-        """Relevancy of every pixel to every prompt, 0…1, and the pixels that match: those that matching
-        Gaussians cover, so that a view shows the scene's selection.
+        """Compute the relevancy of every pixel to every prompt, 0…1, and the pixels that match: those covered
+        by matching Gaussians, so that a view shows the scene's selection.
+
+        Pixels outside the foreground, and those that the scene hardly covers, are 0 and match nothing.
 
         Args:
             rendering: a view with `channels`, composited at its size or at another.
             foreground: pixels that may match, at any size; None for all.
-
-        Pixels outside the foreground, and those that the scene hardly covers, are 0 and match nothing.
         """
         assert rendering.channels is not None
         keep, size = rendering.alpha >= self.min_alpha, (rendering.camera.height, rendering.camera.width)
@@ -84,7 +84,7 @@ class Question:
         return maps[:count] * keep, (maps[count:] >= COVERED) & keep
 
     def _confined(self, relevancy: Float[Tensor, "all ..."]) -> Float[Tensor, "q ..."]:
-        """Relevancy to the prompts, 0 where no foreground prompt matches."""
+        """Return the relevancy to the prompts, set to 0 where no foreground prompt matches."""
         count = len(self.prompts)
         wanted, within = relevancy[:count], relevancy[count:]
         if not len(within):

@@ -14,25 +14,25 @@ from lang3dxl_ns.query.places import STRONG
 from lang3dxl_ns.query.visibility import VisibleGaussians
 
 PEAK = 1e-3
-"""Share of a view that its peak is the mean of: a small thing, not one stray Gaussian."""
+"""Share of a view over which its peak is averaged, so that one stray Gaussian does not decide."""
 LARGE = 0.2
-"""Share of a view beyond which a larger match shows no better."""
+"""Share of a view above which larger matches score no higher."""
 RIM = 0.25
-"""Weight of a match at a view's rim, where it is likely cut off; 1 in the middle half."""
+"""Weight of a match at a view's rim, where it is likely cut off; it is 1 in the middle half."""
 
 
 @dataclass(frozen=True)
 class ViewRank:
-    """How well one view shows a match."""
+    """Measures of how well one view shows a match."""
 
     area: float
     """Share of the view that matches."""
     peak: float
     """Mean relevancy of the most relevant thousandth of the view, 0…1."""
     shown: bool
-    """Whether the match fills as much as a pixel."""
+    """Whether the match fills at least one pixel."""
     rank: float
-    """0…1: closeness of the peak to the scene's highest, times size, times centeredness."""
+    """Score of the view, 0…1: closeness of its peak to the scene's highest, times size, times centering."""
 
 
 def rank_views(
@@ -41,16 +41,16 @@ def rank_views(
     scores: Float[Tensor, " n"],
     threshold: float,
 ) -> dict[str, ViewRank]:
-    """The rank of every view, from the pixels that Gaussians fill in it (hidden ones fill none); those that
-    show the match first, best first.
+    """Rank every view by the pixels that Gaussians fill in it (hidden ones fill none). Views that show the
+    match come first, best first.
 
-    The peak comes first: only Gaussians half-way or more from the threshold to the highest peak of all views
-    count as the match, so that four lukewarm windows don't outrank the one rose window. Where no peak
-    reaches the threshold, the scene's median relevancy takes its place: the views that come closest lead.
+    The peak matters most: only Gaussians half-way or more from the threshold to the highest peak of all views
+    count as the match, so that four lukewarm windows don't outrank the one rose window. If no peak reaches
+    the threshold, the scene's median relevancy takes its place, and the views that come closest lead.
     """
     if not views:
         return {}
-    # Numbers stay on the device until the end: a GPU would be waited for at each.
+    # Numbers stay on the device until the end, since reading each would wait for a GPU.
     peaks = torch.stack([_peak(view, scores) for view in views.values()])
     top = peaks.amax()
     low = torch.where(top > threshold, threshold, scores.median())
@@ -74,7 +74,7 @@ def rank_views(
 
 
 def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, ""]:
-    """Mean relevancy of the most relevant share `PEAK` of a view."""
+    """Compute the mean relevancy of the most relevant share `PEAK` of a view."""
     order = scores[view.rows].argsort(descending=True)
     shares = view.shares[order]
     before = shares.cumsum(0) - shares
@@ -83,7 +83,7 @@ def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, 
 
 
 def _centeredness(view: VisibleGaussians, means: Float[Tensor, "n 3"]) -> Float[Tensor, " m"]:
-    """1 for Gaussians in the middle half of a view, falling to `RIM` at its rim."""
+    """Compute weights of 1 for Gaussians in the middle half of a view, falling to `RIM` at its rim."""
     camera = view.camera
     pose = to_device(camera.view_matrix.to(means.dtype), means.device)
     points = means[view.rows] @ pose[:3, :3].T + pose[:3, 3]

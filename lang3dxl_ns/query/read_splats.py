@@ -29,17 +29,17 @@ from lang3dxl_ns.rendering.splats import Splats, harmonics_of
 
 KINDS = ".ply, .spz, .splat, a checkpoint of gsplat (.pt) or nerfstudio (.ckpt), or a run's folder"
 _IN_FOLDERS = ("*.ckpt", "nerfstudio_models/*.ckpt", "ckpts/*.pt", "point_cloud/iteration_*/point_cloud.ply")
-"""Where programs leave splats in the folder of a run."""
+"""Patterns of the files in which programs leave splats in a run's folder."""
 _MOST_DAMAGE = 0.5
 """Share of Gaussians with NaN or infinite values above which a file is refused."""
 _HEADER = 1 << 16
-"""Most bytes of a PLY's header."""
+"""Most bytes that the header of a PLY may take."""
 _ALL_BANDS = 16
-"""Harmonics of degree 3; those of higher degrees are dropped."""
+"""Number of harmonics up to degree 3; those of higher degrees are dropped."""
 
 
 def find_splats(path: str | Path) -> Path:
-    """The file of a splat: the path itself, or the latest file in a run's folder.
+    """Find the file of a splat: the path itself, or the latest file in a run's folder.
 
     Raises:
         UserError: there is none.
@@ -56,9 +56,9 @@ def find_splats(path: str | Path) -> Path:
 
 
 def read_splats(path: str | Path) -> Splats:
-    """Read the Gaussians of a file, all of them and in its order.
+    """Read all Gaussians of a file, in the file's order.
 
-    Gaussians with NaN or infinite values keep their place, without size and opacity.
+    Gaussians with NaN or infinite values keep their place, but lose their size and opacity.
 
     Args:
         path: .ply (as 3D Gaussian splatting writes it, or compressed by SuperSplat), .spz, .splat, a gsplat
@@ -87,7 +87,7 @@ def read_splats(path: str | Path) -> Splats:
 
 
 class _OtherKindError(Exception):
-    """The file is sound, but holds no Gaussians."""
+    """Raised for an undamaged file that holds no Gaussians."""
 
 
 def _number(file: Path) -> int:
@@ -95,7 +95,7 @@ def _number(file: Path) -> int:
 
 
 def _finite(splats: Splats, path: Path) -> Splats:
-    """The same Gaussians, those with NaN or infinite values made invisible."""
+    """Return the same Gaussians, with those that have NaN or infinite values made invisible."""
     if not len(splats):
         raise UserError(f"{path} holds no Gaussian: export it again")
     sound = splats.sound() & (splats.means.abs() < 1e9).all(1) & (splats.scales >= 0).all(1)
@@ -117,7 +117,7 @@ def _finite(splats: Splats, path: Path) -> Splats:
 
 
 def _check_memory(count: int, bands: int) -> None:
-    """Raises UserError if Gaussians don't fit into memory, read and activated."""
+    """Raise UserError if Gaussians don't fit into memory when they are read and activated."""
     needed, there = 3 * 4 * count * (11 + 3 * bands), machine_memory()
     if needed > there:
         raise UserError(
@@ -129,7 +129,7 @@ def _check_memory(count: int, bands: int) -> None:
 def _activated(
     means: Any, log_scales: Any, quats: Any, logits: Any, harmonics: Any, antialiased: bool = False
 ) -> Splats:
-    """Splats from what files store: logarithms of scales, logits of opacities, harmonics [n, k, 3]."""
+    """Build splats from stored values: logarithms of scales, logits of opacities, harmonics [n, k, 3]."""
     means, log_scales, quats, logits, harmonics = map(_tensor, (means, log_scales, quats, logits, harmonics))
     bands = harmonics.shape[1]
     expect(isqrt(bands) ** 2 == bands, f"it has {bands} harmonics per color")
@@ -152,7 +152,7 @@ _PLY_TYPES = {
 }
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
 _Tables = dict[str, tuple[int, "np.dtype[Any]"]]
-"""Length and row of each table of a PLY, by its name, in the file's order."""
+"""Length and row type of each table of a PLY, by its name, in the file's order."""
 
 
 def _ply(path: Path) -> Splats:
@@ -179,7 +179,7 @@ def _ply(path: Path) -> Splats:
 
 
 def _ply_header(file: BinaryIO) -> tuple[str, _Tables]:
-    """The format and the tables of a PLY; the file is left at the first of them."""
+    """Read the format and the tables of a PLY, and leave the file at the first table's data."""
     head = file.read(_HEADER)
     expect(head.startswith(b"ply"), "it doesn't begin like a PLY")
     end = re.search(rb"end_header\r?\n", head)
@@ -196,7 +196,7 @@ def _ply_header(file: BinaryIO) -> tuple[str, _Tables]:
                 columns = []
                 listed[name] = (int(count), columns)
             case ["property", "list", *_, column]:
-                columns.append((column, "V0"))  # follow the vertices in meshes, and are never read
+                columns.append((column, "V0"))  # lists follow the vertices in meshes, and are never read
             case ["property", kind, column]:
                 columns.append((column, order + _PLY_TYPES[kind]))
     file.seek(end.end())
@@ -204,7 +204,7 @@ def _ply_header(file: BinaryIO) -> tuple[str, _Tables]:
 
 
 def _of_table(table: Any) -> Splats:
-    """Splats from the columns that 3D Gaussian splatting writes."""
+    """Build splats from the columns that 3D Gaussian splatting writes."""
 
     def columns(*names: str) -> Float[Tensor, "n k"]:
         return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in names], axis=1))
@@ -215,10 +215,10 @@ def _of_table(table: Any) -> Splats:
         first = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     else:
         first = harmonics_of(columns("red", "green", "blue") / 255)
-    # Channel by channel.
+    # Coefficients are stored channel by channel.
     others = columns(*rest).reshape(len(first), 3, -1).mT if rest else first[:, :0]
     scales = columns("scale_0", "scale_1")
-    # A flat Gaussian (2D Gaussian splatting) has two scales.
+    # A flat Gaussian (2D Gaussian splatting) has only two scales.
     third = columns("scale_2") if "scale_2" in known else scales.amin(1, keepdim=True) - 5
     quats, harmonics = columns("rot_0", "rot_1", "rot_2", "rot_3"), torch.cat([first, others], dim=1)
     scales = torch.cat([scales, third], dim=1)
@@ -226,7 +226,7 @@ def _of_table(table: Any) -> Splats:
 
 
 def _supersplat(path: Path, tables: _Tables) -> Splats:
-    """SuperSplat's compressed PLY, in chunks of 256 Gaussians."""
+    """Read SuperSplat's compressed PLY, which stores chunks of 256 Gaussians."""
     import gsply
 
     count, chunks = tables["vertex"][0], tables["chunk"][0]
@@ -247,7 +247,7 @@ def _of_gsply(data: Any) -> Splats:
 
 
 def _spz(path: Path) -> Splats:
-    """Niantic's compressed format."""
+    """Read Niantic's compressed format."""
     import gsply
 
     with path.open("rb") as file:
@@ -266,7 +266,7 @@ _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), 
 
 
 def _splat(path: Path) -> Splats:
-    """The format of the first viewers for the web: 32 bytes each, one color."""
+    """Read the format of the first web viewers: 32 bytes per Gaussian, with one color."""
     size = path.stat().st_size
     expect(size % _SPLAT.itemsize == 0, f"{size} bytes are not whole Gaussians of {_SPLAT.itemsize} bytes")
     _check_memory(size // _SPLAT.itemsize, 1)
@@ -278,8 +278,8 @@ def _splat(path: Path) -> Splats:
 
 
 class _NumPyScalar:
-    """Stands in for what pickles make NumPy's scalars of, such as a trainer's learning rates, which are never
-    needed: it takes every argument and does nothing."""
+    """Placeholder for NumPy's scalars in pickles, such as a trainer's learning rates, which are never needed.
+    It takes every argument and does nothing."""
 
     def __init__(self, *_: Any) -> None: ...
 
@@ -288,9 +288,9 @@ class _NumPyScalar:
 
 _SCALARS = (
     *("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar", "numpy.dtype"),
-    "_codecs.encode",  # their bytes, in the pickles that torch.save writes
+    "_codecs.encode",  # makes their bytes, in the pickles that torch.save writes
 )
-"""Names in pickles for which `_NumPyScalar` stands in."""
+"""Names in pickles that `_NumPyScalar` replaces."""
 
 
 def _checkpoint(path: Path) -> Splats:
@@ -308,7 +308,7 @@ def _checkpoint(path: Path) -> Splats:
 
 
 def _gsplat(parts: Mapping[str, Any]) -> Splats:
-    """What gsplat's example trainers save."""
+    """Build splats from what gsplat's example trainers save."""
     _check_parts(parts, ("means", "scales", "quats", "opacities"))
     if "sh0" not in parts:
         raise UserError(
@@ -320,12 +320,12 @@ def _gsplat(parts: Mapping[str, Any]) -> Splats:
 
 
 def _splatfacto(pipeline: Mapping[str, Any], path: Path) -> Splats:
-    """nerfstudio's splatfacto, of any version: older ones call the means _model.means."""
+    """Build splats from nerfstudio's splatfacto of any version; older ones call the means _model.means."""
     names = {name: re.fullmatch(r"_model\.(?:gauss_params\.)?([^.]+)", name) for name in pipeline}
     own = {found[1]: pipeline[name] for name, found in names.items() if found}
     _check_parts(own, ("means", "scales", "quats", "opacities", "features_dc", "features_rest"))
     first, rest = own["features_dc"].float().reshape(-1, 1, 3), own["features_rest"].float()
-    if not rest.shape[1]:  # colors themselves, as logits
+    if not rest.shape[1]:  # the colors themselves, as logits
         first = harmonics_of(first[:, 0].sigmoid())
     config = path.parent.parent / "config.yml"
     antialiased = config.is_file() and "rasterize_mode: antialiased" in config.read_text(errors="replace")

@@ -15,11 +15,11 @@ from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import check_regular
 
 NOT_A_CHECKPOINT = (*DAMAGE, pickle.UnpicklingError)
-"""Exceptions raised on reading a file that is not a checkpoint."""
+"""Exceptions raised when a file that is not a checkpoint is read."""
 
 
 def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
-    """Path and content of the latest checkpoint in a folder, on the CPU, loaded without executing code.
+    """Load the latest checkpoint in a folder on the CPU, without executing code; return its path and content.
 
     Raises UserError if there is none, or it is damaged, or not a run's checkpoint.
     """
@@ -31,7 +31,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Content of a checkpoint of any nerfstudio run, on the CPU. Raises UserError for another file."""
+    """Load the content of any nerfstudio run's checkpoint on the CPU. Raises UserError for another file."""
     try:
         check_regular(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
@@ -59,9 +59,9 @@ def _no_checkpoint(path: Path, why: object) -> UserError:
 
 
 def check_checkpoint(place: Path) -> None:
-    """Verify the checksums of the checkpoint at a path, or of the latest in a folder.
+    """Verify the checksums of the checkpoint at a path, or of the latest one in a folder.
 
-    Raises UserError if it is damaged. A folder without checkpoints is fine: runs start that way.
+    Raises UserError if it is damaged. A folder without checkpoints is accepted, since runs start with one.
     """
     checkpoints = sorted(place.glob("step-*.ckpt")) if place.is_dir() else [place]
     if not checkpoints or not checkpoints[-1].exists():

@@ -1,6 +1,6 @@
 """Scene description in a run's folder: the photos' names and cameras, and the CLIP.
 
-Written when training starts, so that a finished run can be queried without its photos.
+It is written when training starts, so that a finished run can be queried without its photos.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.photo import Photo
 
 SCENE_FILE = "lang3dxl_scene.json"
-"""File name, beside config.yml."""
+"""Name of the scene description, which lies beside config.yml."""
 _VERSION = 2
 
 
@@ -41,13 +41,13 @@ class ScenePhoto:
     name: str
     split: Literal["train", "eval"]
     camera_to_world: list[list[float]]
-    """[3, 4], the model's frame, nerfstudio's camera axes (x right, y up, z backward)."""
+    """Pose [3, 4] in the model's frame, nerfstudio's camera axes (x right, y up, z backward)."""
     lens: Lens
-    """Lens of the file: masks are drawn on the distorted photo, while views are undistorted."""
+    """Lens of the photo's file: masks are drawn on the distorted photo, while views are undistorted."""
     mask: str | bytes | None = None
-    """Foreground mask of the photo: its file, or the content of a PNG of the undistorted mask."""
+    """Foreground mask of the photo: its file, or the bytes of a PNG with the undistorted mask."""
     size: tuple[int, int] | None = None
-    """Width and height of the file; None in runs of earlier versions: that of the lens."""
+    """Width and height of the file; None in runs of earlier versions, where the lens's size is used."""
 
     def __repr__(self) -> str:
         width, height = self.file_size
@@ -56,7 +56,7 @@ class ScenePhoto:
 
     @property
     def file_size(self) -> tuple[int, int]:
-        """Width and height of the file."""
+        """Width and height of the photo's file in pixels."""
         return self.size or (self.lens.width, self.lens.height)
 
     @property
@@ -66,7 +66,7 @@ class ScenePhoto:
 
     @property
     def full_camera(self) -> Camera:
-        """The camera at the file's resolution."""
+        """The camera at the file's resolution, for the rasterizer."""
         return self.lens.resized(*self.file_size).camera(self._view_matrix)
 
     @property
@@ -75,11 +75,11 @@ class ScenePhoto:
 
     @property
     def pose(self) -> Float64[Array, "4 4"]:
-        """Camera → world in the model's frame, nerfstudio's axes."""
+        """Pose [4, 4], camera → world in the model's frame, nerfstudio's axes."""
         return self.camera.pose
 
     def photo(self, folder: Path = Path()) -> Photo:
-        """The photo in its folder; without its mask if that is gone."""
+        """Return the photo in its folder, without its mask if the mask's file is gone."""
         mask = Path(self.mask) if isinstance(self.mask, str) else None
         return Photo(
             name=self.name,
@@ -89,9 +89,9 @@ class ScenePhoto:
         )
 
     def foreground(self, size: tuple[int, int] | None = None) -> Bool[Tensor, "h w"] | None:
-        """The photo's undistorted foreground; None if it has no mask, or the mask is gone.
+        """Read the photo's undistorted foreground; None if it has no mask, or the mask is gone.
 
-        size: height and width in pixels; default: as the mask is stored.
+        size: height and width in pixels; default: the size of the stored mask.
         """
         if isinstance(self.mask, bytes):
             pixels = np.array(Image.open(io.BytesIO(self.mask)).convert("1"))
@@ -105,20 +105,20 @@ class ScenePhoto:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """The contents of the file."""
+    """Contents of a run's scene description."""
 
     photos: list[ScenePhoto]
     """Training photos, then held-out ones."""
     clip: str | None
-    """Folder or name of the CLIP that made the targets; None for a run of colors only."""
+    """Folder or name of the CLIP that made the targets; None for a run with colors only."""
     clip_identity: str | None
-    """Fingerprint of its weights."""
+    """Fingerprint of the CLIP's weights."""
     scale: float
-    """The model's frame = scale · transform · COLMAP's frame."""
+    """Factor in: model's frame = scale · transform · COLMAP's frame."""
     transform: list[list[float]]
-    """[3, 4]."""
+    """Matrix [3, 4] that precedes `scale`."""
     data: str
-    """Folder that the photos came from."""
+    """Folder of the photos that the run was trained on."""
 
     def write(self, path: Path) -> None:
         """Write the file, atomically."""
@@ -141,9 +141,9 @@ class SceneFile:
             raise UserError(f"{path} can't be read ({error}): restore it, or train anew") from error
 
     def photo(self, name: str) -> ScenePhoto:
-        """The photo with this name, or with this file name or stem if that is unique.
+        """Find the photo with this name, or with this file name or stem if only one photo has it.
 
-        Raises UserError with similar names if there is none.
+        Raises UserError, which names similar photos, if there is none.
         """
         for form in (str, lambda n: PurePosixPath(n).name, lambda n: PurePosixPath(n).stem):
             found = [photo for photo in self.photos if form(photo.name) == name]
@@ -157,7 +157,7 @@ class SceneFile:
 
 
 def scene_from_json(content: dict[str, Any]) -> SceneFile:
-    """The description in a JSON object, after validating all its values.
+    """Build the description from a JSON object, after validating all its values.
 
     Raises ValueError, KeyError, TypeError or AttributeError for anything else.
     """
@@ -189,7 +189,7 @@ def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
 
 
 def read_camera_path(path: Path) -> Sequence[Camera]:
-    """Cameras of a camera path saved by nerfstudio's viewer. Raises UserError for other files."""
+    """Read the cameras of a camera path saved by nerfstudio's viewer. Raises UserError for other files."""
     try:
         content = read_json(path)
         width, height = int(content["render_width"]), int(content["render_height"])

@@ -28,21 +28,21 @@ _MOVED = {
         "model_config.Lang3DXLModelConfig": "model.Lang3DXLModelConfig",
     }.items()
 }
-"""Where settings are that earlier versions kept elsewhere."""
+"""New module paths of settings classes that earlier versions kept elsewhere."""
 _REMOVED = {"DecoderConfig": ("start",)}
-"""Settings of earlier versions, by their class, that only training read: a finished run opens without."""
+"""Settings of earlier versions, by class, that only training read; a finished run opens without them."""
 _OURS = re.compile(r"lang3dxl(_|%5f)ns\.|method_name\W+lang3dxl", re.IGNORECASE)
-"""What a run of this package's has in its config.yml: the package's classes, or a method's name."""
+"""Pattern that marks a config.yml as this package's: one of its classes, or a method's name."""
 _DAMAGED = (LookupError, TypeError, AttributeError, ValueError, RecursionError, ImportError)
-"""Exceptions raised on making settings of values that are none."""
+"""Exceptions raised when settings are built from invalid values."""
 _UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
-"""nerfstudio's classes that unpickle what they read."""
+"""Names of nerfstudio classes that unpickle what they read."""
 
 
 def read_model_config(path: Path) -> tuple[Any, Path]:
-    """The model's settings of a run, and the folder of its checkpoints, relative to the run's: as
-    `read_settings`, but without loading what the other settings belong to. Settings that an earlier version
-    did not have take their defaults: the checkpoint beside the file tells whether they fit."""
+    """Read the settings of a run's model, and the folder of its checkpoints, relative to the run's. This
+    works as `read_settings`, but does not load what the other settings belong to. Settings that an earlier
+    version did not have take their defaults, and the checkpoint beside the file shows whether those match."""
     model, checkpoints = read_settings(path, [("pipeline", "model"), ("relative_model_dir",)], complete=True)
     if not is_dataclass(model) or not isinstance(checkpoints, Path):
         raise no_config(path)
@@ -50,16 +50,17 @@ def read_model_config(path: Path) -> tuple[Any, Path]:
 
 
 def read_settings(path: Path, places: Sequence[Sequence[str]], complete: bool = False) -> list[Any]:
-    """Settings in a run's config.yml. The file is parsed as data only: settings, paths, and classes by name
-    from nerfstudio and this package (nerfstudio's own commands call whatever a file names).
+    """Read settings from a run's config.yml. The file is parsed as data only: settings, paths, and classes by
+    name from nerfstudio and this package (nerfstudio's own commands call whatever a file names).
 
     Args:
         path: the file.
-        places: which settings, each named from the outermost in; () for all. None where there are none.
+        places: the settings to read, each as a path of names from the outermost in; () for all. The result is
+            None where there are none.
         complete: give missing settings their defaults.
 
     Raises:
-        UserError: the file is missing, damaged, or of another version, or asks for more than settings.
+        UserError: the file is missing, damaged, or of another version, or requests more than settings.
     """
     try:
         found = _construct(read_text(path), places)
@@ -100,12 +101,12 @@ def _at(node: yaml.Node | None, place: Sequence[str]) -> yaml.Node | None:
 
 
 def no_config(path: Path) -> UserError:
-    """The error of a file that holds other settings than a run's."""
+    """Return the error for a file that is not a run's config.yml."""
     return UserError(f"{path} is not the config.yml of a nerfstudio run")
 
 
 def _differences(settings: Any, place: str = "") -> Iterator[str]:
-    """Settings that a file lacks or should not have, by their dotted names."""
+    """Yield a description of each setting that a file lacks or should not have, by its dotted name."""
     known = {field.name for field in fields(settings)}
     hints = _hints(type(settings))  # type: ignore[arg-type]
     yield from (f"lacks the setting {place}{name}" for name in sorted(known - set(vars(settings))))
@@ -139,12 +140,12 @@ def _default(settings: Any, name: str) -> Any:
 def _hints(settings: type) -> dict[str, Any]:
     try:
         return get_type_hints(settings)
-    except NameError:  # a type that another package imports for its type checker alone
+    except NameError:  # a type that another package imports only for type checkers
         return {}
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of a setting's type, where that is a plain one."""
+    """Return whether a value is of a setting's type, if that is a plain one."""
     kind, parts = get_origin(hint), get_args(hint)
     if kind is Literal:
         return value in parts
@@ -163,11 +164,12 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 def check_command_line(arguments: Sequence[str]) -> None:
-    """Exit from an `ns-…` command whose `--load-config` file is a run of this method's and holds more than
-    settings, or can't be looked at before nerfstudio reads it: a pipe, or a device.
+    """Exit from an `ns-…` command whose `--load-config` file is a run of this method and holds more than
+    settings, or cannot be checked before nerfstudio reads it (a pipe, or a device).
 
-    nerfstudio calls whatever such a file names. It imports the methods first, this one among them, which is
-    the earliest moment a plugin can check. Files that do not name this package are left to nerfstudio.
+    nerfstudio calls whatever such a file names. It imports the methods first, including this one, and that is
+    the earliest moment at which a plugin can check. Files that do not name this package are left to
+    nerfstudio.
     """
     for path in load_configs(arguments):
         if os.environ.get(TRUST_VARIABLE) != "1" and (why := _trouble(path)):
@@ -177,7 +179,7 @@ def check_command_line(arguments: Sequence[str]) -> None:
 
 
 def load_configs(arguments: Sequence[str]) -> Iterator[Path]:
-    """Files that the arguments of a command name with --load-config."""
+    """Yield the files that a command's arguments name with --load-config."""
     for i, argument in enumerate(arguments):
         option, equals, value = argument.partition("=")
         if option.replace("_", "-") == "--load-config":
@@ -187,7 +189,7 @@ def load_configs(arguments: Sequence[str]) -> Iterator[Path]:
 
 
 def _trouble(path: Path) -> str | None:
-    """Why a file may not be passed on to nerfstudio; None if it may."""
+    """Return why a file may not be passed on to nerfstudio; None if it may."""
     try:
         text = read_text(path)
         if _OURS.search(text):
@@ -197,15 +199,15 @@ def _trouble(path: Path) -> str | None:
     except (yaml.constructor.ConstructorError, *_DAMAGED) as error:
         return f"holds more than settings ({in_a_line(error)})"
     except yaml.YAMLError:
-        pass  # the command can't read it either
+        pass  # nerfstudio's command cannot read it either
     return None
 
 
 class _SettingsLoader(yaml.UnsafeLoader):
-    """Constructs only settings, paths and enumeration members."""
+    """YAML loader that constructs only settings, paths and enumeration members."""
 
     def find_python_name(self, name: str, mark: Any) -> Any:  # type: ignore[override]
-        """A class from the packages that define settings."""
+        """Find a class in the packages that define settings."""
         name = _MOVED.get(name, name)
         if not name.startswith(tuple(f"{package}." for package in _PACKAGES)):
             raise yaml.constructor.ConstructorError(None, None, f"it asks for {name}", mark)
@@ -217,11 +219,11 @@ class _SettingsLoader(yaml.UnsafeLoader):
         return found
 
     def find_python_module(self, name: str, mark: Any) -> Any:  # type: ignore[override]
-        """Modules are rejected: settings contain none."""
+        """Reject modules, which settings never contain."""
         raise yaml.constructor.ConstructorError(None, None, f"it asks for the module {name}", mark)
 
     def set_python_instance_state(self, instance: Any, state: Any) -> None:
-        """Settings as they were saved, but for those that are gone."""
+        """Set the settings as they were saved, except for those that no longer exist."""
         for name in _REMOVED.get(type(instance).__name__, ()):
             state.pop(name, None)
         super().set_python_instance_state(instance, state)
@@ -229,11 +231,11 @@ class _SettingsLoader(yaml.UnsafeLoader):
     def make_python_instance(
         self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False
     ) -> Any:
-        """Settings (without calling them), paths and enumeration members."""
+        """Construct settings (without calling them), paths and enumeration members."""
         kind = self.find_python_name(suffix, node.start_mark)
         if not (is_dataclass(kind) and newobj) and not issubclass(kind, PurePath | Enum):
             raise yaml.constructor.ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
-        if issubclass(kind, PurePath):  # of whichever system the run was made on
+        if issubclass(kind, PurePath):  # paths of the system on which the run was made
             written = PureWindowsPath if issubclass(kind, PureWindowsPath) else PurePosixPath
             return Path(written(*args).as_posix())
         return super().make_python_instance(suffix, node, args, kwds, newobj)

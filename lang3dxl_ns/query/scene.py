@@ -1,4 +1,4 @@
-"""`Scene`: a finished scene that one can look at and ask, as data."""
+"""`Scene`: a finished scene that can be rendered and queried."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, resized
 
 _ROWS = 65_536
-"""Gaussians decoded at a time."""
+"""Number of Gaussians decoded at a time."""
 NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
 Text: TypeAlias = str | Prompt | Float[Tensor, " c"] | Float[Array, " c"]
 """A text as `parse_prompts` reads it, or a vector in the space of the scene's CLIP."""
@@ -53,13 +53,13 @@ Text: TypeAlias = str | Prompt | Float[Tensor, " c"] | Float[Array, " c"]
 class Scene(ViewedScene):
     """A scene: Gaussians, what they mean, and the photos they were made from.
 
-    It is data, and never changes; what is computed from it once (decoded features, the Gaussians that each
-    photo shows) is kept. Any number of threads may use one scene.
+    The scene never changes. Results that are computed from it once (decoded features, the Gaussians that each
+    photo shows) are kept. Any number of threads may use one scene.
 
     Args:
         splats, looks, background, cache, backend, watch: see `ViewedScene`.
         file: photos, cameras, and the CLIP that the features come from.
-        decoder: turns codes into features; None for a scene of colors alone.
+        decoder: turns codes into features; None for a scene with colors only.
         codes: semantic values of the Gaussians, a row each; NaN for those visible in no photo.
         config: defaults of queries.
         encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text that
@@ -91,7 +91,7 @@ class Scene(ViewedScene):
         self.decoder, self.codes = decoder, codes
         self._encode_texts, self._vectors = encode_texts, vectors
         self._doubt_alone: dict[str, float] = {}
-        """Doubt about texts without their synonyms."""
+        """Doubt about texts without their synonyms, by text."""
 
     def __repr__(self) -> str:
         held_out = sum(photo.split == "eval" for photo in self.photos)
@@ -117,12 +117,12 @@ class Scene(ViewedScene):
             texts: prompts as `parse_prompts` reads them ("dome; rose window", '"windows" not "arcades"'), or
                 vectors.
             negatives: phrases that all prompts compete with, besides their own.
-            foreground: prompts that matches must lie on, such as "building"; default: the settings'.
-            threshold: relevancy above which places match, 0…1; default: the settings', or by the scene
-                (`match_thresholds`).
+            foreground: prompts that matches must lie on, such as "building"; default: the configured ones.
+            threshold: relevancy above which places match, 0…1; default: the configured one, or else chosen
+                for the scene (`match_thresholds`).
 
         Raises:
-            UserError: there is no prompt, the threshold is impossible, or the scene has colors alone.
+            UserError: there is no prompt, the threshold is impossible, or the scene has colors only.
         """
         requested = self.config.threshold if threshold is None else threshold
         if requested is not None and not 0 <= requested <= 1:
@@ -158,7 +158,7 @@ class Scene(ViewedScene):
         size: int | None = None,
         threshold: float | None = None,
     ) -> Any:
-        """Matches in a view: a `Match` for one prompt, a list of them for several.
+        """Find matches in a view: return a `Match` for one prompt, a list of them for several.
 
         Args:
             texts, negatives, threshold: see `ask`.
@@ -179,11 +179,11 @@ class Scene(ViewedScene):
         return found if _several(texts, found) else found[0]
 
     def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
-        """Matches of a question's prompts in one view; see `query`.
+        """Find matches of a question's prompts in one view; see `query`.
 
-        Relevancies are composited with at most the pixels of the photos in training, in a pass of their own
-        if the view has more, then enlarged: between these pixels nothing was learned, and needles too thin
-        for them would stand out as lines.
+        Relevancies are composited with at most as many pixels as the training photos have. If the view has
+        more, they are rendered in a separate pass and enlarged: nothing was learned between these pixels, and
+        Gaussians too thin for them would stand out as lines.
         """
         start = time.perf_counter()
         channels = question.channels
@@ -208,7 +208,7 @@ class Scene(ViewedScene):
 
     @torch.no_grad()
     def relevancy_maps(self, camera: Camera, queries: Queries) -> Float[Tensor, "q h w"]:
-        """Relevancy of every pixel to every query, 0…1, as it is scored: restricted to no foreground."""
+        """Compute the relevancy of every pixel to every query, 0…1, as it is scored, without a foreground."""
         rendering = self.draw(camera, self.engine.channels(queries))
         assert rendering.channels is not None
         return self.engine.maps(rendering.channels, queries)
@@ -221,14 +221,14 @@ class Scene(ViewedScene):
         threshold: float | None = None,
         most: int = 10,
     ) -> Any:
-        """Matches in the scene: a `Found` for one prompt, a list of them for several.
+        """Find matches in the scene: return a `Found` for one prompt, a list of them for several.
 
         Args:
             texts, negatives, threshold: see `ask`.
-            most: views to return, at least 1.
+            most: number of views to return at most, at least 1.
 
         Raises:
-            UserError: see `ask`.
+            UserError: see `ask`; or `most` is below 1.
         """
         if most < 1:
             raise UserError(f"{most} views are requested: give 1 or more")
@@ -236,11 +236,11 @@ class Scene(ViewedScene):
         return found if _several(texts, found) else found[0]
 
     def places(self, question: Question, most: int = 10) -> list[Found]:
-        """Matches of a question's prompts in the scene; see `find`."""
+        """Find matches of a question's prompts in the scene; see `find`."""
         return [self._found(question, i, most) for i in range(len(question.prompts))]
 
     def best_views(self, question: Question) -> list[str]:
-        """For each prompt the name of the training photo whose view shows it best, or comes closest.
+        """Return for each prompt the name of the training photo whose view shows it best, or comes closest.
 
         Raises:
             UserError: the scene has no training photos.
@@ -250,7 +250,7 @@ class Scene(ViewedScene):
         return [self._views(question, row)[1][0].name for row in range(len(question.prompts))]
 
     def relevancy(self, text: Text) -> Float[Array, " n"]:
-        """Relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
+        """Compute the relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
 
         Raises:
             UserError: see `ask`; or the text holds several prompts.
@@ -271,15 +271,15 @@ class Scene(ViewedScene):
 
         Args:
             path: the file.
-            text: write only the Gaussians that match it; None: all.
+            text: prompt; only the Gaussians that match it are written. None: all Gaussians are written.
             threshold: see `ask`.
             everything: with a text, write all Gaussians; a PLY has their relevancy as a property.
-            look: training photo whose lighting is baked into the colors; default: of the overview photo.
-            index: with a text, a .npy or .txt file for the numbers of the matching Gaussians: their places in
-                the scene, and so in the splat that it was attached to, from 0.
+            look: training photo whose lighting is baked into the colors; default: the overview photo.
+            index: with a text, a .npy or .txt file for the numbers of the matching Gaussians: their
+                positions, from 0, in the scene, and so in the splat that it was attached to.
 
         Returns:
-            How many were written.
+            The number of Gaussians written.
 
         Raises:
             UserError: nothing matches, or see `ask` and `write_splats`.
@@ -299,14 +299,14 @@ class Scene(ViewedScene):
     # ── features ────────────────────────────────────────────────────────────────────────────────────
 
     def encode(self, texts: str | Sequence[str]) -> Float[Array, "n c"]:
-        """Unit vectors of texts in the space of the scene's CLIP: [c] for one text, [n, c] for a list."""
+        """Encode texts as unit vectors in the scene's CLIP space: [c] for a string, [n, c] for a list."""
         vectors = self.text.vectors(texts).cpu().numpy()
         return vectors[0] if isinstance(texts, str) else vectors
 
     @property
     def features(self) -> Float[Array, "n c"]:
-        """Unit CLIP features of all Gaussians, half precision; 0 for those visible in no photo. They are
-        decoded in parts at each call: 1 GB for a million Gaussians of 512 channels."""
+        """Unit CLIP features of all Gaussians in half precision; 0 for those visible in no photo. Each access
+        decodes them, in parts: 1 GB for a million Gaussians with 512 channels."""
         rows = range(0, len(self.splats), _ROWS)
         parts = [self.engine.features(slice(row, row + _ROWS)).cpu().half().numpy() for row in rows]
         return np.concatenate(parts) if parts else np.zeros((0, 0), np.float16)
@@ -321,16 +321,16 @@ class Scene(ViewedScene):
         most: int = 5,
         size: int | None = None,
     ) -> list[tuple[str, float]]:
-        """The words that fit a pixel best, with their relevancy, best first.
+        """Find the words that match a pixel best; return them with their relevancy, best first.
 
-        There are none where the scene's Gaussians hardly cover the pixel or have no meaning, and none at the
-        sky: where the sky or a phrase that fits anything fits best, and no word clearly better.
+        The result is empty where the scene's Gaussians hardly cover the pixel or have no meaning, and at the
+        sky: where the sky or a generic phrase matches best, and no word is clearly better.
 
         Args:
             place, size: the view, see `camera`.
             x, y: column and row in pixels of that view.
             words: the words to choose from; default: the shipped vocabulary of buildings.
-            most: words to return.
+            most: number of words to return at most.
 
         Raises:
             UserError: the pixel lies outside the view.
@@ -349,7 +349,7 @@ class Scene(ViewedScene):
         return named[: max(most, 0)]
 
     def _feature_at(self, camera: Camera, x: float, y: float) -> Float[Tensor, " c"] | None:
-        """What a pixel shows, in CLIP's space, of any length; None where too little of it has a meaning."""
+        """Blend the features that a pixel shows, unnormalized; None where too little of it has a meaning."""
         if not (0 <= x < camera.width and 0 <= y < camera.height):
             raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
         pixel = torch.zeros(camera.height, camera.width, device=self.device)
@@ -368,13 +368,13 @@ class Scene(ViewedScene):
         examples: Example | Sequence[Example],
         selection: Bool[Tensor, " n"] | None = None,
     ) -> Scene:
-        """A scene that knows a word from examples, as `scene.words[word]`; this one doesn't change.
+        """Return a scene that also knows a word from examples, as `scene.words[word]`; this one is unchanged.
 
-        `query`, `find`, `relevancy` and `export` of the new scene use what it learned wherever the word is
-        a prompt. Examples that the word had before are replaced.
+        `query`, `find`, `relevancy` and `export` of the new scene use what it learned wherever the word is a
+        prompt. Examples that the word had before are replaced.
 
         Args:
-            word: the word, of any case.
+            word: the word, in any case.
             examples: marks in photos of the scene.
             selection: the Gaussians that are the word, if known; default: those that the marks show.
 
@@ -396,17 +396,17 @@ class Scene(ViewedScene):
         return self.with_words([*self.words.values(), learned])
 
     def with_words(self, words: Iterable[TaughtWord]) -> Scene:
-        """The same scene with these taught words; of equal names the last one. It shares what is computed."""
+        """Return this scene with other taught words (the last of equal names), sharing its results."""
         changed = copy.copy(self)
         changed.words = {known_word(word.name): word for word in words}
         return changed
 
     def carrying(self, word: TaughtWord) -> Scene:
-        """A scene with a word that was taught elsewhere: learned anew if it was taught in these photos,
-        otherwise, or if its marks show nothing any more, as it was learned there.
+        """Return a scene with a word taught elsewhere. If it was taught in these photos, it is learned anew;
+        if not, or if its marks no longer show anything, it is kept as it was learned there.
 
         Raises:
-            UserError: it was learned with another CLIP.
+            UserError: the word was learned with another CLIP.
         """
         if word.examples and word.scene == Path(self.file.data).name:
             with suppress(UserError):
@@ -416,7 +416,7 @@ class Scene(ViewedScene):
         return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
 
     def unsure(self, word: str) -> str:
-        """The training photo in which a taught word is least sure: the next one to mark.
+        """Find the training photo in which a taught word is least certain, the best one to mark next.
 
         Raises:
             UserError: the word was not taught.
@@ -438,7 +438,7 @@ class Scene(ViewedScene):
     # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
 
     def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
-        """Parsed prompts. Raises UserError if there are none."""
+        """Parse prompts, and attach the taught words. Raises UserError if there are no prompts."""
         prompts: list[Prompt] = []
         for text in _listed(texts):
             if isinstance(text, Prompt):
@@ -450,13 +450,13 @@ class Scene(ViewedScene):
         return prompts or parse_prompts("")
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
-        """Vectors of prompts on the scene's device. A text that the scene doubts has its synonyms beside it:
-        where CLIP knows the word itself, they would only blur it."""
+        """Encode prompts on the scene's device. Only texts that the scene doubts get their synonyms: where
+        CLIP knows the word itself, synonyms would only blur it."""
         known = {prompt.text for prompt in prompts if not self.synonyms(prompt)}
         return self.text.queries(prompts, known).to(self.device)
 
     def synonyms(self, prompt: Prompt) -> list[str]:
-        """Synonyms searched along with a prompt."""
+        """Return the synonyms searched along with a prompt."""
         fixed = prompt.vector is not None or prompt.taught is not None
         synonyms = [] if fixed else self.text.synonyms(prompt.text)
         if not synonyms or self.config.text.combine != "fallback":
@@ -483,7 +483,7 @@ class Scene(ViewedScene):
         return question
 
     def _views(self, question: Question, row: int) -> tuple[list[Viewpoint], list[Viewpoint]]:
-        """Training views that show a prompt, and all of them, best first."""
+        """Return the training views that show a prompt, and all training views, both best first."""
         ranks = rank_views(self.visible, self.splats.means, question.relevancy[row], question.thresholds[row])
         everything = [
             Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
@@ -508,13 +508,13 @@ class Scene(ViewedScene):
 
     @cached_property
     def engine(self) -> QueryEngine:
-        """The query engine; decodes the features of all Gaussians at first use."""
+        """The query engine, which decodes the features of all Gaussians at first use."""
         engine = make_engine(*self._semantics(), self.config.temperature)
         return engine.calibrated(self.text.yardstick.to(self.device))
 
     @cached_property
     def text(self) -> TextEncoder:
-        """The encoder of prompts; loads the scene's CLIP at the first text that it doesn't know."""
+        """The encoder of prompts, which loads the scene's CLIP at the first text that it doesn't know."""
         self._semantics()
         return TextEncoder(self._encode, self.config.text, self._vectors)
 
@@ -525,12 +525,12 @@ class Scene(ViewedScene):
 
     @cached_property
     def doubts(self) -> Doubts:
-        """Tells what the scene doesn't show."""
+        """Estimator of which prompts the scene does not contain."""
         return Doubts(self.engine.of_gaussians, lambda texts: self.text.plain_queries(texts).to(self.device))
 
 
 def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
-    """The CLIP that a scene's features come from. Raises UserError if there is none, or it has changed."""
+    """Load the CLIP that a scene's features come from. Raises UserError if it is missing or has changed."""
     if file.clip is None:
         raise UserError(NO_SEMANTICS)
     encoder = load_image_text_encoder(file.clip, device)
@@ -542,7 +542,7 @@ def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
 
 
 def _expect_match(question: Question) -> None:
-    """Raises UserError if no Gaussian matches the first prompt."""
+    """Raise UserError if no Gaussian matches the first prompt."""
     if not question.gaussians[0].any():
         best, level = float(question.relevancy[0].max()), question.thresholds[0]
         raise UserError(
@@ -556,5 +556,5 @@ def _listed(texts: Any) -> list[Any]:
 
 
 def _several(texts: Any, found: Sequence[Any]) -> bool:
-    """Whether the answer is a list: to a list, and to a text that holds several prompts."""
+    """Return whether the answer is a list: for a list of texts, and for a text that holds several prompts."""
     return isinstance(texts, list | tuple) or len(found) > 1

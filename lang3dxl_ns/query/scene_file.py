@@ -1,8 +1,8 @@
-"""The scene file, NAME.scene: all that rendering and asking a scene need, in one file that can be shared.
+"""The scene file, NAME.scene: everything needed to render and query a scene, in one file that can be shared.
 
-It is a safetensors file: no code in it, and every size is checked before a tensor is read. 40 bytes hold a
-Gaussian of one color and its code. The metadata entry `lang3dxl` is JSON: format version, photos and cameras,
-the CLIP, the decoder's settings, and how the scene was made.
+It is a safetensors file: it contains no code, and every size is checked before a tensor is read. A Gaussian
+of one color with its code takes 40 bytes. The metadata entry `lang3dxl` is JSON: format version, photos and
+cameras, the CLIP, the decoder's settings, and how the scene was made.
 """
 
 from __future__ import annotations
@@ -51,25 +51,25 @@ _MASK_SIDE = 800
 """Longer side of a stored foreground mask in pixels."""
 _LARGEST_HALF = 6e4
 _STEPS = 65534
-"""Stored codes are 1 to 65,535, and 0 for a Gaussian that is visible in no photo."""
+"""Steps of stored codes, which are 1 to 65,535, and 0 for a Gaussian that is visible in no photo."""
 _MOST_SETTING = 100_000
-"""No setting of a decoder is larger: sizes are refused before anything of that size is built."""
+"""Upper limit of a decoder's settings: larger sizes are refused before anything of that size is built."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a scene file tells about its origin."""
+    """Origin of a scene, as its file describes it."""
 
     title: str = ""
-    """Heading of the page; by default the name of the photos' folder."""
+    """Heading of the page; default: the name of the photos' folder."""
     credit: str = ""
-    """Who took the photos."""
+    """Authors of the photos."""
     license: str = ""
     """Terms under which photos and scene may be used."""
     made_by: str = ""
     """Program and version that wrote the file."""
     made_how: str = ""
-    """How the scene was made, in a line: the method, its decoder, its iterations."""
+    """How the scene was made, in one line: the method, its decoder and its iterations."""
 
 
 # ── writing ─────────────────────────────────────────────────────────────────────────────────────────────
@@ -81,10 +81,10 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     Args:
         path: the file; its name ends in .scene.
         scene: the scene. Foreground masks are read from their files and stored with it.
-        provenance: what the file tells about its origin.
+        provenance: the scene's origin, as the file describes it.
 
     Returns:
-        The bytes written.
+        The number of bytes written.
 
     Raises:
         UserError: the name doesn't end in .scene.
@@ -132,10 +132,10 @@ def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
 
     Args:
         path: the scene file.
-        words: those that it holds from now on.
+        words: the words that it holds afterwards.
 
     Raises:
-        UserError: as `read_scene`.
+        UserError: the file is missing, damaged, or of a newer version.
     """
     with _opened(path):
         content = path.read_bytes()
@@ -145,13 +145,12 @@ def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
         described["taught"] = [word.to_json() for word in words]
         header["__metadata__"][_KEY] = json.dumps(described)
         start = json.dumps(header).encode()
-        start += b" " * (-len(start) % 8)  # tensors stay aligned
+        start += b" " * (-len(start) % 8)  # keep tensors aligned
     write_atomically(path, len(start).to_bytes(8, "little") + start + content[begin:])
 
 
 def _stored_codes(codes: Float[Tensor, "n d"], bounded: bool) -> Shaped[Array, "n d"]:
-    """Bounded codes as 16-bit coordinates in (0, 1), which are what the hash grid reads; others as they
-    are."""
+    """Convert bounded codes to the 16-bit coordinates in (0, 1) that the hash grid reads; keep others."""
     if not bounded:
         return _array(codes, np.float32)
     places = 1 + (codes.double().sigmoid() * _STEPS).round()
@@ -159,7 +158,7 @@ def _stored_codes(codes: Float[Tensor, "n d"], bounded: bool) -> Shaped[Array, "
 
 
 def _stored_state(name: str, module: torch.nn.Module) -> dict[str, Shaped[Array, "..."]]:
-    """Weights of a module: in half precision, unless they are too large for it, or few."""
+    """Return a module's weights: in half precision, unless they are too large for it, or few."""
     stored = {}
     for key, values in module.state_dict().items():
         if isinstance(values, Tensor):
@@ -203,13 +202,13 @@ def read_scene(
     config: QueryConfig | None = None,
     encode_texts: EncodeTexts | None = None,
 ) -> Scene:
-    """Read a scene file. Nothing in it is executed, and nothing is allocated that the file doesn't hold.
+    """Read a scene file. Nothing in it is executed, and no memory is allocated beyond what it holds.
 
     Args:
         path: the file.
         device: default: a GPU if there is one.
         config: defaults of queries.
-        encode_texts: the scene's CLIP, if it is already loaded, or is elsewhere than the scene tells.
+        encode_texts: the scene's CLIP, if it is already loaded, or is not where the scene file says.
 
     Raises:
         UserError: the file is missing, damaged, cut short, or of a newer version.
@@ -237,10 +236,10 @@ def read_scene(
 
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
-    """What a scene file says of itself: `provenance`, `scene`, `gaussians`, `photos`, `clip`, `decoder`,
-    `looks`, `taught` (the words taught by example) and `bytes`.
+    """Describe a scene file: `provenance`, `scene`, `gaussians`, `photos`, `clip`, `decoder`, `looks`,
+    `taught` (the words taught by example) and `bytes`.
 
-    Raises UserError as `read_scene` does; no tensor is read.
+    No tensor is read. Raises UserError as `read_scene` does.
     """
     path = expanded(path)
     with _opened(path) as file:
@@ -258,7 +257,7 @@ def describe_scene_file(path: str | Path) -> dict[str, Any]:
 
 
 class _File:
-    """A safetensors file with a scene: its description, and tensors whose shapes are checked first."""
+    """An open safetensors file with a scene: its description, and tensors whose shapes are checked first."""
 
     def __init__(self, opened: Any) -> None:
         self._opened = opened
@@ -277,13 +276,13 @@ class _File:
         self.taught = [TaughtWord.from_json(word) for word in self.about.get("taught", [])]
 
     def tensor(self, name: str, *shape: int) -> Tensor:
-        """A tensor of this shape, of whatever type. Raises ValueError for another shape."""
+        """Read a tensor of any type with this shape. Raises ValueError for another shape."""
         expect(self.shapes[name] == list(shape), f"{name} has the shape {self.shapes[name]}")
         values = self._opened.get_tensor(name)
         return torch.from_numpy(values.astype(np.int32) if values.dtype == np.uint16 else values)
 
     def mask(self, photo: int) -> bytes | None:
-        """The PNG of a photo's foreground, of a sensible size."""
+        """Read the PNG of a photo's foreground, after checking its size; None if the photo has no mask."""
         name = f"mask.{photo}"
         if name not in self.shapes:
             return None
@@ -293,7 +292,7 @@ class _File:
         return content
 
     def loaded(self, name: str, module: Module, state: Mapping[str, Any] | None = None) -> Module:
-        """A module with its tensors from the file, whose shapes must be those that it expects."""
+        """Load a module's tensors from the file, whose shapes must be the module's, and return the module."""
         tensors = {
             key: self.tensor(f"{name}.{key}", *value.shape)
             for key, value in module.state_dict().items()
@@ -304,12 +303,12 @@ class _File:
 
 
 class _NewerError(Exception):
-    """The file's format version is unknown."""
+    """Raised for a file with an unknown format version."""
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_File]:
-    """The file; errors of reading it are one sentence."""
+    """Open the file, and turn errors of reading it into a UserError of one sentence."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -355,7 +354,7 @@ def _decoder(file: _File, described: dict[str, Any]) -> Decoder:
     stored = sum(prod(shape) for name, shape in file.shapes.items() if name.startswith("decoder."))
     needed = _parameters(settings, clip + dense)
     expect(needed <= 4 * stored + 10_000_000, "its decoder is larger than the file")
-    # The first versions called it by the name of the method.
+    # The first versions called this decoder by the name of the method.
     name: Any = "gathered" if described["name"] == "lang3dxl" else described["name"]
     config = SemanticFieldConfig(preset="short", **settings)
     decoder = make_decoder(DecoderConfig(name=name), config, clip, dense, torch.zeros(3), 1.0)
@@ -363,7 +362,7 @@ def _decoder(file: _File, described: dict[str, Any]) -> Decoder:
 
 
 def _parameters(settings: Mapping[str, Any], channels: int) -> int:
-    """At most how many numbers a decoder with these settings and outputs has."""
+    """Compute an upper bound on the number of parameters of a decoder with these settings and outputs."""
     if not settings:
         return 1000 * channels + channels**2
     levels, depth, width = (settings[name] for name in ("levels", "hidden_layers", "hidden_width"))

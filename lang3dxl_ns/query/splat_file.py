@@ -18,7 +18,7 @@ from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.rendering.splats import Splats
 
 LEAST_OPACITY = 1e-6
-"""Opacities are kept this far from 0 and 1, where logits are infinite."""
+"""Smallest distance of stored opacities from 0 and 1, where logits are infinite."""
 
 
 def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | None = None) -> int:
@@ -27,10 +27,10 @@ def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | No
     Args:
         path: the file; its ending names the format.
         splats: the Gaussians; those with a NaN or infinite value are left out.
-        relevancy: of each Gaussian to a prompt, 0…1, written to a PLY as the property `relevancy`.
+        relevancy: relevancy of each Gaussian to a prompt, 0…1, written to a PLY as the property `relevancy`.
 
     Returns:
-        How many Gaussians were written.
+        The number of Gaussians written.
 
     Raises:
         UserError: the ending names another kind of file, or gsply is missing for .spz.
@@ -43,7 +43,7 @@ def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | No
 
 
 def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
-    """Write the numbers of the selected Gaussians, from 0: an array (.npy), or a line each (.txt).
+    """Write the numbers of the selected Gaussians, from 0, as an array (.npy) or one per line (.txt).
 
     Raises UserError for another ending.
     """
@@ -59,7 +59,7 @@ def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
 
 
 def check_splat_name(path: Path) -> None:
-    """Raises UserError for a folder, and for a name that ends in neither .ply nor .spz."""
+    """Raise UserError if the path is a folder, or its name ends in neither .ply nor .spz."""
     if path.is_dir():
         raise UserError(f"{path} is a folder: name a .ply or .spz file in it")
     if path.suffix.lower() not in (".ply", ".spz"):
@@ -67,23 +67,23 @@ def check_splat_name(path: Path) -> None:
 
 
 def logits(splats: Splats) -> Float[Tensor, " n"]:
-    """Logits of the opacities."""
+    """Compute the logits of the opacities."""
     return splats.opacities.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY).logit()
 
 
 def log_scales(splats: Splats) -> Float[Tensor, "n 3"]:
-    """Logarithms of the scales."""
+    """Compute the logarithms of the scales."""
     return splats.scales.clamp_min(1e-30).log()
 
 
 def _ply(splats: Splats, relevancy: Float[Tensor, " n"] | None) -> bytes:
-    """The layout of 3D Gaussian splatting, which ordinary splat viewers open."""
+    """Encode the layout of 3D Gaussian splatting, which ordinary splat viewers open."""
     harmonics, count = splats.harmonics, len(splats)
     blocks = {
         ("x", "y", "z"): splats.means,
         ("nx", "ny", "nz"): torch.zeros_like(splats.means),
         _numbered("f_dc", 3): harmonics[:, 0],
-        # Channel by channel, as viewers expect.
+        # Viewers expect these coefficients channel by channel.
         _numbered("f_rest", 3 * (harmonics.shape[1] - 1)): harmonics[:, 1:].mT.reshape(count, -1),
         ("opacity",): logits(splats)[:, None],
         _numbered("scale", 3): log_scales(splats),
@@ -99,7 +99,7 @@ def _ply(splats: Splats, relevancy: Float[Tensor, " n"] | None) -> bytes:
 
 
 def _spz(splats: Splats) -> bytes:
-    """Niantic's compressed format: 8 bits per value, 24 bits per coordinate, no relevancy."""
+    """Encode Niantic's compressed format: 8 bits per value, 24 bits per coordinate, no relevancy."""
     try:
         import gsply
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Words taught by example: marks in photos, what was learned from them, and files of both."""
+"""Words taught by example: marks in photos, the words learned from them, and files of both."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ from lang3dxl_ns.scene.camera import MOST_PIXELS
 Point = tuple[float, float]
 Box = tuple[float, float, float, float]
 MASK_SIDE = 1024
-"""Longer side of a kept mask in pixels."""
+"""Longer side in pixels of a mask that is kept."""
 _OUTLINE, _BOX = 100, 30
-"""Clicks that an outline and a box are worth."""
+"""Number of clicks that an outline and a box are worth."""
 _VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """Marks in one photo: an outline or a box around all that is the word, or clicks on some of it.
+    """Marks in one photo: an outline or a box around everything that is the word, or clicks on some of it.
 
     Coordinates are pixels of the photo's file, with the origin at its top-left corner.
     """
 
     photo: str
-    """Name of the photo."""
+    """Name of the marked photo."""
     mask: Bool[Array, "h w"] | None = None
-    """What is the word, at any size in the photo's proportions (it is kept at 1,024 pixels at most);
-    everything else in the photo is not."""
+    """Pixels that are the word, at any size in the photo's proportions (at most 1,024 pixels a side are
+    kept). All other pixels of the photo are not the word."""
     box: Box | None = None
-    """Left, top, right, bottom: nothing outside is the word, and most of the inside is."""
+    """Left, top, right, bottom. Nothing outside is the word, and most of the inside is."""
     points: tuple[Point, ...] = ()
     """Columns and rows of pixels that are the word."""
     not_points: tuple[Point, ...] = ()
-    """Columns and rows of pixels that are not."""
+    """Columns and rows of pixels that are not the word."""
 
     def __post_init__(self) -> None:
-        """Raises UserError unless something is marked, with numbers."""
+        """Raise UserError unless something is marked, with finite coordinates."""
         numbers = [*(self.box or ()), *(x for point in (*self.points, *self.not_points) for x in point)]
         if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
             raise UserError(f"the marks in {self.photo} have a coordinate that is not a number")
@@ -66,17 +66,17 @@ class Example:
 
     @property
     def evidence(self) -> int:
-        """How many clicks the marks are worth."""
+        """Number of clicks that the marks are worth."""
         points = len(self.points) + len(self.not_points)
         return points + (_OUTLINE if self.mask is not None else _BOX if self.box is not None else 0)
 
     @property
     def complete(self) -> bool:
-        """Whether everything that is the word in the photo lies inside the marks."""
+        """Whether everything in the photo that is the word lies inside the marks."""
         return self.mask is not None or self.box is not None
 
     def to_json(self) -> dict[str, Any]:
-        """The example as JSON; masks as run lengths."""
+        """Convert the example to JSON, with masks as run lengths."""
         described: dict[str, Any] = {"photo": self.photo}
         if self.mask is not None:
             described["mask"] = {"size": list(self.mask.shape), "counts": run_lengths(self.mask)}
@@ -86,7 +86,7 @@ class Example:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Example:
-        """The example; raises ValueError, LookupError, TypeError or UserError for anything else."""
+        """Build the example; raises ValueError, LookupError, TypeError or UserError for anything else."""
         mask = box = None
         if "mask" in content:
             height, width = map(int, content["mask"]["size"])
@@ -102,7 +102,7 @@ class Example:
 
 
 def _kept(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
-    """A mask at the size that is kept; one marked pixel stays one."""
+    """Shrink a mask to the size that is kept. A single marked pixel stays marked."""
     longer = max(mask.shape)
     if longer <= MASK_SIDE:
         return mask
@@ -116,35 +116,35 @@ class TaughtWord:
     """A word learned from examples, in the space of a CLIP.
 
     A unit feature f has the margin `vector` · f + `bias` + `text` · (margin of the word's text). The
-    relevancy is sigmoid(temperature · margin), above 0.5 where the word is.
+    relevancy is sigmoid(temperature · margin), which is above 0.5 where the word is.
     """
 
     name: str
     vector: Float[Tensor, " c"]
-    """Direction of the word, of any length."""
+    """Direction of the word in CLIP's space, of any length."""
     bias: float
     text: float
-    """Weight of the text, from 0."""
+    """Weight of the text's own margin, at least 0."""
     doubt: float
-    """Share of what is not the word that scores above what is, in the marked photos: 0.5 by chance."""
+    """Probability that a place that is not the word outscores one that is, in the marked photos."""
     precision: Mapping[str, float] = field(default_factory=dict)
-    """Average precision in each marked photo, by name; learned from the others where there are several."""
+    """Average precision in each marked photo, by name; each of several is scored by what the others teach."""
     examples: tuple[Example, ...] = ()
     clip: str | None = None
-    """Fingerprint of the CLIP whose features it scores."""
+    """Fingerprint of the CLIP whose features the word scores."""
     scene: str = ""
-    """Name of the scene that it was taught in."""
+    """Name of the scene in which the word was taught."""
 
     def __repr__(self) -> str:
         photos = len({example.photo for example in self.examples})
         return f"TaughtWord({self.name!r}, {photos} photos of {self.scene}, doubt {self.doubt:.2f})"
 
     def margins(self, features: Float[Tensor, "m c"], text: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-        """Margins of unit features, for which the word's text has margins too."""
+        """Compute the margins of unit features, given the margins of the word's text for them."""
         return features @ self.vector.to(features) + self.bias + self.text * text
 
     def to_json(self) -> dict[str, Any]:
-        """The word as JSON."""
+        """Convert the word to JSON."""
         kept = {name: getattr(self, name) for name in ("name", "bias", "text", "doubt", "clip", "scene")}
         examples = [example.to_json() for example in self.examples]
         vector = self.vector.cpu().tolist()
@@ -152,7 +152,7 @@ class TaughtWord:
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> TaughtWord:
-        """The word; raises ValueError, LookupError, TypeError or UserError for anything else."""
+        """Build the word; raises ValueError, LookupError, TypeError or UserError for anything else."""
         bias, text, doubt = (float(content[name]) for name in ("bias", "text", "doubt"))
         vector = torch.tensor([float(x) for x in content["vector"]])
         finite = all(map(math.isfinite, (bias, text, doubt))) and bool(vector.isfinite().all())
@@ -166,18 +166,18 @@ class TaughtWord:
 
 
 def known_word(text: str) -> str:
-    """The form in which words are compared: lower case, single spaces."""
+    """Return the form in which words are compared: lower case, with single spaces."""
     return " ".join(text.lower().split())
 
 
 def save_words(path: Path, words: Sequence[TaughtWord]) -> None:
-    """Write words as JSON, atomically; `load_words` reads it."""
+    """Write words as JSON, atomically. `load_words` reads the file."""
     content = {"version": _VERSION, "words": [word.to_json() for word in words]}
     write_atomically(path, json.dumps(content, ensure_ascii=False) + "\n")
 
 
 def load_words(path: Path) -> list[TaughtWord]:
-    """Words from a file. Raises UserError if it is missing or damaged, or a newer version wrote it."""
+    """Load words from a file. Raises UserError if it is missing or damaged, or a newer version wrote it."""
     try:
         content = read_json(expanded(path))
         if content["version"] != _VERSION:

@@ -23,10 +23,10 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.teach import TaughtWord
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
-"""`ImageTextEncoder.encode_texts`."""
+"""Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
 
 _SAME = 0.95
-"""Cosine of a vector with a phrase, from which they mean the same."""
+"""Cosine from which a vector and a phrase are taken to mean the same."""
 _QUOTED = r'"[^"]*"'
 _NEGATIVES = re.compile(rf"\s*\bnot\s+({_QUOTED}(?:\s*,\s*{_QUOTED})*)", re.IGNORECASE)
 _SINGLE_QUOTES = re.compile(r"‘([^‘’]*)’")
@@ -39,20 +39,20 @@ class Prompt:
 
     text: str
     negatives: tuple[str, ...] = ()
-    """Phrases it competes with, besides the configured ones."""
+    """Phrases that this prompt competes with, in addition to the configured ones."""
     vector: Float[Tensor, " c"] | None = field(default=None, compare=False, repr=False)
-    """What to search for, in the space of CLIP, in place of the text's own vector."""
+    """Vector in CLIP's space that is searched for in place of the text's own."""
     taught: TaughtWord | None = field(default=None, compare=False, repr=False)
-    """What the scene has learned of this word from examples."""
+    """Word taught to the scene by example that has this text."""
 
     def __post_init__(self) -> None:
-        """Raises TypeError for what is no text."""
+        """Raise TypeError if a text is not a string."""
         texts_of((self.text, *self.negatives), "a prompt")
 
 
 def texts_of(texts: Any, what: str) -> list[str]:
-    """One text or several as a list, without unpaired UTF-16 surrogates, as from a broken paste: tokenizers
-    reject them. Raises TypeError, which names `what`, for anything else."""
+    """Return one text or several as a list, without unpaired UTF-16 surrogates (from a broken paste), which
+    tokenizers reject. Raises TypeError, which names `what`, for anything else."""
     listed = [texts] if isinstance(texts, str) else list(texts) if isinstance(texts, Iterable) else [texts]
     if wrong := [text for text in listed if not isinstance(text, str)]:
         raise TypeError(f"{what} is a text, not {type(wrong[0]).__name__}: {wrong[0]!r:.40}")
@@ -60,10 +60,10 @@ def texts_of(texts: Any, what: str) -> list[str]:
 
 
 def parse_prompts(typed: str) -> list[Prompt]:
-    """Prompts separated by `;`, each with optional negatives: `"windows" not "decorative opening"; dome`.
+    """Parse prompts separated by `;`, with optional negatives: `"windows" not "decorative opening"; dome`.
 
     `not` is special only before a quoted phrase (several: `not "a", "b"`), so that phrases may contain the
-    word; a `;` in quotes doesn't separate. Raises UserError if there is no prompt.
+    word. A `;` in quotes doesn't separate. Raises UserError if there is no prompt.
     """
     (clean,) = texts_of([typed], "a prompt")
     clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES))
@@ -105,13 +105,13 @@ _COLOR = re.compile(rf"\b(?:{_COLORS})\b(?=\s+\S)", re.IGNORECASE)
 
 
 def searched(text: str) -> str:
-    """A prompt without what says which of several things is meant, by its place or size: *windows on the left
-    tower* is *windows*."""
+    """Remove the words by which a prompt selects one of several things, by place or size: *windows on the
+    left tower* becomes *windows*."""
     return _WHERE.sub("", text).strip() or text
 
 
 def caution(text: str) -> str | None:
-    """A sentence about words in a prompt that CLIP can't tell, places, sizes and colors; None without."""
+    """Return a warning about words in a prompt that CLIP can't tell (places, sizes, colors), if any."""
     if (found := searched(text)) != text:
         return f"places and sizes are not told apart: {found} is searched for everywhere"
     if color := _COLOR.search(text):
@@ -124,37 +124,37 @@ def caution(text: str) -> str | None:
 
 @dataclass
 class TextConfig:
-    """How prompts become vectors."""
+    """Settings of how prompts become vectors."""
 
     synonyms: Literal["off", "table"] = "table"
-    """Source of common words for specialist ones: off, or the shipped table of architectural terms."""
+    """Source of common words for specialist terms: the shipped `table` of architectural terms, or `off`."""
     combine: Literal["fallback", "joined"] = "fallback"
-    """How a prompt and its synonyms are combined: the prompt alone unless the scene doubts it, then the best
-    of all at each place (fallback); or as one string with commas (joined, the paper's way)."""
+    """How a prompt and its synonyms are combined. `fallback`: the prompt alone unless the scene doubts it,
+    then the best of all at each place. `joined`: one string with commas, as in the paper."""
     negatives: tuple[str, ...] = NEGATIVES
-    """A prompt matches where it fits better than all of these: phrases that fit anything, and other contents
-    of building photos. Phrases named by a prompt or its synonyms don't compete with it."""
+    """Phrases that compete with every prompt: generic ones, and other contents of building photos. A prompt
+    matches where it beats all of them. Phrases named by a prompt or its synonyms don't compete with it."""
 
     def __post_init__(self) -> None:
-        """Raises UserError if nothing competes with a prompt: it would match everywhere."""
+        """Raise UserError if there are no negatives, since every prompt would then match everywhere."""
         if not any(phrase.strip() for phrase in self.negatives):
             raise UserError("--negatives is empty: give at least one phrase, such as object")
 
 
 @cache
 def synonym_table() -> dict[str, list[str]]:
-    """The shipped table of architectural terms: common synonyms of each, most common first."""
+    """Load the built-in table of architectural terms: common synonyms of each, most common first."""
     return load_preset("synonyms/architecture")
 
 
 def synonyms_of(text: str) -> list[str]:
-    """Synonyms of a term in singular or plural, with or without an article; none for other texts."""
+    """Return synonyms of a term in singular or plural, with or without an article; none for other texts."""
     words, table = re.sub(r"^(an?|the)\s+", "", " ".join(text.lower().split())), synonym_table()
     return next((table[form] for form in _singulars(words) if form in table), [])
 
 
 def _singulars(words: str) -> list[str]:
-    """The words, and what they may be the plural of."""
+    """Return the possible singulars of these words, and the words themselves."""
     endings = (("", ""), ("s", ""), ("es", ""), ("ies", "y"), ("es", "is"), ("ia", "ion"), ("a", "um"))
     irregular = {"oculi": "oculus", "abaci": "abacus"}
     forms = [words.removesuffix(plural) + single for plural, single in endings if words.endswith(plural)]
@@ -165,10 +165,10 @@ def _singulars(words: str) -> list[str]:
 
 
 class TextEncoder:
-    """Prompts to `Queries`; every string is encoded once.
+    """Encoder of prompts to `Queries`, which encodes every string once.
 
     Args:
-        encode: the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
+        encode: text encoder of the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
         known: unit vectors of texts that need not be encoded.
     """
 
@@ -184,14 +184,14 @@ class TextEncoder:
         self._lock = threading.Lock()
 
     def synonyms(self, text: str) -> list[str]:
-        """Common words for a prompt, most common first; none if it is common itself."""
+        """Return common words for a prompt, most common first; none if it is common itself."""
         found = [] if self.config.synonyms == "off" else synonyms_of(searched(text))
         return [word for word in found if word.lower() != text.lower()]
 
     def queries(self, prompts: Sequence[Prompt], known: Collection[str] = ()) -> Queries:
-        """Vectors of prompts, with synonyms combined as configured, and of their competitors.
+        """Encode prompts, with synonyms combined as configured, and their competitors.
 
-        known: texts that are taken without synonyms.
+        known: texts that are encoded without synonyms.
         """
         return Queries.of(
             [self._positive(p, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
@@ -201,7 +201,7 @@ class TextEncoder:
         ).taught([prompt.taught for prompt in prompts])
 
     def plain_queries(self, texts: Sequence[str]) -> Queries:
-        """Vectors of texts without synonyms, against the negatives."""
+        """Encode texts without synonyms, and the configured negatives."""
         return Queries.of(
             self.vectors(texts)[:, None].unbind(),
             self.vectors(self.config.negatives),
@@ -210,7 +210,7 @@ class TextEncoder:
 
     @cached_property
     def yardstick(self) -> Queries:
-        """The words by which an encoder's cosines are measured, whatever the settings are."""
+        """Fixed set of words by which an encoder's cosines are measured, independent of the settings."""
         words = self.vectors((*NEGATIVES, *UNRELATED))
         return Queries(words, (), ())
 
@@ -218,7 +218,7 @@ class TextEncoder:
         return competitors(self.config.negatives, [searched(text), *self.synonyms(text)])
 
     def _against_all_but(self, vector: Float[Tensor, " c"]) -> list[int]:
-        """Negatives that a vector competes with: those that don't mean the same."""
+        """Return the indices of the negatives that a vector competes with: those with another meaning."""
         phrases = self.vectors(self.config.negatives)
         cosines = phrases @ F.normalize(vector.to(phrases), dim=0)
         return (cosines < _SAME).nonzero().flatten().tolist() or list(range(len(phrases)))
@@ -230,9 +230,9 @@ class TextEncoder:
         return self.vectors([", ".join(words)] if self.config.combine == "joined" else words)
 
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:
-        """Unit vectors of texts."""
+        """Encode texts as unit vectors."""
         texts = texts_of(texts, "what is encoded")
-        with self._lock:  # tokenizers can't be used by two threads at once
+        with self._lock:  # two threads can't use a tokenizer at once
             new = [text for text in dict.fromkeys(texts) if text not in self._vectors]
             if new:
                 self._vectors |= zip(new, F.normalize(self._encode(new), dim=-1), strict=True)

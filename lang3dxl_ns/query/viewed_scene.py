@@ -1,4 +1,4 @@
-"""`ViewedScene`: the part of a scene that one looks at, without words: Gaussians, photos and lighting."""
+"""`ViewedScene`: what can be rendered of a scene without any words: Gaussians, photos and lighting."""
 
 from __future__ import annotations
 
@@ -30,26 +30,25 @@ from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 
 LARGEST = 1920
-"""Longer side of pictures in pixels, where no size is requested."""
+"""Longer side of pictures in pixels if no size is requested."""
 Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
 """A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
 
 
 class ViewedScene:
-    """Gaussians, and the photos they were made from.
+    """Gaussians and the photos they were made from.
 
-    It is data, and never changes; which Gaussians each photo shows is computed once. Any number of threads
-    may use it.
+    The scene never changes. What each photo shows is computed once. Any number of threads may use it.
 
     Args:
         splats: the Gaussians, in the model's frame.
         file: photos and cameras.
-        looks: lighting of the photos; None where all share one.
+        looks: lighting of the photos; None if all share one.
         background: color behind the scene, 0…1; None for black.
         config: sizes of pictures, and of the views that `visible` measures.
-        cache: file to keep which Gaussians the photos show; None: they are measured in every process.
+        cache: file that keeps which Gaussians the photos show; if None, every process measures them.
         backend: the rasterizer, see `rasterize`.
-        watch: called with a short description of slow work; None: a progress bar.
+        watch: called with a short description of slow work; if None, a progress bar is shown.
     """
 
     def __init__(
@@ -69,12 +68,12 @@ class ViewedScene:
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians are."""
+        """Device that holds the Gaussians."""
         return self.splats.means.device
 
     @property
     def photos(self) -> list[ScenePhoto]:
-        """Training photos, then held-out ones: names, cameras, poses."""
+        """Training photos, then held-out ones, each with its name, camera and pose."""
         return self.file.photos
 
     @cached_property
@@ -83,14 +82,14 @@ class ViewedScene:
         return overview(self.photos, tuple(self.splats.means.median(0).values.tolist()))
 
     def camera(self, place: Place, size: int | None = None, fov: float | None = None) -> Camera:
-        """A camera of the scene.
+        """Build a camera of the scene.
 
         Args:
             place: a camera; a photo by name; or a pose (camera → world in the model's frame, nerfstudio's
                 axes), which gets the first photo's lens.
-            size: longer side in pixels; by default a camera's own, and for photos that of the file, at most
-                1920.
-            fov: vertical field of view in degrees; by default that of the lens.
+            size: longer side in pixels; by default a camera keeps its size, and a photo has its file's, at
+                most 1920.
+            fov: vertical field of view in degrees; by default the lens's.
 
         Raises:
             UserError: no photo has this name, or the size or field of view is impossible.
@@ -109,11 +108,11 @@ class ViewedScene:
     def render(
         self, place: Place, size: int | None = None, fov: float | None = None, look: str | None = None
     ) -> View:
-        """The scene from a photo's viewpoint, a camera or a pose.
+        """Render the scene from a photo's viewpoint, a camera or a pose.
 
         Args:
             place, size, fov: see `camera`.
-            look: training photo whose lighting is used; default: by the scene's rule for this view.
+            look: training photo whose lighting is used; by default the scene's rule chooses for this view.
 
         Raises:
             UserError: see `camera`; or there is no look of this photo.
@@ -123,12 +122,12 @@ class ViewedScene:
     def draw(
         self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
     ) -> Rendering:
-        """Render a camera, as tensors on the scene's device.
+        """Render a camera as tensors on the scene's device.
 
         Args:
-            camera: where to render from.
+            camera: the camera to render from.
             channels: further values of the Gaussians to composite.
-            look: the lighting; default: by the scene's rule for this view.
+            look: the lighting; by default the scene's rule chooses for this view.
         """
         if look is None and self.looks is not None:
             look = self.looks.of_view(camera)
@@ -158,11 +157,11 @@ class ViewedScene:
         return self.file.photo(place).name if isinstance(place, str) else None
 
     def baked(self, look: str | None = None) -> Splats:
-        """The Gaussians for viewers that know no looks: under that of a training photo.
+        """Return the Gaussians with a training photo's look in their colors, for viewers that know no looks.
 
         Args:
-            look: the photo; default: the overview photo. Without looks the Gaussians are returned as they
-                are.
+            look: the photo; by default the overview photo. A scene without looks returns its Gaussians
+                unchanged.
         """
         if self.looks is None:
             if look is not None:
@@ -175,7 +174,7 @@ class ViewedScene:
 
     @cached_property
     def visible(self) -> Mapping[str, VisibleGaussians]:
-        """The Gaussians visible in the training views; measured once, with a progress bar."""
+        """The Gaussians visible in each training view. They are measured once, with a progress bar."""
         cameras = self._small_cameras
         views = load_visible(self._cache, self._views_key, cameras, self.device) if self._cache else None
         if views is None:
@@ -197,7 +196,7 @@ class ViewedScene:
 
     @cached_property
     def mass(self) -> Float[Tensor, " n"]:
-        """Pixels that every Gaussian fills, over all views."""
+        """Pixels that every Gaussian fills, summed over all views."""
         mass = self.splats.means.new_zeros(len(self.splats))
         for view in self.visible.values():
             mass[view.rows.long()] += view.pixels.float()
@@ -205,14 +204,14 @@ class ViewedScene:
 
     @cached_property
     def trained_side(self) -> int:
-        """Longer side of the photos in training, pixels: their median."""
+        """Median of the training photos' longer sides in pixels."""
         sides = sorted(max(p.camera.width, p.camera.height) for p in self.photos if p.split == "train")
         return sides[len(sides) // 2] if sides else LARGEST
 
     @cached_property
     def gap(self) -> float:
-        """Matches closer than this are connected: 3 % of the median distance at which the scene is seen,
-        about eight pixels of a small view; 0 if no training photo shows anything."""
+        """Distance in world units below which matches are connected: 3 % of the median distance at which the
+        scene is seen, about eight pixels of a small view; 0 if no training photo shows anything."""
         distances = torch.tensor([view.distance(self.splats.means) for view in self.visible.values()])
         return 0.03 * float(distances.nanmedian().nan_to_num())
 

@@ -1,4 +1,4 @@
-"""Words that a scene can be searched for, or that name what is seen at a place."""
+"""Words that a scene can be searched for, or that name the thing seen at a place."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ _COMMON = (
 )  # fmt: skip
 """Things around buildings that the table of architectural terms doesn't list."""
 _WHOLE = re.compile(r"(?P<end>[a-z]{3,})</w>|[▁Ġ](?P<start>[a-z]{3,})")
-"""Tokens that are words: marked at their end in CLIP's tables, at their start in others'."""
+"""Pattern of tokens that are whole words: CLIP's tables mark their end, others mark their start."""
 
 
 @lru_cache(maxsize=1)
 def shipped_vocabulary() -> tuple[str, ...]:
-    """Words and terms of architecture and its surroundings, in the singular, without repetition."""
+    """Return words and terms of architecture and its surroundings, in the singular, without repetition."""
     terms: dict[str, list[str]] = load_preset("synonyms/architecture")
     listed = [*_COMMON, *terms, *(word for words in terms.values() for word in words)]
     return tuple(dict.fromkeys(listed))
 
 
 def common_words() -> tuple[str, ...]:
-    """What a scene file knows without its CLIP: the shipped vocabulary, its single words in the plural too,
-    and the phrases that every query needs."""
+    """Return the words that a scene file can search for without its CLIP: the shipped vocabulary, its single
+    words in the plural too, and the phrases that every query needs."""
     words = shipped_vocabulary()
     plurals = [_plural(word) for word in words if " " not in word]
     return tuple(dict.fromkeys([*NEGATIVES, *CANONICAL, *UNRELATED, *words, *plurals]))
@@ -46,13 +46,13 @@ def _plural(word: str) -> str:
 
 
 def whole_words(clip: str | Path) -> tuple[str, ...]:
-    """Lower-case words of three letters or more that a CLIP's tokenizer knows as a whole, by its table.
+    """List the lower-case words of three letters or more that a CLIP's tokenizer has as single tokens.
 
     Args:
         clip: folder or name of the CLIP.
 
     Raises:
-        UserError: there is no such CLIP here.
+        UserError: there is no such CLIP on this machine.
     """
     folder = find_model(clip, CLIP_OPTION).folder
     tokens: Any = {}

@@ -1,1 +1,1 @@
-"""Static web page of a scene: splats in the browser, prompts answered beforehand as heat."""
+"""Static web page of a scene: splats in the browser, and prompts answered as heat."""

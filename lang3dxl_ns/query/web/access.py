@@ -1,4 +1,4 @@
-"""Who may use a viewer's server: checks of Host and Origin, and a token where other machines can reach it."""
+"""Access to a viewer's server: checks of Host and Origin, and a token where other machines can reach it."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from urllib.parse import parse_qs, urlsplit
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
 EVERYWHERE = ("", "0.0.0.0", "::")
-"""Addresses of servers that are reachable under all names of this machine."""
+"""Addresses at which a server is reachable under all names of this machine."""
 _TOKEN = "token"
 Response = tuple[HTTPStatus, dict[str, str], bytes]
 
 
 class Headers(Protocol):
-    """Headers of a request: `http.server`'s or websockets'."""
+    """Headers of a request, from `http.server` or websockets."""
 
     def get_all(self, name: str, /) -> Any:
-        """All values of this name; none or None if there is none."""
+        """Return all values of this name; an empty list or None if there are none."""
 
 
 def is_local(host: str) -> bool:
-    """Whether a server at this address can be reached from this machine only."""
-    with suppress(ValueError):  # a name
+    """Return whether only this machine can reach a server at this address."""
+    with suppress(ValueError):  # the host may be a name
         return ipaddress.ip_address(host).is_loopback
     return host == "localhost"
 
@@ -36,9 +36,9 @@ def is_local(host: str) -> bool:
 class Access:
     """Access rules of one server.
 
-    One that only this machine can reach answers requests by its own names (against DNS rebinding) from its
-    own pages. One that others can reach answers those who opened the address with the token, which becomes a
-    cookie.
+    A server that only this machine can reach answers requests for the machine's own names (against DNS
+    rebinding) from its own pages. A server that others can reach answers clients that opened the address with
+    the token, which becomes a cookie.
     """
 
     host: str
@@ -49,7 +49,7 @@ class Access:
 
     @property
     def needs_token(self) -> bool:
-        """Whether other machines can reach the server."""
+        """Whether clients need the token, since other machines can reach the server."""
         return self.public or not is_local(self.host)
 
     @property
@@ -60,7 +60,7 @@ class Access:
         return f"http://{host}:{self.port}/" + (f"?{_TOKEN}={self.token}" if self.needs_token else "")
 
     def refusal(self, path: str, headers: Headers) -> Response | None:
-        """The response to a refused request; None for one that may proceed."""
+        """Return the response to a refused request; None for one that may proceed."""
         try:
             host, origin = _only(headers, "Host") or "", _only(headers, "Origin")
             if not self._is_ours(host) or (origin is not None and not self._same_site(origin, host)):
@@ -80,7 +80,7 @@ class Access:
         return f"viewer-{self.port}"
 
     def _is_ours(self, host: str) -> bool:
-        """Whether the host name is ours; with a token, the token protects."""
+        """Return whether the host name is this server's; with a token any name passes."""
         return self.needs_token or urlsplit(f"//{host}").hostname in (*LOCAL_NAMES, self.host)
 
     def _same_site(self, origin: str, host: str) -> bool:
@@ -97,7 +97,7 @@ class Access:
 
 
 def _only(headers: Headers, name: str) -> str | None:
-    """A header's value. Raises ValueError if it is given twice."""
+    """Return a header's value, if any. Raises ValueError if it is given twice."""
     values = headers.get_all(name) or []
     if len(values) > 1:
         raise ValueError(f"{name} is given twice")

@@ -1,15 +1,15 @@
-// Answers: cosines to relevancy, the threshold from which a place matches, and doubt, as in Python's query/.
+// Answers: relevancy from cosines, the threshold above which a place matches, and doubt, as in Python's query/.
 
-const CLEAR = 0.55; // relevancy from which a word names a place that is else sky, or nothing in particular
+const CLEAR = 0.55; // relevancy above which a word names a place that otherwise counts as sky or as nothing
 const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.4, BEST = 0.005, LEAST_PEAK = 0.1;
-const TIE = 0.999; // numbers of 16 bits: what is equal in Python may differ by less than this
+const TIE = 0.999; // values that are equal in Python may differ by this factor in 16 bits
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
 
 export class Answers {
   constructor(rows, vocabulary, words) {
     Object.assign(this, { rows, vocabulary, words });
-    this.competing = []; // cosines with shared negatives as 16-bit integers, made when first needed
+    this.competing = []; // cosines with shared negatives as 16-bit integers, computed when first needed
     this.foreground = null; // 1 for Gaussians that may match
   }
 
@@ -18,8 +18,8 @@ export class Answers {
     return this.competing[i];
   }
 
-  /** Relevancy of every Gaussian, 0…1: sigmoid(τ margin), 0 where nothing is known. The margin of a text is the
-   * best of near − the best of the others; a taught word adds a share of it to its own. */
+  /** Compute every Gaussian's relevancy, 0…1: sigmoid(τ margin), 0 where nothing is known. A text's margin is the
+   * best of near − the best of the others; a taught word adds a share of it to its own margin. */
   relevancy({ near, against, taught }, negatives = []) {
     const best = largest(near.map((vector) => this.rows.times(vector)));
     const own = negatives.map((vector) => this.rows.times(vector)), shared = against.map((i) => this.competitor(i));
@@ -35,8 +35,8 @@ export class Answers {
     return best;
   }
 
-  /** What is found: peak, doubt, threshold, and the number of Gaussians of the foreground that match.
-   * strict: whether it has to beat negatives of its own, or was taught; doubt: where it is known. */
+  /** Return peak, doubt, threshold, and the number of Gaussians of the foreground that match.
+   * strict: whether the prompt has negatives of its own, or was taught; doubt: if it is already known. */
   verdict(relevancy, { strict = false, doubt = null, threshold = null }) {
     const sorted = relevancy.slice().sort(), count = sorted.length;
     let fit = 0;
@@ -45,7 +45,7 @@ export class Answers {
     const { unrelated } = this.words;
     const asWell = unrelated.filter((other) => other >= fit * TIE).length;
     doubt ??= fit < LEAST_PEAK ? 1 : (1 + asWell) / (1 + unrelated.length);
-    const low = sorted[(count - 1) >> 1]; // the median, as torch takes it
+    const low = sorted[(count - 1) >> 1]; // the lower median, as in torch
     const own = doubt > DOUBTFUL || strict ? EVEN : Math.min(low + SHARE * (fit - low), EVEN);
     const level = threshold ?? own, { foreground } = this;
     const confined = foreground ? relevancy.map((value, i) => value * foreground[i]) : relevancy;
@@ -54,7 +54,7 @@ export class Answers {
     return { relevancy: confined, peak, doubt, doubtful: doubt > DOUBTFUL, threshold: level, matching };
   }
 
-  /** The words that fit a blend of rows best, with their relevancy, best first; none at the sky. */
+  /** Find the words that match a blend of rows best, with their relevancy, best first; none at the sky. */
   naming(blend, most = 5) {
     const { vocabulary, words } = this, length = norm(blend, words.gram);
     const cosine = (vector) => dot(blend, vector) / length;
@@ -70,7 +70,7 @@ export class Answers {
 
 export const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
 
-/** Length of the feature that a row stands for; gram: products of the decoder's last layer, or null. */
+/** Compute the length of a row's feature; gram: products of the decoder's last layer, or null. */
 export function norm(row, gram) {
   if (!gram) return Math.sqrt(dot(row, row));
   const width = row.length;

@@ -3,7 +3,7 @@
 export const percent = (share) => (share > 0 && share < 0.01 ? "under 1 %" : `${Math.round(100 * share)} %`);
 export const shown = (text, most = 60) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);
 
-/** An element with these properties and children; texts stay texts. */
+/** Create an element with these properties and children; texts are never parsed as HTML. */
 export function element(tag, properties = {}, ...children) {
   const made = Object.assign(document.createElement(tag), properties);
   made.append(...children);
@@ -27,7 +27,7 @@ function doubtIn({ examples, open, taught, doubt, doubtful }) {
   return `Fits better than ${percent(1 - doubt)} of unrelated words.`;
 }
 
-/** acts: { fly, remove, rename, setThreshold, teach, undo, forget }, each called with the prompt. */
+/** Build a prompt's card. acts: { fly, remove, rename, setThreshold, teach, undo, forget }, each called with the prompt. */
 export function promptCard(prompt, { fly, remove, rename, setThreshold, teach, undo, forget }) {
   const { text, negatives, color, threshold, peak, matching, views, examples, open } = prompt;
   const card = element("li");

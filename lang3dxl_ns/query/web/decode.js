@@ -7,7 +7,7 @@ const HALVES = Float32Array.from({ length: 65536 }, (_, bits) => {
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -14 * (fraction / 1024));
 });
 
-/** Half floats as floats. */
+/** Convert half floats to floats. */
 export const floats = (halves) => Float32Array.from(halves, (bits) => HALVES[bits]);
 
 /** A matrix of as many rows as there are Gaussians: 16 bits per value, and a scale per row. */
@@ -16,7 +16,7 @@ export class Rows {
     this.count = count;
     this.width = width;
     this.values = new Int16Array(count * width);
-    this.scales = new Float32Array(count); // 0 where nothing is known
+    this.scales = new Float32Array(count); // 0 for Gaussians without a known meaning
   }
 
   set(i, row, factor) {
@@ -27,7 +27,7 @@ export class Rows {
     this.scales[i] = (largest * factor) / 32767;
   }
 
-  /** Product of every row with a vector. */
+  /** Multiply every row by a vector. */
   times(vector) {
     const { values, scales, width } = this, products = new Float32Array(this.count);
     for (let i = 0, at = 0; i < this.count; i++) {
@@ -43,14 +43,14 @@ export class Rows {
   }
 }
 
-/** Rows as they were shipped, for decoders that are too wide for a page. */
+/** Read rows that were decoded beforehand, for decoders that are too wide for a page. */
 export function shippedRows(words, buffer) {
   const { count, width } = words, rows = new Rows(count, width), halves = new Uint16Array(buffer);
   for (let i = 0; i < count; i++) rows.set(i, floats(halves.subarray(i * width, (i + 1) * width)), 1);
   return rows;
 }
 
-/** Decode codes (16-bit coordinates, then half-precision 1 / |d|). Yields now and then, to report progress. */
+/** Decode codes (16-bit coordinates, then half-precision 1 / |d|). Wait for `progress` now and then, to report it. */
 export async function decodedRows(words, codesBuffer, fieldBuffer, progress = () => {}) {
   const { count, width, field } = words, d = field.dimensions;
   const codes = new Uint16Array(codesBuffer, 0, count * d);
@@ -69,7 +69,7 @@ export async function decodedRows(words, codesBuffer, fieldBuffer, progress = ()
   return rows;
 }
 
-/** The field as a function from a place in [0, 1]^d to its last hidden layer. */
+/** Build the field as a function from a place in [0, 1]^d to its last hidden layer. */
 function hiddenLayer(field, buffer) {
   const { dimensions: d, frequencies } = field;
   let read = 0;
@@ -103,7 +103,7 @@ function fourier(place, frequencies, encoding) {
 
 const KEYS = new Int32Array(12), WEIGHTS = new Float64Array(12); // lower and upper vertex per axis
 
-/** Multilinear interpolation of the hash grid's entries, level by level (Müller et al. 2022). */
+/** Interpolate the hash grid's entries multilinearly, level by level (Müller et al. 2022). */
 function interpolate(place, field, table, encoding, start) {
   const { dimensions: d, features, cells, offsets, dense, mask, primes } = field, corners = 1 << d;
   encoding.fill(0, start);

@@ -1,8 +1,8 @@
-// Where a match is: the views that show it best, and a box around its strongest part, as in Python's query/.
+// Location of a match: the views that show it best, and a box around its strongest part, as in Python's query/.
 
 const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, OUTLIERS = 0.02, CORE = 0.002, BINS = 1000;
 
-/** Views with the Gaussians that they show, and the share of the view that each fills: sizes[codes[k]]. */
+/** Read views with the Gaussians that they show, and the share of the view that each fills: sizes[codes[k]]. */
 export function readViews(about, buffer) {
   const { count, pixels: [least, steps] } = about.words, bits = Math.ceil(count / 8);
   let start = 0;
@@ -15,7 +15,7 @@ export function readViews(about, buffer) {
   });
 }
 
-/** Views by how well they show a match; see rank_views.py. */
+/** Rank views by how well they show a match; see rank_views.py. */
 export function rankViews(views, centers, relevancy, threshold) {
   const peaks = views.map((view) => peakOf(view, relevancy)), top = Math.max(...peaks);
   const low = top > threshold ? threshold : relevancy.slice().sort()[(relevancy.length - 1) >> 1];
@@ -38,7 +38,7 @@ export function rankViews(views, centers, relevancy, threshold) {
   return ranked.sort((a, b) => b.shown - a.shown || b.rank - a.rank);
 }
 
-/** Mean relevancy of the most relevant share PEAK of a view. */
+/** Compute the mean relevancy of the most relevant share PEAK of a view. */
 function peakOf({ rows, codes, sizes }, relevancy) {
   const filled = new Float32Array(BINS + 1), bin = (k) => Math.floor(BINS * relevancy[rows[k]]);
   for (let k = 0; k < rows.length; k++) filled[bin(k)] += sizes[codes[k]];
@@ -65,14 +65,14 @@ function centeredness({ pose, fx, fy, cx, cy, width, height }, centers, row) {
   return 1 - (1 - RIM) * Math.max(0, Math.min((off - 0.5) / 0.5, 1));
 }
 
-/** Pixels that every Gaussian fills, over all views. */
+/** Sum the pixels that every Gaussian fills, over all views. */
 export function massOf(views, count) {
   const mass = new Float32Array(count);
   for (const { rows, codes, sizes, width, height } of views) rows.forEach((row, k) => (mass[row] += sizes[codes[k]] * width * height));
   return mass;
 }
 
-/** A box around the strongest connected match: { low, high }; null if nothing matches. */
+/** Find the box around the strongest connected match: { low, high }; null if nothing matches. */
 export function boxAround(centers, relevancy, mass, threshold, gap) {
   const matching = [];
   for (let i = 0; i < relevancy.length; i++) if (relevancy[i] > threshold && mass[i] > 0) matching.push(i);
@@ -90,8 +90,8 @@ export function boxAround(centers, relevancy, mass, threshold, gap) {
   return { low: ends.map(([low]) => low), high: ends.map(([, high]) => high) };
 }
 
-/** Of Gaussians in touching cells of this size, the group that weighs most; cells that weigh nearly nothing
- * part groups. */
+/** Group Gaussians in touching cells of this size, and return the heaviest group. Cells with hardly any weight
+ * separate groups. */
 function heaviestGroup(rows, centers, weightOf, size) {
   const cells = new Map();
   for (const i of rows) {

@@ -1,11 +1,11 @@
-// "Like this": a place shown by example, told apart from the rest of the scene.
+// "Like this": search by example, against the rest of the scene.
 
-const RIDGE = 0.01, STEPS = 8, OTHERS = 2000; // penalty, Newton steps, Gaussians that stand for the scene
+const RIDGE = 0.01, STEPS = 8, OTHERS = 2000; // penalty, Newton steps, Gaussians that represent the scene
 
-/** Probability of every Gaussian to be like the examples: [{ rows, without }], Gaussians that were clicked.
+/** Compute every Gaussian's probability of being like the examples: [{ rows, without }], Gaussians that were clicked.
  *
- * A weighted logistic regression on the decoder's rows, standardized over the scene. Examples weigh as much
- * together as what they are told apart from: the scene, and Gaussians clicked `without`. */
+ * This is a weighted logistic regression on the decoder's rows, standardized over the scene. Together the examples
+ * weigh as much as what they compete with: the scene, and Gaussians clicked `without`. */
 export function likeness(rows, examples) {
   const { width, count } = rows, known = [];
   for (let i = 0, step = Math.max(Math.floor(count / OTHERS), 1); i < count; i += step) if (rows.scales[i]) known.push(i);
@@ -21,7 +21,7 @@ export function likeness(rows, examples) {
   const mean = new Float64Array(width), spread = new Float64Array(width);
   for (const row of others) row.forEach((x, j) => (mean[j] += x / others.length));
   for (const row of others) row.forEach((x, j) => (spread[j] += (x - mean[j]) ** 2 / others.length));
-  const least = 1e-3 * Math.sqrt(Math.max(...spread)); // below it there are rounding errors only
+  const least = 1e-3 * Math.sqrt(Math.max(...spread)); // smaller spreads are rounding errors
   const scale = spread.map((variance) => 1 / Math.max(Math.sqrt(variance), least, 1e-9));
   for (const sample of samples) sample.at = [...Array.from(sample.row, (x, j) => (x - mean[j]) * scale[j]), 1];
   const weights = fitted(samples, width + 1), direction = scale.map((s, j) => s * weights[j]);
@@ -29,7 +29,7 @@ export function likeness(rows, examples) {
   return rows.times(direction).map((x, i) => (rows.scales[i] ? 1 / (1 + Math.exp(-x - start)) : 0));
 }
 
-/** Weights of the logistic regression, by Newton's method; the last one, the constant, is not penalized. */
+/** Fit the logistic regression's weights by Newton's method; the last one, the constant, is hardly penalized. */
 function fitted(samples, size) {
   const weights = new Float64Array(size);
   for (let step = 0; step < STEPS; step++) {
@@ -52,7 +52,7 @@ function fitted(samples, size) {
   return weights;
 }
 
-/** Solution of a symmetric positive system, given its lower half, by Cholesky's factors (overwritten). */
+/** Solve a symmetric positive system, given its lower half, which its Cholesky factors overwrite. */
 function solved(matrix, right) {
   const size = right.length, found = Float64Array.from(right);
   for (let j = 0; j < size; j++) {

@@ -26,12 +26,12 @@ from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera
 
 _LOG_SCALES = (-12.0, 9.0)
-"""Range of the logarithms of standard deviations, as the page's renderer packs them."""
+"""Range of the logarithms of standard deviations in the renderer's packed form."""
 _MOST_PRODUCTS = 30_000
-"""Multiplications per Gaussian up to which the page decodes codes itself; otherwise it gets decoded rows."""
+"""Most multiplications per Gaussian for which the page decodes codes itself; beyond, it gets decoded rows."""
 _MOST_ROW_BYTES = 200_000_000
 LEAST_PIXELS, PIXEL_STEPS = 0.05, 12
-"""Pixels of a view that code 0 stands for, and codes per doubling: 12.75 would reach 50,000 pixels."""
+"""Pixels of a view that code 0 stands for, and codes per doubling; 12.75 would reach only 50,000 pixels."""
 
 
 # ── splats ──────────────────────────────────────────────────────────────────────────────────────────────
@@ -40,16 +40,16 @@ LEAST_PIXELS, PIXEL_STEPS = 0.05, 12
 def pack_splats(
     splats: Splats, center: Float[Tensor, "3"], toward: Float[Tensor, "3"]
 ) -> UInt8[Array, "n 16"]:
-    """16 bytes per Gaussian, in Spark's packed form.
+    """Pack splats into 16 bytes per Gaussian, in Spark's format.
 
-    Red, green, blue, opacity; half-precision means; two octahedral coordinates of the rotation's axis; three
-    logarithmic scales; the rotation's angle. Gaussians with a NaN or infinite value become invisible, so that
-    row numbers stay those of the scene.
+    The bytes are: red, green, blue, opacity; half-precision means; two octahedral coordinates of the
+    rotation's axis; three logarithmic scales; the rotation's angle. Gaussians with a NaN or infinite value
+    become invisible, so that row numbers stay those of the scene.
 
     Args:
         splats: the Gaussians.
         center: origin of the packed means, world units: half precision is finest close to it.
-        toward: viewing position that colors are taken for, world units.
+        toward: viewing position for which colors are computed, world units.
     """
     sound = splats.sound()[:, None]
     means = torch.where(sound, splats.means - center, 0.0).cpu().numpy().astype("<f2")
@@ -67,14 +67,14 @@ def pack_splats(
 
 
 def pack_colors(splats: Splats, toward: Float[Tensor, "3"]) -> UInt8[Array, "n 4"]:
-    """Red, green, blue and opacity as bytes; see `pack_splats`."""
+    """Convert red, green, blue and opacity to bytes; see `pack_splats`."""
     values = torch.cat([splats.colors(toward), splats.opacities[:, None]], dim=1)
     values = torch.where(splats.sound()[:, None], values, 0.0).clamp(0, 1)
     return (values * 255).round().byte().cpu().numpy()
 
 
 def _octahedral(quats: Float[Tensor, "n 4"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
-    """Axes as octahedral coordinates, and angles (0 to π), of rotations; both as 0…255."""
+    """Convert rotations to octahedral coordinates of their axes and angles (0 to π), both as 0…255."""
     quats = torch.where(quats.norm(dim=1, keepdim=True) > 0, quats, quats.new_tensor([1.0, 0, 0, 0]))
     quats = F.normalize(quats, dim=1)
     quats = torch.where(quats[:, :1] < 0, -quats, quats)
@@ -92,21 +92,21 @@ def _octahedral(quats: Float[Tensor, "n 4"]) -> tuple[Float[Array, "n 2"], Float
 
 @dataclass(frozen=True)
 class PackedMeaning:
-    """What the page decodes every Gaussian's row ((h, 1) / |d|) from, and how texts are turned to match."""
+    """Data for decoding every Gaussian's row ((h, 1) / |d|) in the page, and the matrix that adapts texts."""
 
     description: dict[str, Any]
     """Sizes and settings, for the page's decode.js."""
     files: dict[str, bytes]
     head: Float[Tensor, "r c"] | None
-    """Turns a row into a unit feature; None if rows are unit features already."""
+    """Matrix that turns a row into a unit feature; None if rows are unit features already."""
 
     def of_texts(self, vectors: Float[Tensor, "v c"]) -> Float[Tensor, "v r"]:
-        """The r numbers whose product with a row is the cosine."""
+        """Compute the r numbers of each text whose product with a row is the cosine."""
         return vectors if self.head is None else vectors @ self.head.T
 
 
 def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
-    """Codes and a small field or, for wide decoders, decoded rows.
+    """Pack codes and a small field or, for wide decoders, decoded rows.
 
     Raises:
         UserError: the rows of a wide decoder are too large for a page.
@@ -130,7 +130,8 @@ def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning
 
 
 def _is_small(field: SemanticField) -> bool:
-    """Whether the page can decode this field: bounded codes, one pass through the grid, small layers."""
+    """Return whether the page can decode this field: bounded codes, one pass through the grid, small
+    layers."""
     settings = field.settings
     products = sum(layer.weight.numel() for layer in _linear_layers(field))
     return settings.bounding == "sigmoid" and not settings.indexed and products <= _MOST_PRODUCTS
@@ -168,7 +169,7 @@ def _packed_field(field: SemanticField) -> tuple[dict[str, Any], dict[str, bytes
 
 
 def pack_view(view: VisibleGaussians, count: int) -> bytes:
-    """Which Gaussians a view shows, a bit each, and the pixels that each of them fills, a byte each."""
+    """Pack which Gaussians a view shows (a bit each), and the pixels that each of these fills (a byte)."""
     pixels = view.pixels.float().cpu().numpy()
     keep = pixels >= LEAST_PIXELS
     seen = np.zeros(count, bool)
@@ -178,14 +179,14 @@ def pack_view(view: VisibleGaussians, count: int) -> bytes:
 
 
 def camera_json(camera: Camera) -> dict[str, Any]:
-    """A camera as the page takes it: pose (camera → world, nerfstudio's axes, by rows) and pinhole lens."""
+    """Describe a camera for the page: pose (camera → world, nerfstudio's axes, by rows) and pinhole lens."""
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.double().tolist()
     lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.width, "height": camera.height}
     return {"pose": camera.pose.tolist(), **lens}
 
 
 def halves(values: Tensor) -> bytes:
-    """The values in half precision."""
+    """Encode values in half precision."""
     return _array(values).astype("<f2").tobytes()
 
 
@@ -194,6 +195,6 @@ def _array(values: Tensor) -> Shaped[Array, "..."]:
 
 
 def spread(items: Sequence[Any], most: int) -> list[Any]:
-    """At most so many of them, evenly chosen."""
+    """Choose at most this many of the items, evenly spaced."""
     count = min(most, len(items))
     return [items[i * len(items) // count] for i in range(count)]

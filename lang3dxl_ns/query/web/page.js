@@ -1,9 +1,9 @@
-// The page: the search box and its prompts, what a click tells, the address, and the keys.
+// The page: the search box and its prompts, answers to clicks, the address, and the keys.
 import { element, explain, percent, promptCard, say, shown } from "./cards.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
-const MOST_KEPT = 20, TYPING = 500; // earlier prompts, and named words; milliseconds until negatives take effect
+const MOST_KEPT = 20, TYPING = 500; // most earlier prompts or named words; milliseconds until negatives take effect
 const UNNAMED = /^like this \d+$/;
 const $ = (id) => document.getElementById(id);
 const prompts = [];
@@ -33,7 +33,7 @@ function think(job, input = {}) {
 
 const commonNegatives = () => $("not").value.split(/[,;]/).map(tidy).filter(Boolean);
 
-/** Answer a prompt anew, and show it. */
+/** Answer a prompt anew, with the common negatives. */
 async function answer(prompt) {
   const { text, examples, chosen: threshold } = prompt, negatives = [...prompt.negatives, ...commonNegatives()];
   const turn = (prompt.turn = {}); // a later answer to the same prompt wins
@@ -42,7 +42,7 @@ async function answer(prompt) {
   return Object.assign(prompt, found, { views: null, box: null, finding: null });
 }
 
-/** Look for the views that show prompts best, once their heat is drawn. */
+/** Find the views that show prompts best, once their heat is drawn. */
 function findPlaces() {
   for (const prompt of prompts.filter((one) => one.relevancy && !one.finding)) {
     const { relevancy, threshold, turn } = prompt;
@@ -55,7 +55,7 @@ function findPlaces() {
   }
 }
 
-/** Ask prompts as if typed: several are separated by `;`. Resolves to the answer to the last. */
+/** Ask prompts as if typed, separated by `;`. Resolves to the answer to the last one. */
 async function ask(typed) {
   await reading;
   $("near").replaceChildren();
@@ -85,7 +85,7 @@ function offerClosest({ unknown, closest }) {
 
 const unusedColor = () => about.colors.find((color) => prompts.every((prompt) => prompt.color !== color)) ?? about.colors[prompts.length % about.colors.length];
 
-/** Run what may fail, and tell why. */
+/** Run work that may fail, and show the reason if it does. */
 async function attempt(work) {
   try {
     return await work();
@@ -96,7 +96,7 @@ async function attempt(work) {
 
 // ── showing ──
 
-/** Show all prompts; newest: the one to scroll to, where the panel is small. */
+/** Show all prompts, and scroll to `newest`, for small panels. */
 function draw(newest = null) {
   const acts = { fly, remove, rename, setThreshold, teach, undo, forget };
   for (const prompt of prompts) prompt.card = promptCard(prompt, acts);
@@ -176,7 +176,7 @@ async function tell({ x, y, without }) {
   $("here").hidden = false;
 }
 
-/** Light up what looks like the place clicked last; further clicks are further examples. */
+/** Highlight what looks like the place clicked last; further clicks add examples. */
 function likeThis() {
   const number = prompts.filter((prompt) => prompt.examples).length + 1;
   const prompt = { text: `like this ${number}`, negatives: [], examples: [], color: unusedColor() };
@@ -185,7 +185,7 @@ function likeThis() {
   attempt(() => addExample(prompt, false));
 }
 
-/** Whether clicks are further examples of this prompt. */
+/** Set whether clicks add examples to this prompt. */
 function teach(prompt, open = !prompt.open) {
   for (const other of prompts) other.open = other === prompt && open;
   $("here").hidden = true;
@@ -199,7 +199,7 @@ async function addExample(prompt, without) {
   draw(prompt);
 }
 
-/** Take the latest example back. */
+/** Remove the latest example. */
 async function undo(prompt) {
   if (prompt.examples.length === 1) return remove(prompt);
   prompt.examples.pop();
@@ -213,19 +213,19 @@ function forget(prompt) {
   remove(prompt);
 }
 
-/** Keep a named word in this browser, instead of one of the same name and of its former name. */
+/** Keep a named word in this browser; it replaces those with its present and former name. */
 function keepWord({ text, examples, named }, before = text) {
   const others = stored("words").filter(({ name }) => ![text, before].includes(name));
   if (named) store("words", [{ name: text, examples }, ...others]);
 }
 
-/** A word that was named in this browser, as a prompt. */
+/** Return a word that was named in this browser as a prompt; null if there is none. */
 function namedWord(text) {
   const found = stored("words").find(({ name }) => name?.toLowerCase() === text.toLowerCase());
   return found && areExamples(found.examples) ? { text: found.name, examples: found.examples, named: true } : null;
 }
 
-/** Whether these are examples in this scene, the first one of what is meant. */
+/** Return whether these are examples in this scene, and the first one shows what is meant. */
 function areExamples(examples) {
   const known = (row) => Number.isInteger(row) && row >= 0 && row < about.count;
   return Array.isArray(examples) && examples.length > 0 && !examples[0].without && examples.every(({ rows }) => rows?.length && rows.every(known));
@@ -268,21 +268,21 @@ async function readExamples(like) {
   await answer(prompt);
 }
 
-/** What this browser keeps about the scene: earlier "prompts" and named "words", latest first. */
+/** Key of a list kept in this browser for the scene: earlier "prompts" or named "words", latest first. */
 const memory = (kind) => `lang3dxl ${kind} ${about.title} ${about.count} ${about.center}`;
 
 function stored(kind) {
   try {
     return [JSON.parse(localStorage.getItem(memory(kind)))].flat().filter(Boolean);
   } catch {
-    return []; // a browser that keeps nothing
+    return []; // the browser keeps nothing
   }
 }
 
 function store(kind, list) {
   try {
     localStorage.setItem(memory(kind), JSON.stringify(list.slice(0, MOST_KEPT)));
-  } catch {} // the same
+  } catch {} // the browser keeps nothing
 }
 
 const remember = (text) => store("prompts", [text, ...stored("prompts").filter((other) => other !== text)]);
@@ -354,11 +354,11 @@ async function copyLink() {
   say("The link is in the clipboard: it opens what you see.");
 }
 
-/** Colors in the lighting of a photo. */
+/** Show the scene in the chosen photo's lighting. */
 async function light() {
   const photo = $("look").value;
   const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.own;
-  if ($("look").value === photo) view.light(colors); // a later choice may have been read before
+  if ($("look").value === photo) view.light(colors); // unless a later choice has been read in the meantime
 }
 
 // ── start ──
@@ -390,7 +390,7 @@ async function readMeaning(splats) {
   say(explain(about));
 }
 
-/** Show what the address says, or what the page opens with. */
+/** Show the prompts in the address, or else those that the page opens with. */
 async function begin() {
   if (location.hash.length > 1) await readAddress();
   else for (const [text, ...negatives] of about.prompts) await ask(asTyped({ text, negatives }));

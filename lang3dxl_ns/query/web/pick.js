@@ -1,10 +1,10 @@
 // The Gaussians that a pixel shows, front to back, with their weights in the picture.
 import { floats } from "./decode.js";
 
-const BLUR = 0.3; // square pixels that every splat is widened by, as in training
-const MARGIN = 1.3; // half sizes of the picture beyond which a splat's shape is that at this place: see ellipses.py
+const BLUR = 0.3; // square pixels added to every splat's variance, as in training
+const MARGIN = 1.3; // half sizes of the picture beyond which a splat keeps its shape at this limit: see ellipses.py
 
-/** Centers [3n] (relative to the scene's origin), axes [9n] scaled by the standard deviations, opacities [n]. */
+/** Unpack centers [3n] (relative to the scene's origin), axes [9n] scaled by standard deviations, opacities [n]. */
 export function unpackSplats(buffer) {
   const bytes = new Uint8Array(buffer), halves = new Uint16Array(buffer), count = bytes.length / 16;
   const centers = new Float32Array(3 * count), axes = new Float32Array(9 * count), opacities = new Float32Array(count);
@@ -20,7 +20,7 @@ export function unpackSplats(buffer) {
   return { centers, axes, opacities };
 }
 
-/** Columns, one after the other, of the rotation by an angle about an axis (Rodrigues). */
+/** Compute the rotation by an angle about an axis (Rodrigues), column by column. */
 function rotation(axis, angle) {
   const length = Math.hypot(...axis), [x, y, z] = axis.map((value) => value / length);
   const c = Math.cos(angle), s = Math.sin(angle), t = 1 - c;
@@ -28,8 +28,8 @@ function rotation(axis, angle) {
     t * x * z + s * y, t * y * z - s * x, c + t * z * z]; // prettier-ignore
 }
 
-/** camera: { view: world → camera by columns, looking along −z; focal, width, height in pixels }; x, y: pixel.
- * Returns pairs of row and weight. */
+/** Return the Gaussians that pixel x, y shows, as pairs of row and weight.
+ * camera: { view: world → camera by columns, looking along −z; focal, width, height in pixels }. */
 export function gaussiansAt({ centers, axes, opacities }, { view, focal, width, height }, x, y, antialiased) {
   const hits = [];
   const [widest, highest] = [width, height].map((side) => (MARGIN * side) / 2 / focal);

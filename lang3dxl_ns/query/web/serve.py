@@ -16,9 +16,9 @@ from lang3dxl_ns.query.web.access import Access
 from lang3dxl_ns.query.web.write_page import Page
 
 FIRST_PORT, PORTS = 7007, 20
-"""Ports tried where none is requested."""
+"""First port, and number of ports, that are tried if none is requested."""
 _PATIENCE = 30.0
-"""Seconds that a connection may stay silent."""
+"""Seconds that a connection may stay silent before it is closed."""
 _KINDS = {
     "html": "text/html; charset=utf-8",
     "css": "text/css; charset=utf-8",
@@ -37,7 +37,7 @@ _HEADERS = {
 
 
 class PageServer(ThreadingHTTPServer):
-    """Serves one page from memory, until `shutdown`.
+    """Server of one page from memory, until `shutdown`.
 
     Args:
         page: the page, with `live` set.
@@ -69,12 +69,12 @@ class PageServer(ThreadingHTTPServer):
         raise UserError(f"nothing can be served at {ask} ({reason}): choose another --port or --host")
 
     def server_bind(self) -> None:
-        """Bind without asking for this machine's name, which may take seconds."""
+        """Bind without resolving this machine's name, which may take seconds."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = self.access.host, self.server_address[1]
 
     def answer(self, path: str) -> tuple[HTTPStatus, str, bytes]:
-        """Status, type and content for a path of the page, or a request of it."""
+        """Return status, type and content for a path of the page or of its API."""
         place = urlsplit(path)
         values = dict(parse_qsl(place.query))
         if place.path == "/api/encode":
@@ -92,7 +92,7 @@ class PageServer(ThreadingHTTPServer):
 
 
 class Handler(BaseHTTPRequestHandler):
-    """One connection of a `PageServer`."""
+    """Handler of one connection to a `PageServer`."""
 
     server: PageServer
     protocol_version = "HTTP/1.1"
@@ -100,13 +100,13 @@ class Handler(BaseHTTPRequestHandler):
     timeout = _PATIENCE
 
     def do_GET(self) -> None:
-        """Answer, unless access is refused."""
+        """Answer the request, unless access is refused."""
         refused = self.server.access.refusal(self.path, self.headers)
         if refused is not None:
             return self._send(*refused)
         try:
             status, kind, content = self.server.answer(self.path)
-        except (UserError, ValueError) as error:  # ValueError: an impossible address
+        except (UserError, ValueError) as error:  # an impossible address raises ValueError
             status, kind = HTTPStatus.BAD_REQUEST, _KINDS["txt"]
             content = f"{error}".encode("utf-8", "replace")
         self._send(status, {"Content-Type": kind}, content)
@@ -116,8 +116,8 @@ class Handler(BaseHTTPRequestHandler):
         for name, value in {**_HEADERS, **headers, "Content-Length": str(len(content))}.items():
             self.send_header(name, value)
         self.end_headers()
-        with contextlib.suppress(ConnectionError):  # the browser has gone on
+        with contextlib.suppress(ConnectionError):  # the browser closed the connection
             self.wfile.write(content)
 
     def log_message(self, *_: object) -> None:
-        """No lines for requests."""
+        """Log nothing, where the parent would log every request."""

@@ -1,4 +1,4 @@
-// Runs before everything else, without modules: says why nothing will happen where it can't.
+// Runs first, without modules, and says why where the page cannot work.
 (function () {
   var status = document.getElementById("status");
   if (location.protocol === "file:") {

@@ -2,11 +2,11 @@
 import { OrbitControls, PackedSplats, PerspectiveCamera, Scene, SparkRenderer, SplatMesh, Vector3, WebGLRenderer } from "./splats.js";
 
 const FLIGHT = 1200, WIDEST = 85, HEAT = 0.7, BLUR = 0.3; // milliseconds, degrees, opacity, square pixels
-const FLUENT = 40, COARSEST = 0.3, STILL = 150; // milliseconds of a frame, share of the pixels' side, milliseconds
+const FLUENT = 40, COARSEST = 0.3, STILL = 150; // milliseconds of a frame, least share of pixels a side, milliseconds
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 
 export class View extends EventTarget {
-  /** about: the page's description; frame: the element to fill. Fires `moved`, `drawn` and `click`. */
+  /** Fill an element. about: the page's description; frame: the element. Fires `moved`, `drawn` and `click`. */
   constructor(about, frame) {
     super();
     Object.assign(this, { about, frame });
@@ -51,7 +51,7 @@ export class View extends EventTarget {
     this.recolor();
   }
 
-  /** Colors and opacities of all splats, four bytes each, before heat. */
+  /** Set the colors and opacities of all splats, four bytes each, before heat. */
   light(colors) {
     this.plain = colors;
     this.layers = null;
@@ -80,8 +80,8 @@ export class View extends EventTarget {
 
   // ── camera ──
 
-  /** Where a photo was taken, so that the window shows all of it (up to a widest lens). target: what to turn
-   * around, moved onto the photo's axis; the scene's middle by default. */
+  /** Compute the viewpoint of a photo whose whole picture the window shows (up to a widest lens). target: point to
+   * orbit, moved onto the photo's axis; the scene's center by default. */
   standing({ pose, fx, fy, cx, cy, width, height }, target = this.about.center) {
     const [position, ahead] = [3, 2].map((k) => new Vector3(...pose.slice(0, 3).map((row) => (k === 3 ? row[3] : -row[2]))));
     const distance = Math.max(new Vector3(...target).sub(position).dot(ahead), 0.05);
@@ -103,7 +103,7 @@ export class View extends EventTarget {
     this.wake();
   }
 
-  /** Ten numbers or fewer as text: position, orbit center, field of view. */
+  /** The viewpoint as text, seven numbers: position, orbit center, field of view. */
   get address() {
     const { position, target, fov } = this.stand;
     return [...position.toArray(), ...target.toArray(), fov].map((value) => +value.toPrecision(5)).join();
@@ -116,7 +116,7 @@ export class View extends EventTarget {
     if (position.distanceTo(target) > 0) this.place({ position, target, fov: numbers[6] });
   }
 
-  /** Fly to a photo's viewpoint, around what is looked at rather than through it. */
+  /** Fly to a photo's viewpoint, around the target rather than through it. */
   flyTo(photo, target) {
     this.flight = { from: this.stand, to: this.standing(photo, target), start: performance.now() };
     this.wake();
@@ -138,7 +138,7 @@ export class View extends EventTarget {
 
   // ── frames ──
 
-  /** Draw anew: a draft that keeps up on slow machines and, once nothing changes, a sharp picture. */
+  /** Redraw: a draft that keeps up on slow machines and, once nothing changes, a sharp picture. */
   wake() {
     this.changed = true;
     this.moved = performance.now();
@@ -167,7 +167,7 @@ export class View extends EventTarget {
     if (!this.resting) this.request();
   }
 
-  /** Whether the last frame has been drawn. Its time tells how many pixels a fluent one may have. */
+  /** Return whether the last frame has been drawn. Its time determines how many pixels a fluent frame may have. */
   drawn() {
     if (!this.drawing) return true;
     const { fence, start, share } = this.drawing, gl = this.renderer.getContext();
@@ -177,7 +177,7 @@ export class View extends EventTarget {
     this.dispatchEvent(new Event("drawn"));
     if (share === 1 || !this.measured) this.cost = Math.min((performance.now() - start) / share ** 2, 2000);
     this.measured ||= share === 1;
-    this.controls.enableDamping = !still.matches && this.cost < 2 * FLUENT; // it takes a hundred frames
+    this.controls.enableDamping = !still.matches && this.cost < 2 * FLUENT; // damping takes a hundred frames
     return true;
   }
 
@@ -191,7 +191,7 @@ export class View extends EventTarget {
     Object.assign(this, { changed: false, sharp: share === 1 });
   }
 
-  /** Splats were sorted: draw them if they now have another order. */
+  /** Draw the splats after sorting, if their order has changed. */
   sorted() {
     const { sortedCenter, sortedDir, sorting } = this.spark, order = [...sortedCenter, ...sortedDir].join();
     if (sorting || order === this.order) return;
@@ -210,14 +210,14 @@ export class View extends EventTarget {
 
   // ── places on the screen ──
 
-  /** Pixel of a point in the world; null behind the camera. */
+  /** Project a point of the world to a pixel; null behind the camera. */
   pixel(point) {
     const seen = new Vector3(...point).project(this.camera);
     if (seen.z > 1) return null;
     return [((seen.x + 1) / 2) * this.frame.clientWidth, ((1 - seen.y) / 2) * this.frame.clientHeight];
   }
 
-  /** The camera as pick.js takes it, in the frame of the packed splats. */
+  /** The camera in the form that pick.js takes, in the frame of the packed splats. */
   get picking() {
     const { clientWidth: width, clientHeight: height } = this.frame;
     this.camera.updateMatrixWorld();
@@ -239,7 +239,7 @@ export class View extends EventTarget {
     this.frame.addEventListener("keydown", (event) => this.steer(event));
   }
 
-  /** Arrows turn, + and − go closer and away, Home shows the overview. */
+  /** Steer by keys: arrows turn, + and − go closer and away, Home shows the overview. */
   steer(event) {
     const turns = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
     const zoom = { "+": 0.9, "=": 0.9, "-": 1.1 }[event.key], { target } = this.controls;
@@ -257,7 +257,7 @@ export class View extends EventTarget {
     event.preventDefault();
   }
 
-  /** The picture as a PNG, with lines of text ([text, color]) below. */
+  /** Draw the picture as a PNG, with lines of text ([text, color]) below. */
   async picture(lines) {
     this.draw(1);
     const canvas = document.createElement("canvas"), size = Math.max(this.canvas.width / 48, 14);

@@ -1,8 +1,8 @@
 """Access control of nerfstudio's viewers: who may open them, and which files and messages they accept.
 
-viser 0.2.7 serves any file of the machine, answers pages of any origin, and has no hook for either, so
-`guard_viewers` puts a guard before every server that this process starts. What it allows:
-docs/troubleshooting.md.
+viser 0.2.7 serves any file of the machine, answers pages of any origin, and has no hook for either. So
+`guard_viewers` puts a guard before every server that this process starts. docs/troubleshooting.md lists what
+the guard allows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _SHARING = (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect)
 _FAR = 1e6
 """Largest coordinate of a viewer's camera."""
 _COUNTER = re.compile(r"<!-- Google tag.*?</script>.*?</script>", re.DOTALL)
-"""The visit counter in viser's page."""
+"""Pattern of the visit counter in viser's page."""
 _NARROW = """<style>#narrow { display: none; padding: 1em; font: 16px system-ui, sans-serif; }
 @media (max-width: 576px) { #root { display: none; } #narrow { display: block; } }</style>
 <p id="narrow">nerfstudio's viewer fails in windows this narrow: turn the phone, or widen the window, and load
@@ -43,11 +43,11 @@ class Guard(Access):
     """Access rules of one viser server."""
 
     root: Path | None = None
-    """Folder of the page's files."""
+    """Folder of viser's page files."""
 
     @property
     def who_may_look(self) -> str:
-        """Markdown about who can open the page, and how to change that."""
+        """Description, in Markdown, of who can open the page and how to change that."""
         if not self.needs_token:
             others = "`--viewer.websocket-host 0.0.0.0` opens it to others."
             return f"Only this machine can open the viewer, at `{self.address}`. {others}"
@@ -55,7 +55,7 @@ class Guard(Access):
         return f"Others can open the viewer through {where} at this address, token included: `{self.address}`"
 
     def response(self, path: str, headers: Headers) -> Response | None:
-        """The response to a request; None for viser's own."""
+        """Return the response to a request; None if viser should respond."""
         refused = self.refusal(path, headers)
         if refused is not None or _is_handshake(headers):
             return refused
@@ -68,17 +68,17 @@ class Guard(Access):
         return HTTPStatus.OK, {"Content-Type": "text/html; charset=utf-8"}, html.encode()
 
     def file(self, path: str) -> str | None:
-        """The address, in its plainest form, of the page's file that a path names; None if it names none."""
+        """Resolve a path to the plainest address of the page's file that it names; None if it names none."""
         try:
             root = (self.root or Path("/none")).resolve()
             file = (root / (urlsplit(path).path.lstrip("/") or "index.html")).resolve()
             inside = file.is_relative_to(root) and file.is_file()
-        except (ValueError, OSError):  # no address, or none that a file could have
+        except (ValueError, OSError):  # the path is not an address, or cannot be a file's
             return None
         return f"/{file.relative_to(root).as_posix()}" if inside else None
 
     def admits(self, handler: infra.WebsockMessageHandler, message: Any) -> bool:
-        """Whether viser gets a page's message; names of files are stripped of paths."""
+        """Return whether viser may receive a page's message. Names of files are stripped of paths."""
         if isinstance(message, _SHARING):
             return self.public
         if isinstance(message, _messages.ViewerCameraMessage):
@@ -87,18 +87,18 @@ class Guard(Access):
             known, value = _input(handler, message.id), message.updates.get("value")
             if known is not None and known._impl.label == RENDER_NAME:
                 message.updates["value"] = file_name(str(value))
-            # No page changes what inputs are, nor chooses what they don't offer.
+            # A page may neither change the kind of an input nor choose a value that it doesn't offer.
             return list(message.updates) == ["value"] and value in getattr(known, "options", [value])
         return True
 
 
 def _is_handshake(headers: Headers) -> bool:
-    """Whether a request opens a websocket; viser takes any other one for a file."""
+    """Return whether a request opens a websocket; viser treats any other request as one for a file."""
     return [value.lower() for value in headers.get_all("Upgrade")] == ["websocket"]
 
 
 def is_camera(message: _messages.ViewerCameraMessage) -> bool:
-    """Whether one can render from this camera: a minimized window has no aspect ratio, for example."""
+    """Return whether this camera can be rendered: for example, a minimized window has no aspect ratio."""
     vectors = (message.wxyz, message.position, message.look_at, message.up_direction)
     return (
         [len(vector) for vector in vectors] == [4, 3, 3, 3]
@@ -111,7 +111,7 @@ def is_camera(message: _messages.ViewerCameraMessage) -> bool:
 
 
 def _input(handler: infra.WebsockMessageHandler, name: str) -> Any:
-    """An input by its name; only viser's handler knows the interface."""
+    """Find an input by its name, through viser's handler, which alone knows the interface."""
     for callback in handler._incoming_handlers.get(_messages.GuiUpdateMessage, ()):
         known = getattr(callback, "__self__", None)
         if known is not None and name in known._gui_input_handle_from_id:
@@ -120,7 +120,7 @@ def _input(handler: infra.WebsockMessageHandler, name: str) -> Any:
 
 
 def file_name(text: str) -> str:
-    """The text as a file name in a folder: letters, digits, space, `_`, `-` and inner dots."""
+    """Turn a text into a file name without a folder: letters, digits, space, `_`, `-` and inner dots."""
     return re.sub(r"[^\w .-]+", "-", text).strip(" .-")[:80] or "render"
 
 
@@ -143,11 +143,11 @@ def guard_viewers() -> None:
             start(self)
         finally:
             module.serve = serve
-        guard.port = self._port  # differs if the port was taken
+        guard.port = self._port  # the port differs if the requested one was taken
 
     def guarded_handle(self: infra.WebsockMessageHandler, client_id: Any, message: Any) -> None:
         guard: Guard | None = getattr(self, "guard", None)
-        # Fields of other types, and messages before the camera that makes a client known.
+        # Drop messages with fields of other types, and those before the camera that makes a client known.
         with contextlib.suppress(TypeError, ValueError, AttributeError, LookupError, AssertionError):
             if guard is None or guard.admits(self, message):
                 handle(self, client_id, message)
@@ -158,15 +158,15 @@ def guard_viewers() -> None:
 
 
 class GuardedProtocol(WebSocketServerProtocol):
-    """A connection that asks the guard first."""
+    """A websocket connection that consults the guard first."""
 
     def __init__(self, guard: Guard, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self.guard = guard
 
     async def process_request(self, path: str, request_headers: Headers) -> Any:
-        """Answer, or pass the request on to viser: a file by the address that the guard resolved, since viser
-        reads addresses and headers in other ways."""
+        """Answer the request, or pass it on to viser: a file by the address that the guard resolved, since
+        viser reads addresses and headers in other ways."""
         response = self.guard.response(path, request_headers)
         if response is not None or _is_handshake(request_headers):
             return response
@@ -174,9 +174,9 @@ class GuardedProtocol(WebSocketServerProtocol):
         return await super().process_request(self.guard.file(path) or "/none", plain)
 
     async def recv(self) -> Any:
-        """The next message that is one; viser would end at others with a traceback."""
+        """Return the next valid message; viser would end at an invalid one with a traceback."""
         while True:
             raw = await super().recv()
-            with contextlib.suppress(Exception):  # of any kind
+            with contextlib.suppress(Exception):  # any kind of error
                 _messages.Message.deserialize(raw)  # type: ignore[arg-type]
                 return raw

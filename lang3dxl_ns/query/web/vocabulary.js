@@ -1,9 +1,9 @@
-// Words that this scene knows, as numbers of its own; and phrases that a live server encodes.
+// Words that this scene knows, in its own numbers, and phrases that a live server encodes.
 import { floats } from "./decode.js";
 
 export const tidy = (text) => text.replace(/["\0]/g, " ").split(/\s+/).filter(Boolean).join(" ");
 
-/** Prompts separated by `;`, each with optional negatives: `"windows" not "doors"; dome`. */
+/** Parse prompts separated by `;`, each with optional negatives: `"windows" not "doors"; dome`. */
 export function parsePrompts(typed) {
   const parts = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).match(/(?:"[^"]*"|[^;])+/g) ?? [];
   const negative = /\s*\bnot\s+("[^"]*"(?:\s*,\s*"[^"]*")*)/gi;
@@ -29,13 +29,13 @@ export class Vocabulary {
     return this.numbers.subarray(i * this.width, (i + 1) * this.width);
   }
 
-  /** Itself, what is searched for, the shared negatives that it competes with, and what examples taught. */
+  /** Look up a word: itself, what is searched for, its shared negatives, and what examples taught. */
   word(i) {
     const own = this.row(this.negatives.length + i), [near, against] = this.special[i] ?? [];
     return { own, near: near?.map((row) => this.row(row)) ?? [own], against: against ?? this.all, taught: this.taught[i] };
   }
 
-  /** The same for any phrase; null if this page doesn't know it. */
+  /** Look up any phrase in the same way; null if this page doesn't know it. */
   async phrase(text) {
     const plain = tidy(text), known = this.index.get(plain.toLowerCase());
     if (!this.live || this.taught[known]) return known === undefined ? null : this.word(known);
@@ -47,7 +47,7 @@ export class Vocabulary {
     return this.encoded.get(plain);
   }
 
-  /** Words spelled most like a phrase, or contained in it. */
+  /** Find the words spelled most like a phrase, or contained in it. */
   closest(text, most = 5) {
     const plain = tidy(text).toLowerCase(), pairs = pairsOf(plain), parts = plain.split(" ");
     const likeness = (word) => {
@@ -59,7 +59,7 @@ export class Vocabulary {
     return scored.sort((a, b) => b[1] - a[1]).slice(0, most).map(([word]) => word);
   }
 
-  /** Words to offer while someone types. */
+  /** Find words to offer while the user types. */
   offered(typed, most = 12) {
     const start = tidy(typed).toLowerCase(), first = [], later = [];
     for (const word of this.words) {

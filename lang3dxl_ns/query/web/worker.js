@@ -1,4 +1,4 @@
-// The page's thinking, beside its drawing: decodes the scene once, then answers words and clicks.
+// Worker that runs beside the drawing: it decodes the scene once, then answers words and clicks.
 import { Answers } from "./answer.js";
 import { decodedRows, shippedRows } from "./decode.js";
 import { boxAround, massOf, rankViews, readViews } from "./find.js";
@@ -6,22 +6,22 @@ import { likeness } from "./like.js";
 import { gaussiansAt, unpackSplats } from "./pick.js";
 import { Vocabulary } from "./vocabulary.js";
 
-const EXAMPLE = 5; // Gaussians that stand for a clicked place
+const EXAMPLE = 5; // number of Gaussians that represent a clicked place
 let about, answers, vocabulary, geometry, views, mass;
 
-/** Numbers of phrases, and the first one that is unknown. */
+/** Look up phrases; return their numbers, and the first phrase that is unknown. */
 async function understood(phrases) {
   const found = await Promise.all(phrases.map((phrase) => vocabulary.phrase(phrase)));
   return { found, unknown: phrases.find((_, i) => !found[i]) };
 }
 
-/** The verdict about a prompt whose phrases are known. */
+/** Compute the verdict about a prompt whose phrases are known. */
 function judged([text, ...negatives], threshold) {
   const relevancy = answers.relevancy(text, negatives.map(({ own }) => own));
   return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold });
 }
 
-/** Which Gaussians may match: 1 where any of these prompts does; null without prompts. */
+/** Compute which Gaussians may match: 1 where any of these prompts does; null without prompts. */
 async function foregroundOf(prompts) {
   if (!prompts.length) return null;
   const mask = new Uint8Array(about.words.count);
@@ -59,7 +59,7 @@ const jobs = {
     return { seconds: (performance.now() - start) / 1000, known: vocabulary.words.length };
   },
 
-  /** An answer about a phrase, or about examples: { known, relevancy, threshold, doubt, … }. */
+  /** Answer a phrase or examples with { known, relevancy, threshold, doubt, … }. */
   async ask({ text, negatives, examples, threshold }) {
     threshold ??= about.words.threshold;
     if (examples) return { known: true, ...answers.verdict(likeness(answers.rows, examples), { strict: true, doubt: 0, threshold }) };
@@ -77,7 +77,7 @@ const jobs = {
     };
   },
 
-  /** The words that fit a pixel best, and the Gaussians that it shows; none where little is, or little is known. */
+  /** Find the words that match a pixel best, and its Gaussians; none where too few of them have a meaning. */
   whatIs({ camera, x, y, most }) {
     const hits = gaussiansAt(geometry, camera, x, y, about.antialiased).filter(([i]) => answers.rows.scales[i]);
     const blend = new Float64Array(about.words.width);

@@ -1,4 +1,4 @@
-"""The page of a scene: every file of it, with a vocabulary that it answers words from by itself."""
+"""The web page of a scene: all its files, with a vocabulary of words that it answers by itself."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ from lang3dxl_ns.query.web.pack import (
 _HERE = Path(__file__).parent
 _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
-"""Bytes of the views that the page flies to, and of the lightings; of more, evenly chosen ones are kept."""
+"""Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _TEXTS = 256
-"""Texts encoded at a time."""
+"""Number of texts encoded at a time."""
 MOST_TEXT = 2_000
-"""Characters of a phrase; CLIP reads about 300."""
+"""Most characters of a phrase, of which CLIP reads about 300."""
 
 
 class Page:
-    """A page about one scene.
+    """The web page of one scene.
 
     Args:
         scene: the scene.
-        texts: prompts that it opens with, as `Scene.prompts` reads them.
+        texts: prompts that the page opens with, as `Scene.prompts` reads them.
         words: words that may name a place, besides the shipped vocabulary of buildings.
-        more: words that it knows besides.
-        provenance: title, credit and license shown on it.
-        look: training photo whose lighting is shown; default: of the overview photo.
+        more: further words that the page can search for.
+        provenance: title, credit and license shown on the page.
+        look: training photo whose lighting is shown; default: the overview photo.
         live: whether a server encodes any other text (`answer`).
     """
 
@@ -73,7 +73,7 @@ class Page:
         self.prompts = scene.prompts(list(texts)) if texts else []
         self._foreground = scene.prompts(scene.config.foreground) if scene.config.foreground else []
         self.left_out: list[str] = []
-        """Sentences about what the files lack, for their size."""
+        """Sentences about what the files leave out because of its size."""
         self._about = provenance or Provenance()
         self._look, self._words, self._more = look, words, more
         self._looks = list(scene.looks.names) if scene.looks else []
@@ -83,7 +83,7 @@ class Page:
             self._meaning = pack_meaning(scene.decoder, scene.codes)
 
     def files(self) -> dict[str, bytes]:
-        """Content of every file, by name."""
+        """Build the content of every file, by name."""
         scene, self.left_out = self.scene, []
         means = scene.splats.means[scene.splats.sound()]
         center = means.median(0).values if len(means) else self._toward
@@ -107,7 +107,7 @@ class Page:
             "words": None,
         }
         about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
-        if not self.live:  # without a server they are files, read when they are chosen
+        if not self.live:  # without a server the lightings are files, read when they are chosen
             chosen = self._within_limits("lightings", self._looks, [4 * len(scene.splats)] * len(self._looks))
             about["looks"] = {name: f"look{i}.bin" for i, name in enumerate(chosen)}
             files |= {f"look{i}.bin": self.colors(name) for i, name in enumerate(chosen)}
@@ -134,7 +134,7 @@ class Page:
         return files
 
     def _within_limits(self, what: str, names: list[str], sizes: list[int]) -> list[str]:
-        """Evenly chosen ones that take at most `_MOST_BYTES`; says which share is left out."""
+        """Choose evenly spaced names that take at most `_MOST_BYTES`, and record how many are left out."""
         count = len(names)
         while count and sum(spread(sizes, count)) > _MOST_BYTES:
             count -= 1
@@ -143,7 +143,7 @@ class Page:
         return spread(names, count)
 
     def _vocabulary(self, meaning: PackedMeaning) -> dict[str, bytes]:
-        """The words that the page knows: those that may name a place first, then all others."""
+        """Encode the words that the page knows: those that may name a place first, then all others."""
         negatives, taught = list(self.scene.text.config.negatives), self.scene.words
         asked = [phrase for phrases in _phrases([*self.prompts, *self._foreground]) for phrase in phrases]
         naming = _distinct([*shipped_vocabulary(), *self._words, *asked])
@@ -174,7 +174,7 @@ class Page:
         return {"vocabulary.json": listed, "vocabulary.bin": halves(torch.cat(numbers))}
 
     def _meant(self, meaning: PackedMeaning, word: str) -> tuple[Float[Tensor, "s r"], list[int]]:
-        """Vectors that are searched for along with a word, and the negatives that it competes with."""
+        """Return the vectors searched for along with a word, and the negatives that it competes with."""
         queries = self.scene.queries(self.scene.prompts([Prompt(word)]))
         return meaning.of_texts(queries.vectors[list(queries.positive[0])]).cpu(), list(queries.negative[0])
 
@@ -186,10 +186,10 @@ class Page:
     # ── what a live server adds ─────────────────────────────────────────────────────────────────────────
 
     def answer(self, phrase: str) -> dict[str, Any]:
-        """Any phrase in this scene's own numbers: itself, what is searched for, and what it competes with.
+        """Express a phrase in this scene's numbers: itself, what is searched for, and what it competes with.
 
         Raises:
-            UserError: the phrase is empty, or the scene has colors alone.
+            UserError: the phrase is empty, or the scene has colors only.
         """
         if self._meaning is None:
             raise UserError(NO_SEMANTICS)
@@ -202,28 +202,28 @@ class Page:
         return {"own": own, "near": near.tolist(), "against": against}
 
     def colors(self, photo: str) -> bytes:
-        """Red, green, blue and opacity of every Gaussian under a photo's lighting. Raises UserError if there
-        is no such look."""
+        """Compute red, green, blue and opacity of every Gaussian under a photo's lighting. Raises UserError
+        if there is no such look."""
         return pack_colors(self.scene.baked(photo), self._toward).tobytes()
 
 
 def _phrases(prompts: Sequence[Prompt]) -> list[list[str]]:
-    """Each prompt and its negatives."""
+    """List each prompt's text with its negatives."""
     return [[prompt.text, *prompt.negatives] for prompt in prompts]
 
 
 def _distinct(phrases: Sequence[str]) -> list[str]:
-    """The phrases as the page compares them, each once."""
+    """Return the phrases in the form in which the page compares them, each once."""
     return list(dict.fromkeys(filter(None, map(plain, phrases))))
 
 
 def plain(text: str) -> str:
-    """A phrase as the page compares it: without quotes and needless spaces."""
+    """Return the form in which the page compares a phrase: without quotes and extra spaces."""
     return " ".join(text.replace('"', " ").replace("\0", " ").split())
 
 
 def write_page(page: Page, folder: Path) -> int:
-    """Write a page's files into a folder, for any static web server; returns the bytes."""
+    """Write a page's files into a folder for any static web server; return the number of bytes."""
     make_folder(folder)
     files = page.files()
     for name, content in files.items():
