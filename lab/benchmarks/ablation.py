@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from lab.benchmarks.ablation_report import write_ablation
-from lab.benchmarks.ablation_rows import BOUNDS, FULL, SEGMENTERS, Row, choose_rows
+from lab.benchmarks.ablation_rows import BOUNDS, FULL, IN_PICTURES, Row, choose_rows
 from lab.benchmarks.landmarks import Landmarks, landmark_scenes
 from lab.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 from lang3dxl_ns.common.errors import UserError
@@ -107,7 +107,7 @@ class Ablation:
             for steps in sorted(self.steps)
             for label, path in scenes.items()
             for row in rows
-            if row.trains or (row.name in SEGMENTERS and seed == 0 and steps == min(self.steps))
+            if row.trains or (row.name in IN_PICTURES and seed == 0 and steps == min(self.steps))
         ]
 
     def _write(self, rows: list[Row], figures: dict[Run, dict], failed: dict[Run, str]) -> None:
@@ -116,11 +116,11 @@ class Ablation:
         write_ablation(self.out, command, rows, figures, self._at_all_lengths(failed))
 
     def _at_all_lengths(self, found: dict[Run, Found]) -> dict[Run, Found]:
-        """What segmenters see doesn't depend on the training's length: they run once."""
+        """What rows see in the pictures themselves doesn't depend on the training: they run once."""
         return {
             replace(run, steps=steps): value
             for run, value in found.items()
-            for steps in (self.steps if run.row.name in SEGMENTERS else [run.steps])
+            for steps in (self.steps if run.row.name in IN_PICTURES else [run.steps])
         }
 
 

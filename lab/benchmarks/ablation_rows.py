@@ -9,10 +9,13 @@ from typing import Any
 from lang3dxl_ns.common.errors import UserError
 
 FULL, TEACHER, LIMIT, CHANCE = "full", "teacher", "limit", "chance"
+FINE_TEACHER = "fine-teacher"
 PAPER_METHOD = "lang3dxl-paper"
 CLIPSEG, LANGSAM, SAM3 = "clipseg", "langsam", "sam3"
 SEGMENTERS = (CLIPSEG, LANGSAM, SAM3)
 """Rows of networks that segment a picture by text."""
+IN_PICTURES = (FINE_TEACHER, *SEGMENTERS)
+"""Rows without training: what a network sees in the scored picture itself."""
 BOUNDS = (TEACHER, LIMIT, CHANCE)
 """Rows that every run of the full method includes: figures with these prefixes."""
 _FIELD, _DATA = "pipeline.model.semantic_field.", "pipeline.datamanager."
@@ -37,7 +40,7 @@ class Row:
     @property
     def trains(self) -> bool:
         """Whether the row needs its own training run."""
-        return self.name not in (*BOUNDS, *SEGMENTERS)
+        return self.name not in (*BOUNDS, *IN_PICTURES)
 
     @property
     def own_targets(self) -> bool:
@@ -58,6 +61,7 @@ ROWS = (
     Row(f"{PAPER_METHOD}-noise", "method", "the same, its codes from noise, as published",
         {f"{_DATA}regions": "felzenszwalb", "pipeline.model.codes_from": "noise"}, PAPER_METHOD),
     Row(TEACHER, "2-D", "the crop pyramid itself, in the scored picture"),
+    Row(FINE_TEACHER, "2-D", "what training photos are read as, in the scored picture"),
     Row(LIMIT, "2-D", "exact labels, lifted to the Gaussians and rendered back"),
     Row(CHANCE, "2-D", "a map without information"),
     Row(CLIPSEG, "2-D", "CLIPSeg", published="mAP .56"),

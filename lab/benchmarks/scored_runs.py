@@ -9,10 +9,11 @@ import shlex
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from copy import deepcopy
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from statistics import median
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 
-from lab.benchmarks.ablation_rows import CLIPSEG, LANGSAM, SAM3, SEGMENTERS, Row
+from lab.benchmarks.ablation_rows import CLIPSEG, FINE_TEACHER, LANGSAM, SAM3, SEGMENTERS, Row
 from lab.reports import in_own_process
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
@@ -28,9 +29,13 @@ from lang3dxl_ns.common.reports import host_peak
 
 if TYPE_CHECKING:
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+    from lang3dxl_ns.evaluation.language import LanguageScorer
+    from lang3dxl_ns.evaluation.scores import Maps, MapScorer
+    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
     from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
     from lang3dxl_ns.preparation.segmentation import TextSegmenter
+    from lang3dxl_ns.preparation.targets import TargetReader
     from lang3dxl_ns.scene.photo import Photo
 
 _LIBRARIES = ("lang3dxl_ns.plugin.trainer_config", "lang3dxl_ns.methods")
@@ -215,8 +220,8 @@ def apply_changes(config: Any, changes: Mapping[str, Any]) -> None:
 
 def _in_process(run: Run, settings: RunSettings, work: Path, log: Path) -> dict[str, float]:
     write_output_to(log)
-    work_on = _score_segmenter if run.row.name in SEGMENTERS else _train_and_score
-    return work_on(run, settings, work)
+    special = dict.fromkeys(SEGMENTERS, _score_segmenter) | {FINE_TEACHER: _score_fine_crops}
+    return special.get(run.row.name, _train_and_score)(run, settings, work)
 
 
 def write_output_to(log: Path) -> None:
@@ -315,32 +320,84 @@ def _now() -> float:
 
 def _score_segmenter(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
     """AP of a segmenter in the very pictures that are scored, by the same rules."""
-    from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+    from lang3dxl_ns.evaluation.scores import MapScorer
     from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 
-    files = find_text_segmenter(*settings.segmenter(run.row.name))
-    segmenter = load_text_segmenter(files, "cpu")
-    config = run_configuration(run, settings, work)
-    config.pipeline.datamanager.clip = config.pipeline.datamanager.dense = "none"
-    data = config.pipeline.datamanager.setup(device="cpu", test_mode="test")
-    found = _score_pictures(segmenter, GroundTruth(run.scene / "ground_truth"), data.eval_dataset.photos)
-    if data.test_views is not None:
-        truth = GroundTruth(data.test_views.folder / "ground_truth", "plain")
-        scores = _score_pictures(segmenter, truth, data.test_dataset.photos)
-        found |= {f"test_{name}": value for name, value in scores.items()}
+    segmenter = load_text_segmenter(find_text_segmenter(*settings.segmenter(run.row.name)), "cpu")
+    found = {}
+    for prefix, truth, photos in _pictures(run, _colors_alone(run_configuration(run, settings, work))):
+        maps = partial(_segmenter_maps, segmenter, truth.categories)
+        found |= _score_pictures(prefix, MapScorer(truth), photos, maps)
     return found
 
 
-def _score_pictures(
-    segmenter: TextSegmenter, truth: GroundTruth, photos: Sequence[Photo]
-) -> dict[str, float]:
-    from lang3dxl_ns.evaluation.aggregate import average
-    from lang3dxl_ns.evaluation.scores import MapScorer, resize_map
+def _segmenter_maps(
+    segmenter: TextSegmenter, words: Sequence[str], photo: Photo, size: tuple[int, int]
+) -> Maps:
+    from lang3dxl_ns.evaluation.scores import resize_map
 
-    scorer, scored = MapScorer(truth), []
+    found = resize_map(segmenter.probabilities(photo.read_uint8(), words), size)
+    return dict(zip(words, found, strict=True))
+
+
+def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
+    """AP of the pictures' own fine targets, as those that the field gathers are made from training photos."""
+    from lang3dxl_ns.evaluation.language import open_scorer
+    from lang3dxl_ns.plugin.novel_views import novel_pixel_sizes
+    from lang3dxl_ns.preparation.collection import plan_crops
+    from lang3dxl_ns.preparation.photo_collection import read_collection
+    from lang3dxl_ns.preparation.prepare import prepare
+    from lang3dxl_ns.preparation.store import FeatureStore
+
+    whole = run_configuration(run, settings, work)
+    data, config = _colors_alone(deepcopy(whole)), whole.pipeline.datamanager
+    config.dense = "none"
+    plan = plan_crops(list(data.photos.values()), read_collection(run.scene).reconstruction, config)
+    found, store = {}, FeatureStore(work / "targets")
+    for prefix, truth, photos in _pictures(run, data):
+        sizes = plan.pixel_sizes
+        if sizes is not None and data.test_views is not None and prefix:
+            sizes = novel_pixel_sizes(data.test_views, config)
+        names = [photo.name for photo in photos]
+        targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names).reader
+        scorer = open_scorer(truth, config.clip, "cpu")
+        maps = partial(_crop_maps, scorer, targets)
+        found |= _score_pictures(prefix, scorer, photos, maps)
+    return found
+
+
+def _crop_maps(scorer: LanguageScorer, targets: TargetReader, photo: Photo, size: tuple[int, int]) -> Maps:
+    return scorer.teacher_maps(targets.clip(photo.name).features.float(), size)
+
+
+def _colors_alone(config: Lang3DXLTrainerConfig) -> Lang3DXLDataManager:
+    """The data of a configuration that makes no targets."""
+    data = config.pipeline.datamanager
+    data.clip = data.dense = "none"
+    return data.setup(device="cpu", test_mode="test")
+
+
+def _pictures(run: Run, data: Lang3DXLDataManager) -> Iterator[tuple[str, GroundTruth, list[Photo]]]:
+    """Held-out photos and test views, each with their truth and the prefix of their figures."""
+    from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+
+    yield "", GroundTruth(run.scene / "ground_truth"), data.eval_dataset.photos
+    if data.test_views is not None:
+        truth = GroundTruth(data.test_views.folder / "ground_truth", "plain")
+        yield "test_", truth, data.test_dataset.photos
+
+
+def _score_pictures(
+    prefix: str,
+    scorer: MapScorer,
+    photos: Sequence[Photo],
+    maps_of: Callable[[Photo, tuple[int, int]], Maps],
+) -> dict[str, float]:
+    """Mean figures of photos, whose maps are made at a given size."""
+    from lang3dxl_ns.evaluation.aggregate import average
+
+    scored = []
     for photo in photos:
-        found = segmenter.probabilities(photo.read_uint8(), truth.categories)
-        small = resize_map(found, truth.scoring_size(photo.height, photo.width))
-        variants = scorer.variants(dict(zip(truth.categories, small, strict=True)))
-        scored.append(scorer.scores_of(photo.name, variants))
-    return average(scored)
+        maps = maps_of(photo, scorer.truth.scoring_size(photo.height, photo.width))
+        scored.append(scorer.scores_of(photo.name, scorer.variants(maps)))
+    return {f"{prefix}{name}": value for name, value in average(scored).items()}

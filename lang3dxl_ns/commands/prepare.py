@@ -63,5 +63,6 @@ def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | 
         cache_dir=cache_dir,
         **{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)},
     )
-    config.settle_targets(learned=config.crops == "pyramid" or config.regions not in ("auto", "none"))
+    learned = config.crops == "pyramid" or config.regions not in ("auto", "none")
+    config.settle_targets(learned, gathered=not learned)
     return config.setup(device=best_device(), test_mode="test")

@@ -87,12 +87,12 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
         super().check()
         check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
 
-    def settle_targets(self, learned: bool) -> None:
-        """Resolve what is prepared: semantics `learned` with the scene use regions and targets in every step,
-        others use finer crops."""
+    def settle_targets(self, learned: bool, gathered: bool) -> None:
+        """Resolve what is prepared: semantics `learned` with the scene use regions and targets in every step;
+        features `gathered` onto Gaussians, also those that codes start from, need fine crops."""
         self.targets_in_steps = learned
         if self.crops == "auto":
-            self.crops = "pyramid" if learned else "fine"
+            self.crops = "fine" if gathered else "pyramid"
         if not learned or self.clip == "none":
             self.regions = "none"
         if self.clip == "none":

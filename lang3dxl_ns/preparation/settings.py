@@ -64,8 +64,9 @@ class PreparationConfig:
     crops: Literal["auto", "pyramid", "fine"] = "auto"
     """What training photos are read at. pyramid: crops of all sizes, half a side apart, averaged (Lang3D-XL's
     targets). fine: the smallest, and 0.7 of them a third of a side apart: three times as many in all. auto:
-    fine where features are gathered onto Gaussians; pyramid where they are trained through the downsampler,
-    which sharpens. Held-out photos have the pyramid, as the 2-D teacher that is scored."""
+    fine where features are gathered onto Gaussians, also to start codes (`codes_from`); pyramid where they
+    are trained through the downsampler alone, which sharpens. Held-out photos have the pyramid, as the 2-D
+    teacher that is scored."""
     pixel_distance: DistanceRule = "median"
     """Distance of a photo's subject: from the camera to the median of its tracked points, to their mean,
     or to the mean of those away from the edges ("mean-inner", the paper's text)."""

@@ -15,6 +15,7 @@ from lab.benchmarks.ablation_report import mark_front, spread, table_of_runs, wr
 from lab.benchmarks.ablation_rows import (
     CHANCE,
     CLIPSEG,
+    FINE_TEACHER,
     FULL,
     LANGSAM,
     LIMIT,
@@ -262,7 +263,7 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     sizes = {"photos": 10, "test_views": 6, "width": 128, "height": 96, "workers": 1}
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, **sizes))
     out = tmp_path / "out"
-    names = (FULL, TEACHER, LIMIT, CHANCE, CLIPSEG, LANGSAM, "lifting")
+    names = (FULL, TEACHER, FINE_TEACHER, LIMIT, CHANCE, CLIPSEG, LANGSAM, "lifting")
     detector = make_tiny_grounding_dino(tmp_path / "detector", seed=2)
     sam = make_tiny_sam(tmp_path / "sam", seed=2)
     few = "--pipeline.datamanager.dense-tokens 8"
@@ -278,7 +279,8 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
         assert next(row for row in rows if row["row"] == CLIPSEG)["not_run"]
         means = {row["row"]: row["mean"] for row in rows if row["mean"]}
         assert 0 < means[LANGSAM]["test_map"]["mean"] < means[TEACHER]["test_map"]["mean"]
-        del means[LANGSAM]  # scored where others are tested, not where they are trained
+        assert means[FINE_TEACHER]["test_map"]["mean"] > means[LANGSAM]["test_map"]["mean"]
+        del means[LANGSAM], means[FINE_TEACHER]  # scored where others are tested, not where they are trained
         for split in ("", "test_", "seen_"):
             scores = {name: values[f"{split}map"]["mean"] for name, values in means.items()}
             assert scores[CHANCE] < scores[TEACHER] and 2 * scores[CHANCE] < scores[LIMIT]

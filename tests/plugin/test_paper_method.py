@@ -79,15 +79,22 @@ def test_the_field_is_as_printed_in_runs_that_are_long_enough_for_it(iterations,
 
 
 @pytest.mark.parametrize(
-    ("iterations", "start", "warm_up", "grid"),
-    [(4_999, "photos", 0.25, "coarse"), (5_000, "noise", 0.0, "paper"), (ITERATIONS, "noise", 0.0, "paper")],
+    ("iterations", "start", "warm_up", "crops", "grid"),
+    [
+        (4_999, "photos", 0.25, "fine", "coarse"),
+        (5_000, "noise", 0.0, "pyramid", "paper"),
+        (ITERATIONS, "noise", 0.0, "pyramid", "paper"),
+    ],
 )
-def test_codes_start_and_looks_are_as_printed_in_runs_that_are_long_enough(iterations, start, warm_up, grid):
+def test_codes_start_crops_and_looks_are_as_printed_in_runs_that_are_long_enough(
+    iterations, start, warm_up, crops, grid
+):
     config = deepcopy(lang3dxl_paper.config)
     config.max_num_iterations = iterations
     config.fit_to_run()
     model = config.pipeline.model
     assert (model.codes_from, model.warm_up, model.appearance.preset) == (start, warm_up, grid)
+    assert config.pipeline.datamanager.crops == crops
 
 
 def test_the_default_is_another_method_with_settings_of_its_own():

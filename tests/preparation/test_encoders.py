@@ -240,7 +240,7 @@ def test_half_precision_on_the_gpu_stays_close_to_the_cpu(clip_folder, dino_fold
 )
 def test_the_built_in_clip_takes_the_built_in_dense_encoder_along(clip, dense, learned, expected):
     config = Lang3DXLDataManagerConfig(clip=clip, dense=dense)
-    config.settle_targets(learned)
+    config.settle_targets(learned, not learned)
     assert config.dense == expected
 
 
