@@ -1,6 +1,6 @@
 """Language in large 3D scenes: Lang3D-XL as a nerfstudio plugin.
 
-Each name loads its module at first use, so that importing the package costs nothing. Only `train`, and
+Each public name loads its module at first use, so importing the package costs nothing. Only `train`, and
 `load_scene` for runs without a scene file, need nerfstudio.
 """
 
@@ -22,7 +22,7 @@ _PUBLIC = {
 __all__ = list(_PUBLIC)
 try:
     __version__ = version("lang3dxl-ns")
-except PackageNotFoundError:  # a checkout that isn't installed
+except PackageNotFoundError:  # a checkout that is not installed
     __version__ = "0"
 
 

@@ -1,4 +1,4 @@
-"""The `lang3dxl` command: everything except training, rendering and viewing (the ns-* commands)."""
+"""The `lang3dxl` command: all tasks except training and rendering, which have the ns-* commands."""
 
 from __future__ import annotations
 
@@ -70,12 +70,12 @@ COMMANDS = {
     "numerics": ("lab.numerics.command:Numerics", "Error and time of components on stiff cases."),
     "benchmark": (BENCHMARKS, "Measure: time, memory and error, side by side."),
 }
-"""Each command's settings class, which has a method `main`, and its summary in the list of commands. Those of
-`lab` come with a checkout alone."""
+"""Settings class of each command, which has a method `main`, and its summary in the list of commands.
+Commands of `lab` are available only in a checkout."""
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the `lang3dxl` command."""
+    """Run the `lang3dxl` command (its entry point)."""
     words = asked_for_all(sys.argv[1:] if arguments is None else arguments)
     silence_libraries()
     accept_any_console()
@@ -83,13 +83,13 @@ def main(arguments: list[str] | None = None) -> None:
         return print(version("lang3dxl-ns"))
     try:
         with _terminable():
-            copy_context().run(_parsed(words).main)  # what a command sets for its messages ends with it
+            copy_context().run(_parsed(words).main)  # undoes the command's message settings
             sys.stdout.flush()
     except UserError as error:
         # Messages name the options of ns-train; these commands have the same ones without the prefix.
         prefix = "--pipeline.datamanager." if words[0] in ("prepare", "needs") else "--"
         sys.exit(f"Error: {str(error).replace(prefix, '--')}")
-    except BrokenPipeError:  # the reader has seen enough, as in `lang3dxl … | head`
+    except BrokenPipeError:  # the reader closed the pipe, as in `lang3dxl … | head`
         _leave_output()
         sys.exit(1)
     except OSError as error:
@@ -107,7 +107,7 @@ _TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows --out {}"
 
 
 def _parsed(words: Sequence[str]) -> Any:
-    """The called command with its settings. Exits with a hint if the words make no sense."""
+    """Parse the words into the called command with its settings. Exits with a hint if they are not valid."""
     _check_name(COMMANDS, words)
     try:
         choice = _choice(COMMANDS, words)
@@ -119,7 +119,7 @@ def _parsed(words: Sequence[str]) -> Any:
 
 
 def _check_name(commands: Mapping[str, Any], words: Sequence[str], above: str = "lang3dxl") -> None:
-    """Raises UserError with similar names if the first word is no command."""
+    """Check that the first word is a command. Raises UserError with similar names if it is not."""
     if not words or words[0].startswith("-"):
         return
     if words[0] not in commands:
@@ -131,14 +131,14 @@ def _check_name(commands: Mapping[str, Any], words: Sequence[str], above: str = 
 
 
 def _leave_output() -> None:
-    """Write what is left of the output nowhere, so that Python does not complain at its end."""
-    with contextlib.suppress(OSError, ValueError):  # some streams have no descriptor
+    """Discard the unwritten output, so that Python does not report a broken pipe at exit."""
+    with contextlib.suppress(OSError, ValueError):  # some streams have no file descriptor
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
-    """tyro's type for a choice of subcommands. Only the one called is imported, since most need torch; the
-    others appear in the help."""
+    """Build tyro's type for a choice of subcommands. Only the called command is imported, because most need
+    torch; the others only appear in the help."""
     kinds = []
     for name, (place, summary) in commands.items():
         called = words[:1] == [name]
@@ -154,10 +154,10 @@ def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
 
 
 def settings_of(place: str) -> Any:
-    """A command's settings class, imported from `module:class` of the package or of the laboratory beside it.
+    """Import a command's settings class from `module:class` of the package or of the lab beside it.
 
     Raises:
-        UserError: it belongs to the laboratory, which is not here.
+        UserError: the command belongs to the lab, which is not installed here.
     """
     module, _, name = place.partition(":")
     if not module.startswith("lab."):

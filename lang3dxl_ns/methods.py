@@ -24,12 +24,12 @@ check_command_line(sys.argv[1:])
 DEVICE: Literal["cuda", "cpu"] = "cuda" if torch.cuda.is_available() else "cpu"
 
 EXTENT = 1.1
-"""The published extent, 1.1 times the farthest camera's distance from their middle: nerfstudio makes that
-distance about 1."""
+"""The published extent, 1.1 times the largest distance of a camera from the cameras' center. nerfstudio
+scales that distance to about 1."""
 
 
 def _optimizers() -> dict[str, dict]:
-    """Groups of the paper with schedules in fractions of the run, and rates for short runs beside them."""
+    """Return the paper's parameter groups, with schedules in fractions of the run, and short-run rates."""
     adam, schedule = RunAdamConfig, RunScheduleConfig
     learned = partial(schedule, start=0.1, warm=0.05, end=0.01, power=2.0)
     groups = {
@@ -43,7 +43,7 @@ def _optimizers() -> dict[str, dict]:
         "codes": (adam(lr=1e-3, short_lr=3e-2), schedule(end=0.05)),
         "field_encoding": (adam(lr=5e-4, short_lr=1e-2), learned()),
         "field_decoder": (adam(lr=5e-4, short_lr=1e-2, weight_decay=1e-5), learned()),
-        # As published for long runs.
+        # The long-run rates are as published.
         "feature3dgs_decoder": (adam(lr=1e-4, short_lr=1e-2), learned()),
         "downsampler": (adam(lr=5e-4, short_lr=5e-3, weight_decay=1e-5), learned()),
         "appearance": (adam(lr=5e-4, short_lr=5e-3), schedule(start=0.1, warm=0.05, end=0.1)),
@@ -57,11 +57,11 @@ def _optimizers() -> dict[str, dict]:
 
 
 def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
-    """A method's configuration; `iterations` on a GPU."""
+    """Build the configuration of a method. `iterations` applies on a GPU."""
     return Lang3DXLTrainerConfig(
         method_name=method,
         machine=MachineConfig(device_type=DEVICE),
-        # On a CPU a step takes a tenth of a second or more: a run of minutes is the sensible default.
+        # A step on a CPU takes 0.1 s or more, so the default is a run that ends within minutes.
         max_num_iterations=iterations if DEVICE == "cuda" else 3_000,
         steps_per_save=2_000,
         steps_per_eval_batch=0,
@@ -69,18 +69,16 @@ def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
         steps_per_eval_all_images=0,
         pipeline=Lang3DXLPipelineConfig(),
         optimizers=_optimizers(),
-        logging=LoggingConfig(profiler="none"),  # its table would end every command
+        logging=LoggingConfig(profiler="none"),  # the profiler's table would end every command's output
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
     )
 
 
 def _paper_config() -> Lang3DXLTrainerConfig:
-    """Lang3D-XL as printed and, where the paper is silent, as released: docs/deviations.md says where.
-
-    A run of any length shrinks or stretches the schedule of 70,000 iterations. Runs of under 30,000 learn at
-    the rates for short runs.
-    """
+    """Build the configuration of Lang3D-XL as printed or, where the paper is silent, as released;
+    docs/deviations.md lists where. The schedule of 70,000 iterations is scaled to the length of the run. Runs
+    of under 30,000 iterations use the learning rates for short runs."""
     config = _config("lang3dxl-paper", 70_000)
     x = 1 / 70_000
     model, data, groups = config.pipeline.model, config.pipeline.datamanager, config.optimizers
@@ -128,7 +126,7 @@ def run_config(
     dense: str,
     method: str = "lang3dxl",
 ) -> Lang3DXLTrainerConfig:
-    """Configuration of a method's run inside another command: no viewer, no evaluation on the way."""
+    """Build the configuration for training inside another command, without viewer or interim evaluation."""
     config = deepcopy(METHODS[method].config)
     assert isinstance(config, Lang3DXLTrainerConfig)
     config.data = config.pipeline.datamanager.data = data

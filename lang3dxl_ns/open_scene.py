@@ -1,4 +1,4 @@
-"""`load_scene`: a scene file, or a run's folder."""
+"""`load_scene`: open a scene from a scene file or from the folder of a run."""
 
 from __future__ import annotations
 
@@ -23,18 +23,19 @@ def load_scene(
     settings: QueryConfig | None = None,
     clip: str | None = None,
 ) -> Scene:
-    """Open a scene that one can render and ask.
+    """Open a scene for rendering and queries.
 
     Args:
-        path: a NAME.scene file; a folder that holds one; or a run of `ns-train lang3dxl`: its folder, or one
-            above it (the newest run there is taken). None: the newest run under outputs/. Runs without a
-            scene file, and any config.yml, are converted, which needs nerfstudio. No file is executed.
-        device: by default a GPU if there is one.
-        settings: defaults of queries.
-        clip: name or folder of the scene's CLIP, where it is not at the place that the scene names.
+        path: a NAME.scene file, a folder that holds one, or a run of `ns-train lang3dxl`: its folder, or one
+            above it, whose newest run is opened. None opens the newest run under outputs/. Runs without a
+            scene file, and any config.yml, are converted, which needs nerfstudio. No code from the files is
+            executed.
+        device: where the scene is held; by default a GPU if there is one.
+        settings: default settings of queries.
+        clip: name or folder of the scene's CLIP, if it is not where the scene file says.
 
     Raises:
-        UserError: there is no scene, or it is damaged; or `clip` is another CLIP than the scene's.
+        UserError: there is no scene, it is damaged, or `clip` is not the scene's CLIP.
     """
     file = find_scene_file(path)
     encode_texts = None
@@ -45,17 +46,15 @@ def load_scene(
         return read_scene(file, device, settings, encode_texts)
     from lang3dxl_ns.common.console import silence_libraries
 
-    silence_libraries()  # nerfstudio's imports warn of what a user can do nothing about
+    silence_libraries()  # nerfstudio's imports print warnings that a user can do nothing about
     from lang3dxl_ns.plugin.load_scene import load_run
 
     return load_run(path, device, settings)
 
 
 def find_scene_file(path: str | Path | None = None) -> Path | None:
-    """The scene file that a path names or holds; None for a config.yml, and for a run without one.
-
-    Raises UserError if there is neither a scene nor a run.
-    """
+    """Find the scene file that a path names or holds. Returns None for a config.yml, and for a run without
+    one. Raises UserError if there is neither a scene nor a run."""
     place = OUTPUTS if path is None else expanded(path)
     if place.suffix == SUFFIX or place.is_file():
         return None if place.suffix == ".yml" else place
@@ -68,6 +67,6 @@ def find_scene_file(path: str | Path | None = None) -> Path | None:
 
 
 def provenance_of(path: str | Path | None = None) -> Provenance:
-    """Title, credit and license of the scene that `load_scene` opens; empty for a run without a file."""
+    """Read title, credit and license of the scene that `load_scene` opens; empty for a run without a file."""
     file = find_scene_file(path)
     return Provenance() if file is None else describe_scene_file(file)["provenance"]

@@ -1,4 +1,4 @@
-"""`train`: photos to a scene, from Python."""
+"""`train`: turn photos into a scene from Python."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ def train(
     """Train a scene from photos, as `ns-train lang3dxl` does without a viewer.
 
     Args:
-        data: folder of photos, with or without a COLMAP model or transforms.json; or a video.
+        data: folder of photos, with or without a COLMAP model or transforms.json, or a video.
         out: folder for the run, in which NAME.scene is written.
-        iterations: training steps; default: 30,000 on a GPU, 3,000 without.
-        clip: the CLIP to learn words from: "builtin", a Hugging Face name, a folder, or "none" for colors
-            alone; default: that of `ns-train lang3dxl`.
-        dense: dense encoder, the same choices.
-        scale: size of the photos that colors are trained on, as a fraction of the files'.
+        iterations: training steps; by default 30,000 on a GPU and 3,000 without one.
+        clip: the CLIP that provides the language features: "builtin", a Hugging Face name, a folder, or
+            "none" to train colors only. The default is the one of `ns-train lang3dxl`.
+        dense: dense encoder, with the same choices.
+        scale: size of the photos that colors are trained on, as a fraction of the files' size.
 
     Returns:
         The trained scene.
 
     Raises:
-        UserError: the photos can't be used, or training was interrupted.
+        UserError: the photos cannot be used, or training was interrupted.
     """
     from lang3dxl_ns.common.console import silence_libraries
     from lang3dxl_ns.common.errors import UserError

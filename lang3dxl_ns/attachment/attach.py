@@ -1,4 +1,4 @@
-"""`attach`: words for a finished splat, from its photos or from views of itself."""
+"""`attach`: words for a finished splat, learned from its photos or from views of itself."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
 from lang3dxl_ns.rendering.splats import Splats
 
 _LIGHT = 0.15
-"""Deviation of the photos' brightness (natural logarithm) from which a message says so."""
+"""Deviation of the photos' brightness (natural logarithm) above which a message reports it."""
 _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
 
 
@@ -40,15 +40,15 @@ class AttachConfig:
     """Settings of `attach`."""
 
     views: int = 48
-    """Without photos: views of the splat to render and learn from."""
+    """Number of views of the splat to render and learn from, without photos."""
     up: Up = "auto"
-    """Without photos: the splat's axis that points up (auto: by where its ground is)."""
+    """Axis of the splat that points up, without photos. With auto, it is estimated from the ground."""
     cache_dir: Path | None = None
     """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
     segment: tuple[str, ...] = ()
     """Words that a segmenter, `preparation.foreground_model`, finds in the photos and teaches the scene."""
     preparation: PreparationConfig = field(default_factory=PreparationConfig)
-    """Encoders, crops and foreground."""
+    """Settings of encoders, crops and foreground."""
 
 
 def attach(
@@ -58,23 +58,23 @@ def attach(
     config: AttachConfig | None = None,
     device: torch.device | str | None = None,
 ) -> Scene:
-    """Give a finished splat words: a scene that answers any text.
+    """Give a finished splat words: make a scene that answers any text.
 
     Targets are kept beside the photos, so that an interrupted call continues when it is repeated.
 
     Args:
-        splat: the file or run, see `read_splats`.
-        data: its photos, see `read_collection`; None: views of the splat are rendered, and kept in the hidden
-            folder .NAME.views beside `out`.
-        out: the scene file to write; None (with `data`): none is written.
+        splat: file or run of the splat, as `read_splats` takes it.
+        data: photos of the splat, as `read_collection` takes them. None renders views of the splat, which are
+            kept in the hidden folder .NAME.views beside `out`.
+        out: scene file to write; None (with `data`): none is written.
         config: settings.
-        device: where to work; default: a GPU if there is one.
+        device: where to compute; by default a GPU if there is one.
 
     Returns:
-        The scene, its Gaussians in the splat's own frame and order.
+        The scene, with its Gaussians in the splat's own frame and order.
 
     Raises:
-        UserError: the splat or the photos can't be read, or the photos don't show the splat.
+        UserError: the splat or the photos cannot be read, or the photos do not show the splat.
     """
     config, place = config or AttachConfig(), None if out is None else expanded(out).absolute()
     if place is not None and place.suffix != SUFFIX:
@@ -128,7 +128,8 @@ def attach(
 
 
 def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path | None) -> Similarity:
-    """The frame of the photos in the splat's; says what was found. Raises UserError if nothing fits."""
+    """Find the similarity from the photos' frame to the splat's, and say what was found. Raises UserError if
+    no frame matches."""
     if collection.left_out:
         say(f"{len(collection.left_out)} photos are left out: {some(list(collection.left_out.values()), 3)}")
     fit = find_frame(splats, collection, path)

@@ -1,4 +1,4 @@
-"""Which frame a splat is in: renderings at the photos' cameras, compared with the photos."""
+"""Search for the frame of a splat: renderings at the photos' cameras are compared with the photos."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ from lang3dxl_ns.scene.colmap import TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
 
 FITS = 0.5
-"""Correlation of renderings with their photos above which a frame is right; wrong ones reach 0.3."""
+"""Correlation of renderings with their photos above which a frame is right. Wrong ones reach 0.3."""
 _CLOSE = 0.75
-"""Correlation from which a frame isn't refined, and no other one tried."""
+"""Correlation from which a frame is not refined, and no other one is tried."""
 _PROMISING = 0.15
 """Correlation below which a frame is not worth refining."""
 _SMALL, _LARGE = 64, 128
-"""Longer sides in pixels of the comparisons."""
+"""Longer sides of the compared pictures, pixels."""
 _FEW, _MANY = 5, 12
-"""Photos of the first comparison, and of the last."""
+"""Numbers of photos in the first comparison, and in the last."""
 _REFINED = 3
-"""Frames that are refined at most."""
+"""Largest number of frames that are refined."""
 _ROUNDS = ((48, 40), (96, 40))
-"""Refinement: longer sides in pixels, and steps at each."""
+"""Rounds of refinement: longer side in pixels, and steps at it."""
 _MOST = 200_000
-"""Gaussians that refinement renders, hundreds of times."""
+"""Largest number of Gaussians that refinement renders, which it does hundreds of times."""
 _RATE = 4e-3
-"""Adam's, in radians and shares of the scene's size."""
+"""Adam's learning rate, in radians and fractions of the scene's size."""
 _COVERED = 0.05
-"""Share of a photo that the splat must cover."""
+"""Smallest share of a photo that the splat must cover."""
 _SEES = 0.05
-"""Opacity of Gaussians that registration takes part of the shape."""
+"""Opacity above which registration counts a Gaussian as part of the shape."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A frame, and how well renderings in it agree with the photos."""
+    """Frame of a splat, and how well renderings in it agree with the photos."""
 
     name: str
     similarity: Similarity
@@ -71,24 +71,25 @@ class Fit:
 
 
 def camera_in(similarity: Similarity | Float[Tensor, "4 4"], tracked: TrackedPhoto) -> Camera:
-    """A photo's camera in the splat's frame. Its lens must not distort, or be of the undistorted photo."""
+    """Build a photo's camera in the splat's frame. The lens must have no distortion, or belong to the
+    undistorted photo."""
     whole = torch.as_tensor(similarity, dtype=torch.float64)
     pose = torch.from_numpy(np.vstack([tracked.camera_from_world, [0, 0, 0, 1]])).double()
     view = pose @ whole.inverse()
     scale = whole[:3, :3].det().pow(1 / 3)
-    return tracked.lens.camera(torch.cat([scale * view[:3], view[3:]]).float())  # axes stay of unit length
+    return tracked.lens.camera(torch.cat([scale * view[:3], view[3:]]).float())  # the axes keep unit length
 
 
 def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
-    """The frame in which renderings at the photos' cameras look like the photos.
+    """Find the frame in which renderings at the photos' cameras look like the photos.
 
-    The frames that programs use are tried first, then the scene's shape; the best of them are refined by
-    descent on the correlation. The result may be wrong: see `Fit.fits`.
+    The frames that programs use are tried first, then those from the scene's shape. The best of them are
+    refined by descent on the correlation. The result may be wrong, which `Fit.fits` shows.
 
     Args:
         splats: the Gaussians.
         collection: the photos.
-        splat: file of the splat, see `known_frames`.
+        splat: file of the splat, for `known_frames`.
     """
     small, large = _Comparison.of(collection, _FEW, _SMALL), _Comparison.of(collection, _MANY, _LARGE)
     best = _best(splats, small, known_frames(collection.reconstruction, splat))
@@ -104,7 +105,7 @@ def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
     worth = [found] if found.fits else [f for f in checked if f.score >= min(_PROMISING, found.score)]
     every = -(-len(splats) // _MOST)
     thinned = splats.select(torch.arange(0, len(splats), every))
-    thinned = replace(thinned, scales=thinned.scales * every**0.5)  # that cover as much together
+    thinned = replace(thinned, scales=thinned.scales * every**0.5)  # fewer Gaussians cover as much together
     with progress("refining the frame", len(worth) * sum(steps for _, steps in _ROUNDS)) as advance:
         for fit in worth:
             refined = fit.similarity
@@ -128,7 +129,7 @@ def _best(splats: Splats, comparison: _Comparison, frames: Mapping[str, Similari
 
 @dataclass(frozen=True)
 class _Compared:
-    """A photo, small and gray."""
+    """Photo to compare, small and gray."""
 
     tracked: TrackedPhoto
     gray: Float[Tensor, "h w"]
@@ -144,8 +145,9 @@ class _Compared:
     def beside(
         self, splats: Splats, similarity: Similarity | Float[Tensor, "4 4"]
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """A rendering at the photo's camera, the photo, and where the two can be compared: what is behind the
-        splat is not in it, and the edges of it are mixed."""
+        """Return a rendering at the photo's camera, the photo, and where the two can be compared. Pixels that
+        the splat does not cover are excluded, because it lacks the background, and so are its edges, where
+        the two mix."""
         camera = camera_in(similarity, self.tracked)
         colors = splats.colors(camera.position.detach()).mean(1, keepdim=True)
         gaussians = splats.gaussians.seen_from(camera)
@@ -157,7 +159,7 @@ class _Compared:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Some photos, evenly spread, at one size."""
+    """Photos to compare with, evenly spread over the collection, at one size."""
 
     photos: Sequence[_Compared]
 
@@ -178,7 +180,7 @@ class _Comparison:
         return Fit(name, similarity, float(np.mean(scores)), tuple(gains))
 
     def refined(self, splats: Splats, start: Similarity, steps: int, advance) -> Similarity:
-        """The similarity after some steps of Adam on rotation, translation and scale."""
+        """Refine the similarity by some steps of Adam on rotation, translation and scale."""
         centers = np.array([photo.tracked.center for photo in self.photos])
         middle = torch.from_numpy(start[:3, :3] @ np.median(centers, axis=0) + start[:3, 3])
         seen = splats.means[splats.opacities > _SEES].double().cpu()
@@ -204,7 +206,7 @@ class _Comparison:
 
 
 def _similarity(values: Float[Tensor, "7"], middle: Float[Tensor, "3"], size: float) -> Float[Tensor, "4 4"]:
-    """A rotation about `middle` (radians), a scale (logarithm) and a translation (in units of the size)."""
+    """Combine a rotation about `middle` (radians), a scale (logarithm) and a translation (in sizes)."""
     x, y, z = values[:3]
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
@@ -217,7 +219,7 @@ def _similarity(values: Float[Tensor, "7"], middle: Float[Tensor, "3"], size: fl
 def _correlation(
     a: Float[Tensor, "h w"], b: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
 ) -> Float[Tensor, ""]:
-    """Pearson's, over the mask; 0 where one is flat, or the mask is small."""
+    """Compute Pearson's correlation over the mask; 0 where one picture is flat, or the mask is small."""
     if float(mask.float().mean()) < _COVERED:
         return a.sum() * 0
     a, b = a[mask] - a[mask].mean(), b[mask] - b[mask].mean()
@@ -225,7 +227,7 @@ def _correlation(
 
 
 def side_by_side(splats: Splats, collection: PhotoCollection, fit: Fit) -> UInt8[Array, "h w 3"]:
-    """A photo beside the rendering at its camera, to look at."""
+    """Draw a photo beside the rendering at its camera, for a person to compare."""
     photo = collection.photos[len(collection.photos) // 2]
     camera = camera_in(fit.similarity, collection.reconstruction.photos[photo.name])
     camera = resized(camera, 640)

@@ -1,4 +1,4 @@
-"""Frames that programs train splats in: similarities from the frame of the photos' poses."""
+"""Frames in which programs train splats, as similarities from the frame of the photos' poses."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.scene.colmap import Reconstruction
 
 Similarity = Float[Array, "4 4"]
-"""[[s·R, t], [0, 1]] from the photos' frame to the splat's."""
+"""Similarity [[s·R, t], [0, 1]] from the photos' frame to the splat's."""
 RUN_TRANSFORM = "dataparser_transforms.json"
-"""File in which nerfstudio tells a run's frame."""
+"""File to which nerfstudio writes a run's frame."""
 _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""COLMAP's y down to nerfstudio's z up."""
+"""Rotation from COLMAP's y down to nerfstudio's z up."""
 _OLD_Z_UP = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-"""The same in nerfstudio before 1.0."""
+"""Rotation from COLMAP's y down to z up in nerfstudio before 1.0."""
 _STEPS = 30
 _POINTS = 2_000
 _GAUSSIANS = 20_000
 
 
 def known_frames(reconstruction: Reconstruction, splat: Path) -> dict[str, Similarity]:
-    """What the frame of a splat may be, by the program that uses it.
+    """List the possible frames of a splat, by the program that uses them.
 
     Args:
         reconstruction: the photos' poses, and points if there are some.
-        splat: file of the splat; in a run of nerfstudio the file beside it tells the frame.
+        splat: file of the splat. In a run of nerfstudio, the file beside it gives the frame.
     """
     cameras = np.array(
         [np.vstack([p.camera_from_world, [0, 0, 0, 1]]) for p in reconstruction.photos.values()]
@@ -58,7 +58,7 @@ def _of_run(splat: Path) -> dict[str, Similarity]:
         except DAMAGE:
             continue
         own = np.vstack([rows, [0, 0, 0, 1]])
-        # A transforms.json of ns-process-data has turned the axes already.
+        # A transforms.json of ns-process-data already has turned axes.
         return {
             "the run's": own,
             "the run's, of turned axes": own @ np.linalg.inv(_Z_UP),
@@ -67,13 +67,13 @@ def _of_run(splat: Path) -> dict[str, Similarity]:
 
 
 def _upright(poses: Float[Array, "n 4 4"]) -> Similarity:
-    """The smallest rotation that takes the cameras' mean up direction to z."""
+    """Compute the smallest rotation that takes the cameras' mean up direction to z."""
     up = -poses[:, :3, 1].mean(axis=0)
     return _between(up / max(np.linalg.norm(up), 1e-12), np.array([0.0, 0, 1]))
 
 
 def _between(source: Float[Array, "3"], target: Float[Array, "3"]) -> Similarity:
-    """The smallest rotation that takes a direction to another."""
+    """Compute the smallest rotation that takes one direction to another."""
     axis, cosine = np.cross(source, target), float(source @ target)
     turn = np.eye(4)
     opposite = cosine < -1 + 1e-8
@@ -83,7 +83,7 @@ def _between(source: Float[Array, "3"], target: Float[Array, "3"]) -> Similarity
 
 
 def _centered(poses: Float[Array, "n 4 4"], turn: Similarity) -> Similarity:
-    """Turned, the cameras' mean at the origin, their largest coordinate 1."""
+    """Turn the frame, move the cameras' mean to the origin, and scale their largest coordinate to 1."""
     shift = np.eye(4)
     shift[:3, 3] = -poses[:, :3, 3].mean(axis=0)
     moved = (turn @ shift @ poses)[:, :3, 3]
@@ -95,8 +95,9 @@ def _scaled(factor: float) -> Similarity:
 
 
 def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[str, Similarity]:
-    """The normalization of gsplat's examples: up is −y, the origin is where the cameras look, the median
-    camera is at distance 1; then the principal axes of the points, and z up again."""
+    """Compute the normalization of gsplat's examples: up is −y, the origin is where the cameras look, and the
+    median camera is at distance 1. With points, their principal axes follow, and the one of smallest variance
+    becomes z."""
     up = -poses[:, :3, 1].mean(axis=0)
     turn = _between(up / max(np.linalg.norm(up), 1e-12), np.array([0.0, -1, 0]))
     turned = turn @ poses
@@ -112,7 +113,7 @@ def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[s
     moved = points @ first[:3, :3].T + first[:3, 3]
     middle = np.median(moved, axis=0)
     _, axes = np.linalg.eigh(np.cov(moved - middle, rowvar=False))
-    axes = axes[:, ::-1].copy()  # of largest variance first
+    axes = axes[:, ::-1].copy()  # largest variance first
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1
     principal = np.eye(4)
@@ -126,8 +127,8 @@ def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[s
 
 
 def registered_frames(points: Float[Array, "m 3"], means: Float[Array, "n 3"]) -> dict[str, Similarity]:
-    """Similarities that lay the photos' points onto the Gaussians, by iterated closest points from many
-    rotations, the three closest; none with fewer than 50 points."""
+    """Register the photos' points to the Gaussians by iterated closest points from many rotations, and return
+    the three closest similarities. With fewer than 50 points or Gaussians there are none."""
     if len(points) < 50 or len(means) < 50:
         return {}
     chosen = np.random.default_rng(0)
@@ -141,7 +142,7 @@ def registered_frames(points: Float[Array, "m 3"], means: Float[Array, "n 3"]) -
 
 
 def _typical(points: Float[Array, "m 3"]) -> Float[Array, "k 3"]:
-    """The nine tenths nearest to the middle."""
+    """Select the nine tenths of the points that are nearest to the middle."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return points[distance <= np.quantile(distance, 0.9)]
 
@@ -149,7 +150,8 @@ def _typical(points: Float[Array, "m 3"]) -> Float[Array, "k 3"]:
 def _closest(
     source: Float[Array, "m 3"], target: Float[Array, "n 3"], tree: KDTree, turn: Float[Array, "3 3"]
 ) -> tuple[float, Similarity]:
-    """Iterated closest points from principal axes and a rotation; the mean distance in units of the size."""
+    """Run iterated closest points from principal axes and a rotation. Returns the mean distance in units of
+    the size, and the similarity."""
     from skimage.transform import estimate_transform  # takes a second to import
 
     (a, from_axes, small), (b, to_axes, size) = map(_principal, (source, target))
@@ -161,13 +163,13 @@ def _closest(
         kept = near <= np.quantile(near, 0.8)
         distance = float(near[kept].mean() / size)
         fit = estimate_transform("similarity", source[kept], target[rows[kept]]).params
-    # Everything shrunk onto one place is close, too.
+    # A fit that shrinks everything onto one place is close, too, so shrinking is penalized.
     return distance * max(1.0, size / max(small * np.cbrt(np.linalg.det(fit[:3, :3])), 1e-12)), fit
 
 
 def _principal(points: Float[Array, "m 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"], float]:
-    """Middle of points, their principal axes as columns of a rotation, of smallest variance first, and their
-    mean distance from the middle."""
+    """Return the middle of points, their principal axes as columns of a rotation, smallest variance first,
+    and their mean distance from the middle."""
     middle = np.median(points, axis=0)
     _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
     axes[:, 0] *= np.sign(np.linalg.det(axes))

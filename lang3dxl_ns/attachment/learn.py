@@ -32,11 +32,11 @@ from lang3dxl_ns.scene.camera import Camera, camera_to_world, resized
 from lang3dxl_ns.scene.photo import Photo
 
 LONGER_SIDE = 800
-"""Pixels of the longer side at which photos are gathered, at most: a fine crop covers dozens of them."""
+"""Largest longer side at which photos are gathered, pixels. A fine crop covers dozens of pixels."""
 
 
 def settled(config: PreparationConfig) -> PreparationConfig:
-    """The settings with which features are gathered: fine crops, and the dense encoder that belongs to the
+    """Return the settings for gathering features: fine crops, and the dense encoder that belongs to the
     CLIP."""
     dense = config.dense
     if dense == "auto":
@@ -47,12 +47,12 @@ def settled(config: PreparationConfig) -> PreparationConfig:
 def prepare_photos(
     collection: PhotoCollection, config: PreparationConfig, cache: Path, device: torch.device | str
 ) -> tuple[PhotoCollection, TargetReader]:
-    """The photos with their foreground, and their targets; those that can't be read are left out.
+    """Prepare the photos' foreground and targets. Photos that cannot be read are left out.
 
     Args:
         collection: the photos.
-        config: see `settled`.
-        cache: folder of the targets, where training finds them too.
+        config: settings from `settled`.
+        cache: folder of the targets, where training also finds them.
         device: where the encoders run.
     """
     masked = with_foreground(collection.photos, config, collection.folder, cache, device, say)
@@ -67,13 +67,13 @@ def prepare_photos(
 def learn(
     splats: Splats, collection: PhotoCollection, cameras: Mapping[str, Camera], targets: TargetReader
 ) -> tuple[Decoder, Float[Tensor, "n code"]]:
-    """A decoder and the Gaussians' codes; NaN for those that no photo shows.
+    """Learn a decoder and the Gaussians' codes, which are NaN for Gaussians that no photo shows.
 
     Args:
-        splats: the Gaussians, on the device to work on.
+        splats: the Gaussians, on the device to compute on.
         collection: the photos.
-        cameras: of each photo, at the file's resolution, in the splat's frame.
-        targets: of the photos.
+        cameras: camera of each photo, at the file's resolution, in the splat's frame.
+        targets: targets of the photos.
     """
     device = splats.means.device
     decoder = make_decoder(
@@ -115,7 +115,7 @@ def scene_file(
     similarity: Similarity,
     config: PreparationConfig,
 ) -> SceneFile:
-    """What a scene keeps of its photos, and of the frame: splat's = similarity · photos'."""
+    """Describe what a scene keeps of its photos and of the frame, where splat's = similarity · photos'."""
     known, local = find_model(config.clip, CLIP_OPTION), expanded(config.clip)
     scale = float(torch.from_numpy(similarity[:3, :3]).double().det().pow(1 / 3))
     return SceneFile(

@@ -1,4 +1,4 @@
-"""Words taught by a segmenter: its masks of the photos, lifted to the Gaussians by votes."""
+"""Words taught by a segmenter, whose masks of the photos are lifted to the Gaussians by votes."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.photo import Photo
 
 _SIDE = 800
-"""Longer side in pixels of the photos that are segmented."""
+"""Longer side of the photos that are segmented, pixels."""
 _EXAMPLES = 12
-"""Photos that teach the word, at most: those that show most of it."""
+"""Largest number of photos that teach the word. Those that show most of it are chosen."""
 _LEAST, _MOST = 1e-3, 0.9
-"""Share of the scene's pixels in a photo that the word fills, where the photo teaches it."""
+"""Smallest and largest share of the scene's pixels that the word may fill in a photo that teaches it."""
 
 
 def segmented(
     scene: Scene, word: str, segmenter: TextSegmenter, photos: Sequence[Photo], cameras: Mapping[str, Camera]
 ) -> Scene:
-    """A scene that was taught a word by a segmenter; the same scene, with a message, if that finds nothing.
+    """Teach a scene a word by a segmenter; if that finds nothing, say so and return the same scene.
 
-    Each photo votes about the Gaussians that it shows, so an error in one photo is outvoted by the others.
-    The word is then learned from the Gaussians with a majority, as from marks of a person.
+    Each photo votes about the Gaussians that it shows, so the others outvote an error in one photo. The word
+    is then learned from the Gaussians with a majority, as from marks by a person.
 
     Args:
         scene: the scene.
-        word: what to look for.
-        segmenter: finds it in photos.
-        photos: those of the scene.
-        cameras: of each photo, at the file's resolution, in the scene's frame.
+        word: the word to teach.
+        segmenter: segmenter that finds the word in photos.
+        photos: photos of the scene.
+        cameras: camera of each photo, at the file's resolution, in the scene's frame.
     """
     masks: dict[str, Bool[Tensor, "h w"]] = {}
 
@@ -69,7 +69,7 @@ def segmented(
 
 
 def _share(scene: Scene, photo: Photo, camera: Camera, chosen: Bool[Tensor, " n"]) -> float:
-    """Share of the scene's pixels in a photo's foreground that some Gaussians fill."""
+    """Compute the share of the scene's pixels in a photo's foreground that the chosen Gaussians fill."""
     small = resized(camera, MARK_SIDE)
     both = torch.stack([chosen, torch.ones_like(chosen)], dim=1).to(scene.splats.means)
     drawn = composite(scene.splats, small, both, scene.backend)

@@ -1,4 +1,4 @@
-"""Views of a splat from the splat alone: around it and in it, outside of matter, chosen to show all of it."""
+"""Views of a splat made without photos: around it and in it, outside of matter, chosen to show all of it."""
 
 from __future__ import annotations
 
@@ -33,55 +33,55 @@ from lang3dxl_ns.scene.photo import Photo
 
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
 LENS = Lens(480, 360, 384.0, 384.0, 240.0, 180.0)
-"""Lens of the views: 64 degrees wide, as a phone's."""
+"""Lens of the views, 64 degrees wide like a phone's."""
 BACKGROUND = (0.75, 0.8, 0.85)
-"""Behind the splat: a pale sky."""
+"""Color behind the splat, a pale sky."""
 _RULE = 3
-"""Increased when views are chosen or rendered in another way."""
+"""Version of the rule. It is increased when views are chosen or rendered in another way."""
 _OPAQUE = 0.3
 _NEAR = 0.03
-"""Distance from matter that a camera keeps, in radii of the scene."""
+"""Distance that a camera keeps from matter, in radii of the scene."""
 _CLOSE = 0.1
-"""Depth in radii below which a pixel shows something too close, and the share of such pixels."""
+"""Depth in radii below which a pixel shows something too close. `_MOST_CLOSE` limits their share."""
 _MOST_CLOSE = 0.1
 _COVERED = 0.35
-"""Share of a view that the splat must cover."""
+"""Smallest share of a view that the splat must cover."""
 _BLURRED = 2.0
-"""Median size of the Gaussians in a view, relative to that in most views, from which it is blurred: too close
-for what the splat was made from."""
+"""Median size of the Gaussians in a view, relative to the median view, above which the view is blurred: it is
+closer than the splat's own photos were."""
 _PROBES, _ROOFED = 64, 0.7
-"""Places tried, and the share of them with matter above from which a scene is indoors."""
+"""Number of places tried, and the share of them with matter above from which a scene is indoors."""
 _TILT = 0.4
-"""Angle in radians between up and the nearest axis, at most."""
+"""Largest angle between up and the nearest axis, radians."""
 _RING = (1.6, 5.0)
-"""Distances in radii of the views around a scene. From closer by, its parts fill a view, and their crops
-lack the surroundings by which CLIP tells them apart."""
+"""Distances of the views around a scene, in radii. From closer by, its parts fill a view, and their crops
+lack the surroundings by which CLIP distinguishes them."""
 _CANDIDATES = 5
-"""Candidates for every view wanted."""
+"""Number of candidates for every requested view."""
 _SIDE = 96
-"""Longer side of the views that candidates are judged by."""
+"""Longer side of the views by which candidates are judged, pixels."""
 _SAMPLE = 30_000
-"""Gaussians that candidates are judged by."""
+"""Number of Gaussians by which candidates are judged."""
 _ENOUGH = 4.0
-"""Pixels of a small view that show a Gaussian well; more count less."""
+"""Pixels of a small view that are enough to show a Gaussian well. Further ones count less."""
 _POINTS = 400
-"""Points per view, from its depth, for the sizes of crops."""
+"""Number of points per view, from its depth, which give the sizes of crops."""
 
 
 @dataclass(frozen=True)
 class Extent:
-    """Where a splat's matter is."""
+    """Position and size of a splat's matter."""
 
     center: Float[Tensor, "3"]
     radius: float
-    """Holds three quarters of it."""
+    """Distance from the center that holds three quarters of the matter."""
     up: Float[Tensor, "3"]
     ground: float
-    """Height of the ground, along `up`, from the center."""
+    """Height of the ground above the center, along `up`."""
 
     @classmethod
     def of(cls, splats: Splats, up: Up) -> Extent:
-        """Raises UserError if there is no matter."""
+        """Measure the extent. Raises UserError if there is no matter."""
         solid = solids(splats)
         means = solid.means
         center = means.median(0).values
@@ -93,7 +93,7 @@ class Extent:
 
 
 def solids(splats: Splats) -> Splats:
-    """Opaque Gaussians, at most 200,000 of them. Raises UserError if there are hardly any."""
+    """Select the opaque Gaussians, at most 200,000 of them. Raises UserError if there are hardly any."""
     rows = (splats.opacities > _OPAQUE).nonzero()[:, 0]
     if len(rows) < 10:
         raise UserError("this splat has hardly an opaque Gaussian: nothing can be seen in it")
@@ -101,7 +101,7 @@ def solids(splats: Splats) -> Splats:
 
 
 def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:
-    """The direction, near one of the axes, against which the ground lies: of all flat things at an end of the
+    """Find the up direction, near one of the axes, from the ground: of all flat things at an end of the
     scene, the ground is the largest."""
     normals, area = _normals(solid)
     near = (solid.means - center).norm(dim=1) < 4 * radius
@@ -123,7 +123,7 @@ def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[T
 
 
 def _normals(solid: Splats) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """The thinnest axis of each Gaussian, and the area of the other two, which nothing huge dominates."""
+    """Return each Gaussian's thinnest axis, and the area of the other two, clamped at the 99th percentile."""
     thin = solid.scales.argmin(1)
     normals = rotations(solid.quats)[torch.arange(len(solid), device=thin.device), :, thin]
     area = solid.scales.prod(1) / solid.scales.amin(1).clamp_min(1e-12)
@@ -137,9 +137,9 @@ def _axis(name: str) -> Float[Tensor, "3"]:
 
 
 def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCollection:
-    """Pictures of a splat as a photo collection, in the splat's frame.
+    """Render pictures of a splat as a photo collection, in the splat's frame.
 
-    They are kept in `folder`, and made anew only for another splat or other settings.
+    They are kept in `folder`, and rendered again only for another splat or other settings.
 
     Args:
         splats: the Gaussians.
@@ -174,7 +174,7 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCol
 
 
 def _kept(folder: Path, stamp: str) -> list[Camera] | None:
-    """The cameras of an earlier call for the same splat."""
+    """Read the cameras of an earlier call for the same splat; None if there was none."""
     try:
         content = read_json(folder / "views.json")
         if content["of"] != stamp:
@@ -187,7 +187,7 @@ def _kept(folder: Path, stamp: str) -> list[Camera] | None:
 
 
 def _tracked(name: str, view: Rendering, chosen: np.random.Generator) -> TrackedPhoto:
-    """A view with points of the surfaces that it shows."""
+    """Build a tracked photo from a view, with points of the surfaces that it shows."""
     rows, columns = (view.alpha > 0.8).cpu().numpy().nonzero()
     some = chosen.permutation(len(rows))[:_POINTS]
     rows, columns = rows[some], columns[some]
@@ -202,11 +202,11 @@ def _tracked(name: str, view: Rendering, chosen: np.random.Generator) -> Tracked
 
 
 def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
-    """Views that together show the most Gaussians at the size at which they were made.
+    """Choose views that together show the most Gaussians at the size at which they were made.
 
-    Candidates stand around the scene and in it, at several heights and distances. Those too close to matter,
-    those that show little, and those that show it blurred are dropped; of the rest the one that adds most is
-    taken, again and again.
+    Candidates are placed around the scene and in it, at several heights and distances. Those that are too
+    close to matter, show little, or show it blurred are dropped. From the rest, the one that adds most is
+    chosen, again and again.
 
     Raises:
         UserError: no candidate is left.
@@ -232,7 +232,7 @@ def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
 
 
 def _cover(shown: Float[Tensor, "views n"], count: int) -> list[int]:
-    """Greedy choice: a Gaussian's first pixels count most."""
+    """Choose views greedily. A Gaussian's first pixels count most."""
     total, chosen = torch.zeros_like(shown[0]), list[int]()
     for _ in range(count):
         gain = ((total + shown) / _ENOUGH).log1p().sum(1) - (total / _ENOUGH).log1p().sum()
@@ -243,8 +243,8 @@ def _cover(shown: Float[Tensor, "views n"], count: int) -> list[int]:
 
 
 def _judged(splats: Splats, camera: Camera, extent: Extent) -> tuple[Float[Tensor, " n"], float] | None:
-    """Pixels that each Gaussian fills in a small view, and the median size of those seen, in pixels of the
-    large one; None for a view that isn't worth taking."""
+    """Compute how many pixels each Gaussian fills in a small view, and the median size of the visible ones,
+    in pixels of the large view. Returns None for a view that is not worth taking."""
     small = resized(camera, _SIDE)
     view = render(splats, small)
     solid = view.alpha > 0.5
@@ -263,8 +263,8 @@ def _judged(splats: Splats, camera: Camera, extent: Extent) -> tuple[Float[Tenso
 
 
 class _FreeSpace:
-    """Where no matter is: not close to it and, in scenes under the sky, not below it either: a building of
-    which only the outside was seen is hollow."""
+    """Space without matter, for cameras. Its places are not close to matter. In scenes under the sky they are
+    not below matter either, because a building of which only the outside was seen is hollow."""
 
     def __init__(self, solid: Splats, extent: Extent) -> None:
         near = (solid.means - extent.center).norm(dim=1) < 3 * extent.radius
@@ -286,13 +286,13 @@ class _FreeSpace:
         return bool(far.all()) and (self.indoors or not self.roofed(place))
 
     def roofed(self, place: Float[Tensor, "3"]) -> bool:
-        """Whether there is matter above a place."""
+        """Return whether there is matter above a place."""
         rows = self._from_above.query_ball_point((place @ self._plan).cpu().numpy(), self._width)
         return bool((self._heights[rows] > float(place @ self._extent.up) + self._margin).any())
 
 
 def candidates(extent: Extent, free: _FreeSpace, count: int) -> Iterator[Camera]:
-    """Cameras in free space: two thirds around the scene, looking in, one third in it, looking around."""
+    """Yield cameras in free space: two thirds around the scene, looking in, a third in it, looking around."""
     draw = torch.Generator().manual_seed(0)
     found = tries = 0
     while found < count and tries < 20 * count:
@@ -304,7 +304,7 @@ def candidates(extent: Extent, free: _FreeSpace, count: int) -> Iterator[Camera]
 
 
 def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """As far as `_RING` says, up to 40 degrees above the ground; at something in the inner half."""
+    """Draw a place within `_RING`, up to 40 degrees above the ground, and a target in the inner half."""
     angle, height, distance, *aim = torch.rand(6, generator=draw).tolist()
     elevation = math.radians(40) * height**2
     away = extent.radius * _RING[0] * (_RING[1] / _RING[0]) ** distance
@@ -317,7 +317,8 @@ def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], 
 
 
 def _inside(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Somewhere over the ground within a radius, at a person's or a storey's height, looking around."""
+    """Draw a place over the ground within a radius, at a person's or a story's height, and a target
+    around."""
     x, y, height, angle, tilt = torch.rand(5, generator=draw).tolist()
     side, front = _level(extent.up)
     place = extent.center + extent.radius * ((2 * x - 1) * side + (2 * y - 1) * front)
@@ -327,7 +328,7 @@ def _inside(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], 
 
 
 def _level(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Two directions along the ground."""
+    """Return two directions along the ground."""
     first = torch.zeros_like(up)
     first[int(up.abs().argmin())] = 1.0
     side = F.normalize(torch.linalg.cross(up, first), dim=0)
@@ -337,7 +338,8 @@ def _level(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3
 def looking(
     place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "4 4"]:
-    """World → camera (OpenCV axes) of an upright camera that looks from a place at a target."""
+    """Build the view matrix (world → camera, OpenCV axes) of an upright camera at a place, looking at a
+    target."""
     forward = F.normalize(target - place, dim=0)
     right = F.normalize(torch.linalg.cross(forward, up), dim=0)
     down = torch.linalg.cross(forward, right)

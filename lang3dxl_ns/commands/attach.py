@@ -20,28 +20,29 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 )
 @dataclass(kw_only=True)
 class Attach(PreparationConfig):
-    """Give words to a finished splat: writes a scene that answers any text, without training colors again.
+    """Give words to a finished splat: write a scene that answers any text, without training colors again.
 
-    Reads PLY of any program (SuperSplat's compressed one too), .spz, .splat, gsplat's checkpoints, and runs
-    of nerfstudio's splatfacto. With --data, words are learned from the splat's photos; without, from views of
-    the splat itself, which is less accurate.
+    Reads PLY files of any program (also SuperSplat's compressed ones), .spz, .splat, gsplat's checkpoints,
+    and runs of nerfstudio's splatfacto. With --data, words are learned from the splat's photos. Without it,
+    they are learned from views of the splat itself, which is less accurate.
     """
 
     splat: tyro.conf.Positional[Path]
-    """The splat's file, or the folder of its run."""
+    """File of the splat, or the folder of its run."""
     data: Path | None = None
-    """Its photos: a folder with a COLMAP model or a transforms.json, a folder of photos alone, or a video."""
+    """Photos of the splat: a folder with a COLMAP model or a transforms.json, a folder of photos only, or a
+    video."""
     out: Path
-    """The scene file to write, NAME.scene."""
+    """Scene file to write, NAME.scene."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Texts to look for at the end ("windows; towers"): a picture of the best view of each is written beside
-    the scene."""
+    """Texts to search for at the end ("windows; towers"). A picture of the best view of each is written
+    beside the scene."""
     views: int = 48
-    """Without --data: number of views to render."""
+    """Number of views to render without --data."""
     up: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
-    """Without --data: the splat's axis that points up (auto: by where its ground is)."""
+    """Axis of the splat that points up, without --data. With auto, it is estimated from the ground."""
     segment: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """A word that --foreground-model finds in the photos and teaches the scene; repeat the flag."""
+    """Word that --foreground-model finds in the photos and teaches the scene. Repeat the flag for more."""
     cache_dir: Path | None = None
     """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
 
@@ -60,7 +61,7 @@ class Attach(PreparationConfig):
 
 
 def _show(scene, texts: list[str], out: Path) -> None:
-    """Write a picture, named after its prompts, of each view that shows one best."""
+    """Write a picture of each view that shows a prompt best, named after the prompts."""
     from lang3dxl_ns.common.files import slugs
     from lang3dxl_ns.query.doubt import doubtful
     from lang3dxl_ns.query.match import save_picture, together

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.query.match import Match
 
 RUN = Path("run", "lang3dxl", "demo")
-"""The run's folder inside the demo's folder."""
+"""Folder of the run inside the demo's folder."""
 _STAGES = "stages.json"
 
 
@@ -37,34 +37,35 @@ _STAGES = "stages.json"
 @dataclass
 class Demo:
     """See the full workflow in minutes, without any data: generate a landmark that the built-in CLIP has
-    never seen, photograph it, prepare targets, train, and measure how well words find their pixels in
-    novel views and held-out photos.
+    never seen, photograph it, prepare targets, train, and measure how well words find their pixels in novel
+    views and held-out photos.
 
-    Ctrl-C stops at any point and keeps what is there; the same command continues.
+    Ctrl-C stops at any point and keeps what is finished. The same command continues.
     """
 
     out: Path | None = None
-    """Folder for the scene, the run and the report (default: lang3dxl-demo or, if another scene is there,
-    lang3dxl-demo-2 …)."""
+    """Folder for the scene, the run and the report. The default is lang3dxl-demo or, if that holds another
+    scene, lang3dxl-demo-2 …"""
     seed: int = 2
-    """Landmark seed; those below 1,000 are unknown to the built-in CLIP."""
+    """Seed of the landmark. The built-in CLIP has not seen seeds below 1,000."""
     family: Literal["cathedral", "mosque", "hall", "auto"] = "auto"
-    """Kind of building; auto: chosen by the seed."""
+    """Kind of building. With auto, the seed chooses it."""
     photos: int | None = None
-    """Number of photos; 48, or 24 with --quick."""
+    """Number of photos. The default is 48; --quick makes it 24."""
     steps: int | None = None
-    """Training iterations; 1,200, or 250 with --quick."""
+    """Training iterations. The default is 1,200; --quick makes it 250."""
     wild: bool = True
-    """Photos like those from the Internet: sizes, lenses, weather, exposures and passers-by vary.
-    --no-wild: one camera, one sun, no people."""
+    """Vary sizes, lenses, weather, exposures and passers-by as in photos from the Internet. --no-wild uses
+    one camera, one sun and no people."""
     test_views: int | None = None
-    """Novel views with exact labels to score, besides the held-out photos; 24, or 8 with --quick; 0: none."""
+    """Number of novel views with exact labels to score, besides the held-out photos. The default is 24;
+    --quick makes it 8. 0 makes none."""
     quick: bool = False
-    """A third of the time: fewer photos, views and iterations, less accurate words."""
+    """Take a third of the time, with fewer photos, views and iterations. Words are less accurate."""
     clip: str = "builtin"
-    """CLIP: "builtin", a Hugging Face name, a folder, or "none" for colors only."""
+    """CLIP to use: "builtin", a Hugging Face name, a folder, or "none" for colors only."""
     dense: str = "builtin"
-    """Dense encoder: the same choices."""
+    """Dense encoder to use, with the same choices."""
     ns_train: str = ""
     """Extra flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.sky-gaussians 0"."""
 
@@ -112,8 +113,8 @@ class Demo:
         say(f'Ask it:          lang3dxl query {run} --text "windows" --out found')
 
     def _folder(self) -> Path:
-        """The folder requested, or the first default one without another scene. Raises UserError if a
-        requested one holds another."""
+        """Return the requested folder, or the first default one without another scene. Raises UserError if
+        the requested folder holds another scene."""
         if self.out is not None:
             out = expanded(self.out).absolute()
             if difference := self._difference(out):
@@ -123,7 +124,7 @@ class Demo:
         return next(out for name in names if not self._difference(out := Path(name).absolute()))
 
     def _difference(self, out: Path) -> str | None:
-        """How the scene in a folder differs from the one requested; None if it doesn't, or is yet to come."""
+        """Say how the scene in a folder differs from the requested one; None if it does not or is missing."""
         path = out / "scene" / "scene.json"
         if not path.exists():
             return None
@@ -138,7 +139,7 @@ class Demo:
 
     @property
     def _wanted(self) -> dict[str, Any]:
-        """What tells the requested scene from others, as scene.json names it."""
+        """Settings that distinguish the requested scene from others, with their names in scene.json."""
         photos, views = (24, 8) if self.quick else (48, 24)
         wanted: dict[str, Any] = {"seed": self.seed, "wild": self.wild}
         wanted["photos"] = photos if self.photos is None else self.photos
@@ -146,7 +147,7 @@ class Demo:
         return wanted | ({} if self.family == "auto" else {"family": self.family})
 
     def _scene(self, out: Path) -> Path:
-        """The scene in `out`, generated unless it is there."""
+        """Return the scene in `out`, generating it if necessary."""
         from lang3dxl_ns.demo.landmark.scene_writer import write_scene
 
         folder = out / "scene"
@@ -155,7 +156,7 @@ class Demo:
         return write_scene(DemoScene(out=folder, **{"family": self.family, **self._wanted}))
 
     def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
-        """The run's configuration; resumes from the checkpoint of an earlier command, if any."""
+        """Build the run's configuration, resuming from an earlier command's checkpoint if there is one."""
         import tyro
 
         from lang3dxl_ns.methods import run_config
@@ -163,7 +164,7 @@ class Demo:
         steps = self.steps or (250 if self.quick else 1_200)
         config = run_config(scene, out, str(RUN.parts[0]), steps, self.clip, self.dense)
         config.timestamp = RUN.name
-        config.pipeline.datamanager.foreground = "none"  # score every pixel, sky and people too
+        config.pipeline.datamanager.foreground = "none"  # score every pixel, also of sky and people
         config.pipeline.datamanager.camera_res_scale_factor = 0.5  # words are scored at half the size
         if self.quick:
             config.pipeline.datamanager.dense_tokens = 32
@@ -192,7 +193,7 @@ class Demo:
         }
 
     def markdown(self, report: dict[str, Any]) -> str:
-        """The report in markdown."""
+        """Write the report in markdown."""
         from lang3dxl_ns.evaluation.report import scene_table
 
         splits = "\n".join(f"#{scene_table(*split)}" for split in report["splits"].items())
@@ -223,7 +224,7 @@ size, as published. Test views are novel cameras in plain light, no people. PSNR
 _BOUNDS = {"seed": (0, 2**63), "photos": (4, 9999), "steps": (1, 1e9), "test_views": (0, 9999)}
 
 SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluate": 0.28}
-"""The demo's stages, and their usual shares of its time on a CPU."""
+"""Stages of the demo, with their usual shares of its time on a CPU."""
 
 
 def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, matches: dict[str, Match]) -> PictureRow:

@@ -1,4 +1,4 @@
-"""`lang3dxl doctor`: checks versions, the GPU and its build of gsplat, disk, memory, ffmpeg."""
+"""`lang3dxl doctor`: checks of versions, the GPU and its build of gsplat, disk, memory, ffmpeg."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 
 LEAST_MEMORY, LEAST_DISK = 4e9, 10e9
-"""Bytes; of disk: encoders of one or two gigabytes, targets of eight megabytes per photo, and a run."""
+"""Least memory and disk space without a note, bytes. The disk holds encoders of one or two gigabytes, targets
+of eight megabytes per photo, and a run."""
 
 
 @dataclass(frozen=True)
@@ -27,21 +28,21 @@ class Finding:
     verdict: Literal["ok", "note", "problem"]
     found: str
     remedy: str = ""
-    """What to do if it isn't fine."""
+    """Remedy if the check did not pass."""
 
 
 @dataclass(kw_only=True)
 class Doctor:
-    """Check this machine: versions, GPU, gsplat's build, disk and memory, and say what to do.
+    """Check versions, GPU, gsplat's build, disk and memory of this machine, and say what to do.
 
-    Nothing is downloaded or changed, unless --build requests gsplat's kernels. Exits with status 1 if
+    Nothing is downloaded or changed, unless --build requests gsplat's kernels. The exit status is 1 if
     something prevents a run.
     """
 
     build: bool = False
-    """Build gsplat's CUDA kernels now (minutes), instead of before the first training."""
+    """Build gsplat's CUDA kernels now, which takes minutes, instead of before the first training."""
     arch: str = ""
-    """Compute capability to build for, such as 8.6; default: this machine's GPUs."""
+    """Compute capability to build for, such as 8.6. The default is the one of this machine's GPUs."""
 
     def main(self) -> None:
         found = []
@@ -59,10 +60,8 @@ class Doctor:
 
 
 def build_now(arch: str = "") -> None:
-    """Build and load gsplat's kernels for a compute capability, by default this machine's.
-
-    Raises UserError if something is missing.
-    """
+    """Build and load gsplat's kernels for a compute capability, by default this machine's. Raises UserError
+    if something is missing."""
     from lang3dxl_ns.rendering import gsplat_build
 
     arch = arch or gsplat_build.device_arch()
@@ -75,7 +74,7 @@ def build_now(arch: str = "") -> None:
 
 
 def findings() -> Iterator[Finding]:
-    """Runs all checks, yielding each result."""
+    """Run all checks, and yield each result."""
     yield from versions()
     yield from devices()
     yield storage("memory", machine_memory(), LEAST_MEMORY, "--pipeline.datamanager.cache-gb 0.2")
@@ -87,7 +86,7 @@ def findings() -> Iterator[Finding]:
 
 
 def versions() -> Iterator[Finding]:
-    """Python and the required packages, pycolmap among them, against this package's requirements."""
+    """Check Python and the required packages, pycolmap among them, against this package's requirements."""
     from packaging.requirements import Requirement
 
     fine = (3, 10) <= sys.version_info[:2] < (3, 13)
@@ -106,12 +105,12 @@ def versions() -> Iterator[Finding]:
 
 
 def devices() -> Iterator[Finding]:
-    """GPUs, and what gsplat's kernels need; without a GPU, the CPU."""
+    """Check the GPUs, and what gsplat's kernels need. Without a GPU, report the CPU."""
     cpu = Finding("device", "note", f"CPU, {os.cpu_count()} cores", "training is slower than on a GPU")
     if not (shutil.which("nvidia-smi") or glob("/dev/nvidia[0-9]*") or glob("/dev/kfd")):
         yield cpu
         return
-    import torch  # takes seconds
+    import torch  # takes seconds to import
 
     from lang3dxl_ns.common.device import unused_gpu
     from lang3dxl_ns.rendering import gsplat_build
@@ -131,6 +130,6 @@ def devices() -> Iterator[Finding]:
 
 
 def storage(what: str, size: float, least: float, remedy: str) -> Finding:
-    """Whether there is enough of a storage, in bytes."""
+    """Check whether there is enough of a kind of storage, in bytes."""
     verdict: Literal["ok", "note"] = "ok" if size >= least else "note"
     return Finding(what, verdict, f"{size / 1e9:.1f} GB", "" if size >= least else f"little: use {remedy}")

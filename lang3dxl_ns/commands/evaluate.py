@@ -1,4 +1,4 @@
-"""`lang3dxl evaluate`: scores of runs, of other systems' maps, and of several scenes together."""
+"""`lang3dxl evaluate`: scoring of runs, of other systems' maps, and of several scenes together."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_ph
 from lang3dxl_ns.evaluation.report import pooled_table, read_results, scene_table
 
 REPORT = "scores"
-"""Report file name, without suffix."""
+"""Name of the report's files, without suffix."""
 
 
 @showing("maps", "ground_truth", "layout", "photos", "masks", "out")
 @dataclass(kw_only=True)
 class EvaluateMaps:
-    """Score relevancy maps made by any system.
+    """Score relevancy maps made by any system, and write scores.md and scores.json.
 
-    Maps are in a folder per prompt, `<prompt>/<photo>.npy` (float) or a picture, as `lang3dxl query` also
-    writes them. Writes scores.md and scores.json.
+    Maps are in a folder per prompt, as `<prompt>/<photo>.npy` (float) or a picture. `lang3dxl query` also
+    writes them so.
     """
 
     maps: Path
@@ -38,12 +38,12 @@ class EvaluateMaps:
     photos: Path | None = None
     """Text file with the names of the photos to score, one per line (default: all labeled photos)."""
     masks: Path | None = None
-    """Folder of foreground masks, white = keep: predictions become 0 elsewhere."""
+    """Folder of foreground masks, white = keep. Predictions become 0 elsewhere."""
     temperature: float = 1.0
-    """Softmax temperature that the maps were made with: 20 for `lang3dxl query`, 10 in LERF's code. The
-    published processing uses temperature 1, to which maps are converted for it."""
+    """Softmax temperature that the maps were made with: 20 for `lang3dxl query`, 10 in LERF's code. For the
+    published processing, maps are converted to temperature 1, which it uses."""
     scene: str | None = None
-    """Name in the report (default: that of the ground truth's folder)."""
+    """Name in the report (default: the name of the ground truth's folder)."""
     out: Path
     """Folder for the report."""
 
@@ -68,10 +68,10 @@ class EvaluateRun:
     """
 
     run: tyro.conf.Positional[Path | None] = None
-    """Folder of the run, or its config.yml (default: the newest under outputs/); or a .scene file, whose
-    words are scored with --ground-truth, without its run and its photos."""
+    """Folder of the run, or its config.yml (default: the newest under outputs/). For a .scene file, its words
+    are scored with --ground-truth, which needs neither its run nor its photos."""
     split: Literal["held-out", "seen", "test"] = "held-out"
-    """Photos held out of training, labeled training photos, or the run's test views."""
+    """Photos to score: those held out of training, labeled training photos, or the run's test views."""
     ground_truth: Path | None = None
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
     layout: Layout | Literal["auto"] = "auto"
@@ -117,13 +117,13 @@ class EvaluateRun:
 
 @dataclass(kw_only=True)
 class EvaluatePool:
-    """Combine scenes: averages over all photos, and over the scenes' means.
+    """Combine scenes: average over all photos, and over the scenes' means.
 
     Writes scores.md and scores.json.
     """
 
     reports: list[Path]
-    """For each scene the scores.json of `lang3dxl evaluate`, or the file of `ns-eval --output-path`."""
+    """The scores.json of each scene from `lang3dxl evaluate`, or its file from `ns-eval --output-path`."""
     out: Path
     """Folder for the report."""
 
@@ -153,7 +153,7 @@ class EvaluatePool:
 
 @dataclass(kw_only=True)
 class EvaluateSplit:
-    """Choose labeled photos to hold out of training, up to five per category, the same at every call.
+    """Choose labeled photos to hold out of training, up to five per category, the same in every call.
 
     Pass the list to `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`.
     """
@@ -163,7 +163,7 @@ class EvaluateSplit:
     out: Path
     """Text file to write."""
     per_category: int = 5
-    """Photos for each category; photos that show several count for each."""
+    """Number of photos for each category. Photos that show several categories count for each."""
 
     def main(self) -> None:
         if self.per_category < 1:
@@ -182,14 +182,14 @@ Evaluate = (
 
 
 def _told(name: str, protocol: dict[str, Any]) -> str:
-    """What a report says of how its scene was scored."""
+    """Summarize what a report says about how its scene was scored."""
     keys = ("evaluated_photos", "seen_in_training", "foreground")
     known = [f"{key.replace('_', ' ')}: {protocol[key]}" for key in keys if protocol.get(key) is not None]
     return f"- {name}: {', '.join(known) or 'its report does not tell how it was scored'}"
 
 
 def _scene_name(folder: Path) -> str:
-    """Name of the scene, from a ground truth folder named after it, or one inside that."""
+    """Derive the scene's name from a ground truth folder named after it, or one inside that."""
     return folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
 
 

@@ -1,4 +1,4 @@
-"""`lang3dxl info`: what a scene file holds."""
+"""`lang3dxl info`: contents of a scene file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lang3dxl_ns.common.errors import UserError
 
 @dataclass(kw_only=True)
 class Info:
-    """Tell what a scene file holds and where it comes from."""
+    """Print what a scene file holds and where it comes from."""
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""

@@ -17,7 +17,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 class Needs(PreparationConfig):
     """Measure a scene's needs without training: which optional components will be built, and why.
 
-    `ns-train lang3dxl` measures the same, and follows it for every component left at "auto".
+    `ns-train lang3dxl` measures the same, and applies it to every component left at "auto".
     """
 
     data: Path

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 @showing("data", "clip", "dense", "quality", "foreground", "regions", "workers", "cache_dir")
 @dataclass(kw_only=True)
 class Prepare(PreparationConfig):
-    """Make the targets that training learns from: CLIP features of crops in physical scale, dense features.
+    """Make the targets that training learns from, in advance.
 
-    `ns-train lang3dxl` makes missing targets itself; this command makes them in advance. It can be
-    interrupted and repeated at any time.
+    They are CLIP features of crops in physical scale, and dense features. `ns-train lang3dxl` makes missing
+    targets itself. This command can be interrupted and repeated at any time.
     """
 
     data: Path
@@ -27,8 +27,8 @@ class Prepare(PreparationConfig):
     cache_dir: Path | None = None
     """Folder for the targets (default: lang3dxl_cache inside the data folder)."""
     clean: bool = False
-    """Make nothing; delete targets that these settings and the scene's photos do not use (such as those of
-    removed photos, or dense features with --dense none)."""
+    """Delete targets that these settings and the scene's photos do not use (such as those of removed photos,
+    or dense features with --dense none), and make none."""
 
     def main(self) -> None:
         from lang3dxl_ns.plugin.dataparser import check_data
@@ -50,7 +50,7 @@ class Prepare(PreparationConfig):
 
 
 def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:
-    """The data manager for a folder of photos with these settings; prepares nothing yet."""
+    """Open the data manager for a folder of photos with these settings. Nothing is prepared yet."""
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
     from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig

@@ -17,11 +17,11 @@ class Preset:
 
     ns-train lang3dxl-paper --data FOLDER $(lang3dxl preset holyscenes/milano)
 
-    `official`: flags for what the authors' release does otherwise; both can be given.
+    `official` prints flags for what the authors' release does differently. The flags of both can be combined.
     """
 
     name: Annotated[str, tyro.conf.Positional] = ""
-    """Such as holyscenes/milano, or official; without a name, lists them all."""
+    """Name of the preset, such as holyscenes/milano, or official. Without a name, all are listed."""
 
     def main(self) -> None:
         if not self.name:

@@ -41,20 +41,21 @@ _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")
 @showing("scene", "text", "not_", "out", "image", "all", "camera_path", "coco", "clip", "settings")
 @dataclass(kw_only=True)
 class Query:
-    """Search a trained scene for texts: writes heat maps, masks and relevancy maps.
+    """Search a trained scene for texts: write heat maps, masks and relevancy maps.
 
-    For every text, a folder in --out with, for every view, `….overlay.png` (heat map over the rendering),
-    `….mask.png` and `….npy` (relevancy, float32); `query.json` lists prompts and results. Without
-    --image, --all or --camera-path, each text gets the training view that shows it best. Views that several
-    texts share also come as one picture, with a color for each and a legend, in `together`.
+    Each text gets a folder in --out. For every view, it holds `….overlay.png` (heat map over the rendering),
+    `….mask.png` and `….npy` (relevancy, float32). `query.json` lists prompts and results. Without --image,
+    --all or --camera-path, each text gets the training view that shows it best. Views that several texts
+    share are also written as one picture to `together`, with a color for each text and a legend.
     """
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Text to look for; repeat the flag, or separate with `;`. Negatives: '"windows" not "arcades"'."""
+    """Text to search for. Repeat the flag, or separate texts with `;`. Negatives are written as '"windows"
+    not "arcades"'."""
     not_: _Not = field(default_factory=list)
-    """What all texts are told apart from, such as arcades; repeat the flag for more."""
+    """Negative for all texts, such as arcades. Repeat the flag for more."""
     out: Path
     """Folder for the results."""
     image: str | None = None
@@ -64,11 +65,11 @@ class Query:
     camera_path: Path | None = None
     """Use the views of a camera path saved by the viewer."""
     coco: Path | None = None
-    """With --all, also write the masks to this file as labels in COCO's format, for all photos and texts."""
+    """COCO file to which the masks of all photos and texts are also written as labels. It needs --all."""
     without_taught: bool = False
-    """Ask for the texts alone, leaving out what the scene was taught by example (lang3dxl teach)."""
+    """Search for the texts only, without what the scene was taught by example (lang3dxl teach)."""
     clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene says."""
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
@@ -118,7 +119,7 @@ class Query:
                 say(f"  {advice}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
-        """File name (no suffix) of every requested view, its camera or photo, and the prompts it is for."""
+        """List file name (no suffix), camera or photo, and prompts of every requested view."""
         everything = range(len(question.prompts))
         if self.camera_path is not None:
             return [(f"{i:05d}", c, everything) for i, c in enumerate(read_camera_path(self.camera_path))]
@@ -135,17 +136,17 @@ class Query:
 
 
 def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:
-    """Prompts of --text, each once and with the negatives of --not."""
+    """Parse the prompts of --text, each once and with the negatives of --not."""
     prompts = dict.fromkeys(prompt for text in texts for prompt in parse_prompts(text))
     return [replace(prompt, negatives=(*prompt.negatives, *apart_from)) for prompt in prompts]
 
 
 _LONGEST_NAME = 200
-"""Bytes; file systems allow 255, suffixes included."""
+"""Longest file name without suffixes, bytes. File systems allow 255 with suffixes."""
 
 
 def file_names(photos: list[str]) -> list[str]:
-    """A unique file name (no suffix) for each photo: a.jpg beside a.png becomes a_jpg."""
+    """Choose a unique file name (no suffix) for each photo. For example, a.jpg beside a.png becomes a_jpg."""
     stems = [str(PurePosixPath(photo).with_suffix("")).replace("/", "_") for photo in photos]
     whole = [photo.replace("/", "_").replace(".", "_") for photo in photos]
     names = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, whole, strict=True)]
@@ -154,7 +155,7 @@ def file_names(photos: list[str]) -> list[str]:
 
 
 def of_file(scene: Scene, photo: str, mask: Bool[Array, "h w"]) -> Bool[Array, "H W"]:
-    """A view's mask at the size of the photo's file."""
+    """Resize a view's mask to the size of the photo's file."""
     found = scene.file.photo(photo)
     size = found.size or (found.lens.width, found.lens.height)
     return np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST))
@@ -191,41 +192,41 @@ def _view_report(name: str, matches: list[Match]) -> dict:
 )
 @dataclass(kw_only=True)
 class Export:
-    """Write a scene in another form: a splat file of the Gaussians that match a text, in the model's frame,
-    which ordinary viewers open (--out); a web page that answers words by itself (--web); or the scene itself,
-    in one file to share, that can be queried without its run and its photos (--scene-file).
-    """
+    """Write a scene in another form. --out writes a splat file of the Gaussians that match a text, in the
+    model's frame, which ordinary viewers open. --web writes a web page that answers words by itself.
+    --scene-file writes the scene itself to one file to share, which can be queried without its run and its
+    photos."""
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Text to look for (default: write everything); with --web, prompts that the page opens with."""
+    """Text to search for (default: write everything). With --web, prompts that the page opens with."""
     not_: _Not = field(default_factory=list)
-    """What all texts are told apart from; repeat the flag for more."""
+    """Negative for all texts. Repeat the flag for more."""
     out: Path | None = None
-    """The .ply or .spz file to write."""
+    """Splat file to write, .ply or .spz."""
     web: Path | None = None
     """Folder for a web page that any static server can serve."""
     vocabulary: Path | None = None
-    """Words that may name a place on the page, one per line, besides the shipped ones; it also knows those of
+    """File of words that may name a place on the page, one per line, besides the shipped ones and those of
     the CLIP's tokenizer."""
     scene_file: Path | None = None
-    """The .scene file to write."""
+    """Scene file to write, NAME.scene."""
     title: str = ""
-    """Heading of page and scene (default: the scene's own, or the name of the photos' folder)."""
+    """Title of page and scene (default: the scene's own, or the name of the photos' folder)."""
     credit: str = ""
     """Line about the photos: who took them."""
     license: str = ""
     """Terms under which photos and scene may be used."""
     all: bool = False
-    """Write all Gaussians; with --text a .ply has their relevancy as a property."""
+    """Write all Gaussians. With --text, a .ply has their relevancy as a property."""
     index: Path | None = None
-    """With --text and --out: file (.npy or .txt) for the numbers of the matching Gaussians, in the scene's
-    order, which is that of the splat it was attached to."""
+    """File (.npy or .txt) for the indices of the matching Gaussians, in the order of the scene, which is also
+    the order of the splat that it was attached to. It needs --text and --out."""
     look: str | None = None
-    """Light of this training photo, by name (default: of the photo that shows the scene as a whole)."""
+    """Training photo whose lighting is used, by name (default: the photo that best shows the whole scene)."""
     clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene says."""
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
@@ -257,7 +258,7 @@ class Export:
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:
-        """The words of the CLIP's tokenizer; none on a machine without that CLIP."""
+        """Return the words of the CLIP's tokenizer; empty on a machine without that CLIP."""
         try:
             return whole_words(self.clip or clip or "")
         except UserError as error:
@@ -265,7 +266,7 @@ class Export:
             return ()
 
     def _told(self) -> Provenance:
-        """What the scene's own file tells of its origin, unless told otherwise."""
+        """Return the provenance in the scene's own file, with what the flags override."""
         own, program = provenance_of(self.scene), f"lang3dxl-ns {__version__}"
         title, credit = self.title or own.title, self.credit or own.credit
         return Provenance(title, credit, self.license or own.license, program, own.made_how)

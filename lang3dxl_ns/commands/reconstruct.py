@@ -13,8 +13,8 @@ from lang3dxl_ns.scene.reconstruction_settings import ReconstructionSettings
 class Reconstruct(ReconstructionSettings):
     """Reconstruct photos: cameras, poses and points, as a COLMAP model.
 
-    `ns-train lang3dxl` does this itself for photos without a model; this command does it in advance.
-    It can be interrupted and repeated at any time, and never replaces an existing model.
+    `ns-train lang3dxl` does this itself for photos without a model; this command does it in advance. It can
+    be interrupted and repeated at any time, and never replaces an existing model.
     """
 
     data: Path

@@ -19,26 +19,26 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class Teach:
-    """Show a scene what a word means, by marking it in a photo: an outline, a box, or points.
+    """Show a scene what a word means, by marking it in a photo with an outline, a box, or points.
 
-    The scene keeps the word. Further calls add examples, in the same photo or in others; `lang3dxl words`
-    lists them and takes them back. `query`, `export` and the viewer then find the word everywhere.
+    The scene keeps the word. Further calls add examples, in the same photo or in others. `lang3dxl words`
+    lists and removes them. `query`, `export` and the viewer then find the word everywhere.
     """
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
     word: str
-    """The word to teach."""
+    """Word to teach."""
     photo: str
-    """The photo that is marked, by name."""
+    """Name of the photo that is marked."""
     mask: Path | None = None
-    """Picture of the photo's proportions, white on all that is the word."""
+    """Picture in the photo's proportions that is white on everything that the word means."""
     box: str | None = None
-    """A box around all that is the word, in pixels of the photo: LEFT,TOP,RIGHT,BOTTOM."""
+    """Box around everything that the word means, in pixels of the photo: LEFT,TOP,RIGHT,BOTTOM."""
     at: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """A point on the word, in pixels of the photo: X,Y; repeat the flag."""
+    """Point on what the word means, in pixels of the photo: X,Y. Repeat the flag for more."""
     not_at: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """A point on something else: X,Y; repeat the flag."""
+    """Point on something else: X,Y. Repeat the flag for more."""
 
     def main(self) -> None:
         from lang3dxl_ns.query.scene_file import keep_words
@@ -68,16 +68,16 @@ class Teach:
 
 @dataclass(kw_only=True)
 class Words:
-    """List the words that a scene was taught; take them back; carry them to other scenes of the same CLIP."""
+    """List the words that a scene was taught, remove them, or carry them to other scenes of the same CLIP."""
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
     forget: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """A word to forget, or one of its examples: doors, or doors/2 for its second example."""
+    """Word to forget, or one of its examples (doors, or doors/2 for the second). Repeat the flag for more."""
     save: Path | None = None
-    """Write the words to this file."""
+    """File to write the words to."""
     load: Path | None = None
-    """Add the words from this file. What was learned in one scene often fails in another: check them."""
+    """File of words to add. Words learned in one scene often fail in another, so check them."""
 
     def main(self) -> None:
         from lang3dxl_ns.query.scene_file import keep_words
@@ -103,7 +103,7 @@ class Words:
 
 
 def opened(path: Path | None) -> tuple[Scene, Path]:
-    """A scene, and the file that keeps its words.
+    """Open a scene, and find the file that keeps its words.
 
     Raises:
         UserError: there is no scene file.
@@ -120,10 +120,10 @@ def opened(path: Path | None) -> tuple[Scene, Path]:
 
 
 def forgotten(scene: Scene, which: str) -> Scene:
-    """The scene without a word (doors), or without one of its examples (doors/2).
+    """Return the scene without a word (doors), or without one of its examples (doors/2).
 
     Raises:
-        UserError: it was not taught.
+        UserError: the word or example was not taught.
     """
     from lang3dxl_ns.query.teach import known_word
 
@@ -138,7 +138,7 @@ def forgotten(scene: Scene, which: str) -> Scene:
 
 
 def described(word: TaughtWord) -> list[str]:
-    """A word and its examples, in lines."""
+    """Describe a word and its examples in lines."""
     if not word.examples:
         return [f"{word.name}: carried over from {word.scene}, which often fails: check it in a few photos"]
     count = f"{len(word.examples)} example{'s' if len(word.examples) > 1 else ''}"
@@ -159,7 +159,7 @@ def _marks(example: Example) -> str:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """A picture as a mask: at least half bright. Raises UserError where it can't be read."""
+    """Read a picture as a mask, true where at least half bright. Raises UserError if it cannot be read."""
     from lang3dxl_ns.evaluation.annotations import read_gray
 
     return np.asarray(read_gray(path, "mask")) >= 128

@@ -1,4 +1,4 @@
-"""`lang3dxl view`: a scene in the browser, asked with any words."""
+"""`lang3dxl view`: exploring and querying a scene in the browser."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from lang3dxl_ns.common.settings_help import showing
 @showing("scene", "text", "host", "port", "clip")
 @dataclass(kw_only=True)
 class View:
-    """Explore and ask a scene in a browser.
+    """Explore and query a scene in a browser.
 
-    The browser draws the Gaussians (WebGL) and answers words; this machine encodes texts. It is the page of
-    `lang3dxl export --web`, which answers the words of a vocabulary without any server.
+    The browser draws the Gaussians (WebGL) and answers words; this machine encodes texts. The page is the one
+    of `lang3dxl export --web`, which answers the words of a vocabulary without any server.
     """
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Prompt to start with; repeat the flag, or separate with `;`."""
+    """Prompt to start with. Repeat the flag, or separate prompts with `;`."""
     vocabulary: Path | None = None
-    """Words that may name a place, one per line, besides the shipped ones."""
+    """File of words that may name a place, one per line, besides the shipped ones."""
     host: str = "127.0.0.1"
-    """Address to serve at; 0.0.0.0 opens it to the network, with the token shown in the terminal."""
+    """Address to serve at. 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
-    """Port to serve at; by default a free one from 7007 on."""
+    """Port to serve at. The default is a free one from 7007 on."""
     clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene says."""
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene, provenance_of

@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from lang3dxl_ns.common.errors import UserError, in_a_line
 
 FARTHEST = 1e12
-"""Largest coordinate, world units; map coordinates are below 1e8."""
+"""Largest coordinate, world units. Map coordinates are below 1e8."""
 
 
 def check_numbers(settings: object, bounds: Mapping[str, tuple[float, float]], prefix: str = "--") -> None:
-    """Raises UserError for a field outside its (smallest, largest), NaN included. None passes."""
+    """Check that fields are within (smallest, largest) or None. Raises UserError otherwise, also for NaN."""
     for name, (low, high) in bounds.items():
         value = getattr(settings, name)
         if value is not None and not low <= value <= high:
@@ -22,7 +22,7 @@ def check_numbers(settings: object, bounds: Mapping[str, tuple[float, float]], p
 
 
 def disk_trouble(error: OSError) -> str | None:
-    """Message about a file that can't be read or written; None for other errors."""
+    """Return a message about a file that cannot be read or written; None for other errors."""
     if error.errno not in _REMEDIES:
         return None
     if error.filename is None:  # a stream has no name
@@ -31,19 +31,19 @@ def disk_trouble(error: OSError) -> str | None:
 
 
 def is_coordinate(value: object) -> bool:
-    """Whether this is a finite number of a sensible size: no NaN, truth value or text."""
+    """Return whether this is a finite number of a sensible size: not NaN, a truth value or text."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < FARTHEST
 
 
 def expect(holds: bool, otherwise: str) -> None:
-    """Raises ValueError with a reason unless a condition on a file's content holds."""
+    """Check a condition on a file's content. Raises ValueError with a reason if it does not hold."""
     if not holds:
         raise ValueError(otherwise)
 
 
 def check_address(host: str, port: int | None) -> None:
-    """Raises UserError for an address that nothing can be served at: a port that is taken or none at all, a
-    host that is not a name or address of this machine. port: None: any."""
+    """Check that a server can use an address; a port of None stands for any. Raises UserError for a port that
+    is taken or invalid, and for a host that is not a name or address of this machine."""
     if port is not None and not 1 <= port <= 65535:
         raise UserError(f"the port is {port}: give a number from 1 to 65535")
     try:

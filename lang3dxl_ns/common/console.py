@@ -13,18 +13,18 @@ from contextlib import contextmanager
 from lang3dxl_ns.common.errors import printable
 
 QUIET_S = 5.0
-"""Seconds before a progress bar appears; shorter work shows none."""
+"""Seconds before a progress bar appears. Shorter work shows none."""
 
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
-    """A function to call after each of `total` items, or with their number after several; after five seconds,
-    shows a bar with the time left."""
+    """Yield a function to call after each of `total` items, or with their number after several. After five
+    seconds, it shows a progress bar with the time left."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     start = time.monotonic()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    bar = Progress(*columns, speed_estimate_period=600)  # items come in lots: a short window would jump
+    bar = Progress(*columns, speed_estimate_period=600)  # items come in batches: a short window would jump
     shown = bar.add_task(what, total=total)
 
     def advance(count: int = 1) -> None:
@@ -35,7 +35,7 @@ def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
     try:
         yield advance
     finally:
-        if bar.live.is_started:  # else it would print an empty line
+        if bar.live.is_started:  # otherwise it would print an empty line
             bar.stop()
 
 
@@ -48,7 +48,7 @@ def say(*lines: str) -> None:
 
 
 def accept_any_console() -> None:
-    """Make characters that the terminal's encoding lacks appear escaped, instead of as an error."""
+    """Make characters that the terminal's encoding lacks appear escaped instead of raising an error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -67,9 +67,9 @@ _KNOWN_WARNINGS = (
     r"Detected call of `lr_scheduler\.step\(\)` before",  # nerfstudio's optimizers
     r"Converting a tensor with requires_grad=True to a scalar",  # nerfstudio's writer
 )
-"""Beginnings of messages."""
+"""Patterns for the beginnings of warnings that are silenced."""
 
 
 def some(names: Sequence[str], shown: int = 10) -> str:
-    """The first few names, for a message."""
+    """Join the first few names for a message."""
     return printable(", ".join(names[:shown])) + (", …" if len(names) > shown else "")

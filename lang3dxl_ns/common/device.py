@@ -1,4 +1,4 @@
-"""The device to compute on, a warning about GPUs that torch can't use, copies that don't wait for the GPU."""
+"""Choice of the device, a warning about GPUs that torch cannot use, copies that do not wait for the GPU."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ Moved = TypeVar("Moved", bound=Tensor)
 
 
 def to_device(tensor: Moved, device: torch.device | str) -> Moved:
-    """Copy to a device. A copy to a GPU doesn't wait for the work that is queued there, as `Tensor.to` does:
-    CUDA stages ordinary memory before it returns, so the source may be dropped or changed at once."""
+    """Copy a tensor to a device. Unlike `Tensor.to`, a copy to a GPU does not wait for the work that is
+    queued there. CUDA stages ordinary memory before it returns, so the source may be dropped or changed at
+    once."""
     return tensor.to(device, non_blocking=torch.device(device).type == "cuda")  # type: ignore[return-value]
 
 
 def best_device() -> str:
-    """ "cuda" if torch can use a GPU, else "cpu"; then says so if there is a GPU."""
+    """Return "cuda" if torch can use a GPU, else "cpu". In the latter case, warn if there is a GPU."""
     if torch.cuda.is_available():
         return "cuda"
     warn_of_unused_gpu()
@@ -32,13 +33,13 @@ def best_device() -> str:
 
 @functools.cache
 def warn_of_unused_gpu() -> None:
-    """Say once per process if this machine has a GPU that torch can't use."""
+    """Say once per process if this machine has a GPU that torch cannot use."""
     if (trouble := unused_gpu()) is not None:
         say(f"Warning: {trouble}. Everything runs on the CPU now, many times slower.")
 
 
 def unused_gpu() -> str | None:
-    """Why torch can't use this machine's GPU, with the remedy; None if it can, or if there is none."""
+    """Say why torch cannot use this machine's GPU, with the remedy; None if it can, or if there is no GPU."""
     if torch.cuda.is_available():
         return None
     nvidia = bool(shutil.which("nvidia-smi") or glob.glob("/dev/nvidia[0-9]*"))

@@ -9,32 +9,30 @@ DAMAGE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
     *(MemoryError, AssertionError, struct.error),
 )
-"""Exceptions raised on reading values that a damaged file doesn't have."""
+"""Exceptions raised when values are read that a damaged file does not have."""
 
 
 class UserError(Exception):
-    """An error in the user's data or settings; the message names it and the remedy.
-
-    Commands print the message alone, without a traceback.
-    """
+    """Error in the user's data or settings. The message names it and the remedy. Commands print only the
+    message, without a traceback."""
 
     def __str__(self) -> str:
         return printable(super().__str__())
 
 
 def printable(text: str) -> str:
-    """The text with control characters and lone surrogates escaped: a file's name may hold commands for the
+    """Escape control characters and lone surrogates, because a file's name may hold commands for the
     terminal. Line breaks and tabs stay."""
     return "".join(c if c in "\n\t" or not _commands(c) else repr(c)[1:-1] for c in text)
 
 
 def in_a_line(error: BaseException, most: int = 200) -> str:
-    """The beginning of another library's error, or its kind if it says nothing."""
+    """Return the beginning of another library's error in one line, or its type if it has no message."""
     return " ".join(str(error).split())[:most] or type(error).__name__
 
 
 def is_plain(text: str) -> bool:
-    """Whether a text holds neither control characters nor lone surrogates, nor line breaks."""
+    """Return whether a text has no control characters, lone surrogates or line breaks."""
     return not any(map(_commands, text))
 
 

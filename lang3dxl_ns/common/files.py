@@ -17,12 +17,12 @@ from typing import Any, BinaryIO
 from lang3dxl_ns.common.errors import UserError
 
 _MOST_BYTES = 64 << 20
-"""Largest file of settings, names or figures; files of arrays have limits of their own."""
+"""Largest file of settings, names or figures, bytes. Files of arrays have their own limits."""
 
 
 def open_file(path: Path) -> BinaryIO:
-    """A regular file, opened for reading. Raises OSError for anything else: reading a pipe or a device may
-    never end. The check is of the opened file, so that it can't be replaced in between."""
+    """Open a regular file for reading. Raises OSError for anything else, because reading a pipe or a device
+    may never end. The check is made on the opened file, so that it cannot be replaced in between."""
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     file = os.fdopen(descriptor, "rb", closefd=True) if _is_regular(descriptor) else None
     if file is None:
@@ -37,13 +37,13 @@ def _is_regular(descriptor: int) -> bool:
 
 
 def check_regular(path: Path) -> None:
-    """Raises OSError unless this is a regular file that can be read; for readers of other libraries."""
+    """Check, for readers of other libraries, that this is a readable regular file. Raises OSError if not."""
     open_file(path).close()
 
 
 def read_text(path: Path, most: int = _MOST_BYTES) -> str:
-    """UTF-8 text of a regular file of at most `most` bytes. Raises OSError, or ValueError for a larger file
-    and other bytes."""
+    """Read UTF-8 text from a regular file of at most `most` bytes. Raises OSError, or ValueError for a larger
+    file or invalid UTF-8."""
     with open_file(path) as file:
         content = file.read(most + 1)
     if len(content) > most:
@@ -52,7 +52,7 @@ def read_text(path: Path, most: int = _MOST_BYTES) -> str:
 
 
 def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
-    """Content of a JSON file. Raises OSError, or ValueError for anything that is not JSON."""
+    """Read the content of a JSON file. Raises OSError, or ValueError for anything that is not JSON."""
     try:
         return json.loads(read_text(path, most))
     except RecursionError as error:
@@ -60,8 +60,8 @@ def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
 
 
 def read_array(path: Path) -> Any:
-    """The array of a .npy file, whose header must fit the file's size. Raises OSError, or ValueError for
-    anything else: other formats, pickles, and headers that announce more than there is."""
+    """Read the array of a .npy file, whose header must match the file's size. Raises OSError, or ValueError
+    for anything else: other formats, pickles, and headers that announce more data than there is."""
     import numpy as np
 
     with open_file(path) as file:
@@ -84,7 +84,7 @@ def read_array(path: Path) -> Any:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write to a temporary file beside `path`, then rename it, so that readers never see a partial file.
 
-    If the process is killed, the old content remains, beside a leftover .tmp file. A link stays a link; a
+    If the process is killed, the old content remains, beside a leftover .tmp file. A link stays a link. A
     device (/dev/stdout) or a pipe is written to, and never replaced by a file.
     """
     make_folder(path.parent)
@@ -104,12 +104,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         if isinstance(error, OSError):
-            error.filename = str(path)  # instead of none, or the temporary name
+            error.filename = str(path)  # otherwise it would be None or the temporary name
         raise
 
 
 def replace_durably(partial: Path, path: Path) -> None:
-    """Move a finished file over another one; a loss of power leaves one of the two, whole."""
+    """Move a finished file over another one. A loss of power leaves one of the two intact."""
     _to_disk(partial)
     os.replace(partial, path)
     _to_disk(path.parent)
@@ -124,7 +124,7 @@ def _to_disk(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and its parents. Raises OSError with its name."""
+    """Make a folder and its parents. Raises OSError with the folder's name."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -133,7 +133,7 @@ def make_folder(folder: Path) -> None:
 
 
 def expanded(path: str | Path) -> Path:
-    """The path with ~ replaced. Raises UserError for the home of an unknown user."""
+    """Replace ~ in a path. Raises UserError for the home of an unknown user."""
     try:
         return Path(path).expanduser()
     except RuntimeError as error:
@@ -141,7 +141,7 @@ def expanded(path: str | Path) -> Path:
 
 
 def slugs(texts: Sequence[str]) -> list[str]:
-    """A unique folder name for each text, valid whatever the text contains."""
+    """Choose a unique folder name for each text, valid whatever the text contains."""
     found: list[str] = []
     for i, text in enumerate(texts):
         slug = re.sub(r"[^\w]+", "-", text.lower()).strip("-")[:40] or f"text-{i + 1}"
@@ -151,11 +151,9 @@ def slugs(texts: Sequence[str]) -> list[str]:
 
 
 def read_names(path: Path, what: str = "photos") -> tuple[str, ...]:
-    """Names of photos, or other texts (`what`, for messages), from a text file, one per line and each once;
-    blank lines and comments (#) are skipped.
-
-    Raises UserError for a file that can't be read or is empty.
-    """
+    """Read names of photos, or other texts, from a text file, one per line and each once. Blank lines and
+    comments (#) are skipped. `what` names the texts in messages. Raises UserError for a file that cannot be
+    read or is empty."""
     try:
         lines = read_text(expanded(path)).splitlines()
     except (OSError, ValueError) as error:

@@ -8,19 +8,19 @@ from torch import Tensor
 
 
 def fitted_size(codes: Float[Tensor, "H W 3"], longer_side: int) -> tuple[int, int]:
-    """Rows and columns of a map of at most `longer_side` pixels."""
+    """Compute rows and columns of a map of at most `longer_side` pixels."""
     height, width = codes.shape[:2]
     scale = min(longer_side / max(height, width), 1.0)
     return max(round(height * scale), 1), max(round(width * scale), 1)
 
 
 def resize_nearest(image: Float[Tensor, "H W c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:
-    """Nearest-exact resizing: picks samples, since the mean of two codes is meaningless."""
+    """Resize by nearest-exact sampling, because the mean of two codes is meaningless."""
     return F.interpolate(image.permute(2, 0, 1)[None], size, mode="nearest-exact")[0].permute(1, 2, 0)
 
 
 def resize(values: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
-    """Bilinear resize that averages when shrinking."""
+    """Resize bilinearly, with averaging when shrinking."""
     if values.shape[:2] == grid:
         return values
     planes = values.permute(2, 0, 1)[None]

@@ -16,21 +16,21 @@ from lang3dxl_ns.common.console import say
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function for each number type it is called with; it releases Python's lock.
+    """Compile a function for each number type it is called with. It releases Python's lock.
 
-    The machine code is cached beside the source or in the user's numba folder; if neither is writable, it is
+    The machine code is cached beside the source or in the user's numba folder. If neither is writable, it is
     compiled anew in every process.
     """
     try:
         compiled = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
-    except RuntimeError:  # numba's error for having no cache folder
+    except RuntimeError:  # numba raises this if there is no cache folder
         compiled = numba.njit(nogil=True, error_model="numpy")(function)
     _announcement.kernels.add(id(compiled))
     return compiled
 
 
 class _Announcement(Listener):
-    """Logs once per process that kernels are being compiled; loading them from disk is silent."""
+    """Listener that says once per process that kernels are compiled, not when they are loaded from disk."""
 
     def __init__(self) -> None:
         self.kernels: set[int] = set()
@@ -51,12 +51,12 @@ register("numba:compile", _announcement)
 
 @kernel
 def successor(number: int) -> int:
-    """The smallest kernel, which shows that numba compiles."""
+    """Return the next number. This smallest kernel shows that numba compiles."""
     return number + 1
 
 
 def in_threads(function: Callable[..., Any], parts: Sequence[tuple[Any, ...]]) -> list[Any]:
-    """Call a function with each tuple of arguments, on as many threads as torch uses; results in order."""
+    """Call a function with each tuple of arguments, on as many threads as torch uses, and keep the order."""
     threads = torch.get_num_threads()
     if min(threads, len(parts)) <= 1:
         return [function(*part) for part in parts]
@@ -64,16 +64,16 @@ def in_threads(function: Callable[..., Any], parts: Sequence[tuple[Any, ...]]) -
 
 
 def ranges(count: int, least: int = 1) -> list[tuple[int, int]]:
-    """A range in equal parts, as many as there are threads, of at least `least` each."""
+    """Split a range into equal parts, as many as there are threads, of at least `least` each."""
     step = max(-(-count // torch.get_num_threads()), least)
     return [(first, min(first + step, count)) for first in range(0, count, step)]
 
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """The threads that all kernels share; another pool only if torch is set to another number of them."""
+    """Return the threads that all kernels share. There is one pool for each number of threads of torch."""
     return ThreadPoolExecutor(threads, thread_name_prefix="kernel")
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads don't survive a fork
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork

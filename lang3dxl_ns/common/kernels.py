@@ -9,32 +9,33 @@ import torch
 from torch import Tensor
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import in_a_line
+from lang3dxl_ns.common.errors import UserError, in_a_line
 
 VARIABLE = "LANG3DXL_CPU_KERNELS"
-"""Environment variable: "torch" disables the compiled kernels, as in the tests."""
+"""Environment variable that disables the compiled kernels if it is "torch", as in the tests."""
 
 
 def takes_kernels(tensor: Tensor, wanted: str | None = None) -> bool:
-    """Whether the compiled kernels are available, enabled, and suit a tensor's device and number type.
-
-    wanted: "numba" or "torch"; None reads the environment variable.
-    """
+    """Return whether the compiled kernels are available, enabled, and suit a tensor's device and number type.
+    `wanted` is "numba" or "torch"; None reads the environment variable. Raises UserError for other names."""
     wanted = wanted or os.environ.get(VARIABLE, "numba")
+    if wanted not in ("numba", "torch"):
+        raise UserError(f"{VARIABLE} is {wanted!r}: set it to numba or torch, or unset it")
     fits = tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64)
     return wanted == "numba" and fits and numba_works()
 
 
 @functools.cache
 def numba_works() -> bool:
-    """Whether numba is installed and compiles. A broken one is reported: it may not fit numpy or LLVM."""
+    """Return whether numba is installed and compiles. A broken one is reported, such as one that does not
+    match numpy or LLVM."""
     try:
         import numba  # noqa: F401
 
         from lang3dxl_ns.common import jit
 
         jit.successor(0)
-    except Exception as error:  # of any kind, depending on what doesn't fit
+    except Exception as error:  # of any kind, depending on the mismatch
         if not (isinstance(error, ModuleNotFoundError) and error.name == "numba"):
             say(f"numba does not work ({in_a_line(error)}): torch takes its place, at 2 to 4 times the time")
         return False

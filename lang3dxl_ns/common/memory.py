@@ -11,11 +11,11 @@ from typing import TypeVar
 T = TypeVar("T")
 
 _LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-"""A container's limit, often far below the machine's memory."""
+"""Files with a container's memory limit, which is often far below the machine's memory."""
 
 
 def machine_memory() -> int:
-    """Bytes of main memory available to this process at most: the machine's, or its container's limit."""
+    """Return the bytes of main memory that this process may use: the machine's, or its container's limit."""
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for path in map(Path, _LIMITS):
         text = path.read_text().strip() if path.is_file() else ""
@@ -25,14 +25,14 @@ def machine_memory() -> int:
 
 
 def with_less_memory(work: Callable[[int], T], amount: int) -> T:
-    """Call `work(amount)`; each time memory runs out, retry with half the amount, down to 1."""
+    """Call `work(amount)`. Each time memory runs out, retry with half the amount, down to 1."""
     while True:
         try:
             return work(amount)
         except (RuntimeError, MemoryError) as error:
             if amount <= 1 or not ran_out_of_memory(error):
                 raise
-        # Outside the handler: the error, and the tensors its traceback keeps alive, are released.
+        # Outside the handler, so that the error and the tensors that its traceback keeps alive are released.
         amount = (amount + 1) // 2
         gc.collect()
         import torch
@@ -42,7 +42,7 @@ def with_less_memory(work: Callable[[int], T], amount: int) -> T:
 
 
 def ran_out_of_memory(error: BaseException) -> bool:
-    """Whether an error means that the GPU or the machine is out of memory."""
+    """Return whether an error means that the GPU or the machine is out of memory."""
     import torch
 
     if isinstance(error, MemoryError | torch.cuda.OutOfMemoryError):

@@ -11,28 +11,29 @@ from PIL import Image
 from lang3dxl_ns.common.errors import DAMAGE
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "AVIF")
-"""Formats accepted, whatever the file's name. Pillow knows forty more, some of which start other programs
+"""Accepted formats, whatever the file's name. Pillow knows forty more, some of which start other programs
 (EPS: Ghostscript)."""
 
 
 class NoPictureError(Exception):
-    """A file that is not a complete picture in one of these formats."""
+    """File that is not a complete picture in one of the accepted formats."""
 
 
 @contextmanager
 def open_picture(path: Path) -> Iterator[Image.Image]:
-    """The picture in a file, closed afterwards. Raises OSError for the disk, and NoPictureError for a
-    damaged file or another format, even if the block is the first to read the pixels."""
+    """Open the picture in a file, and close it afterwards. Raises OSError for errors of the disk, and
+    NoPictureError for a damaged file or another format, even if the enclosed block is the first to read the
+    pixels."""
     if path.exists() and not path.is_file():
         raise NoPictureError("not a file")  # reading a pipe would never end
-    Image.init()  # otherwise Pillow knows only the most common
+    Image.init()  # otherwise Pillow knows only the most common formats
     try:
         with Image.open(path, formats=[form for form in FORMATS if form in Image.OPEN]) as image:
             yield image
     except Image.UnidentifiedImageError as error:
         raise NoPictureError(f"not a picture in one of the formats {', '.join(FORMATS)}") from error
-    # Exceptions of Pillow's decoders for damaged files.
+    # Pillow's decoders raise these for damaged files.
     except (*DAMAGE, SyntaxError, Image.DecompressionBombError) as error:
-        if isinstance(error, OSError) and error.errno is not None:  # the disk's, not the decoder's
+        if isinstance(error, OSError) and error.errno is not None:  # an error of the disk, not of the decoder
             raise
         raise NoPictureError(str(error) or type(error).__name__) from error

@@ -15,8 +15,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def in_full_precision(function: Function) -> Function:
     """Run a function outside autocast, with 16-bit tensor arguments widened to float32.
 
-    For sums over thousands of pixels, differences of large numbers, and positions: 16 bits would make these
-    wrong, not just imprecise. Without autocast it changes nothing.
+    This is for sums over thousands of pixels, differences of large numbers, and positions, which 16 bits
+    would make wrong, not just imprecise. Without autocast, it changes nothing.
     """
 
     @functools.wraps(function)

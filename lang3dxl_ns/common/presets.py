@@ -10,15 +10,13 @@ import yaml
 from lang3dxl_ns.common.errors import UserError
 
 _PACKAGE = Path(__file__).parents[1]
-# Inside the package in an installed wheel, beside it in a checkout.
+# Configs are inside the package in an installed wheel, and beside it in a checkout.
 FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 
 
 def load_preset(name: str) -> dict[str, Any]:
-    """The settings in configs/`name`.yaml, for example "holyscenes/milano".
-
-    Raises UserError for an unknown name (listing the known ones) and for a damaged file.
-    """
+    """Load the settings in configs/`name`.yaml, for example "holyscenes/milano". Raises UserError for an
+    unknown name (listing the known ones) and for a damaged file."""
     known = sorted(path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml"))
     if name not in known:
         raise UserError(f"there is no preset {name!r}: choose one of {', '.join(known)}")
@@ -32,20 +30,18 @@ def load_preset(name: str) -> dict[str, Any]:
 
 
 OFFICIAL = "official"
-"""Preset of what the authors' release does otherwise than the paper."""
+"""Preset for what the authors' release does differently from the paper."""
 
 
 def scene_presets() -> list[str]:
-    """Names of the presets that describe a scene."""
+    """List the names of the presets that describe a scene."""
     return sorted(f"holyscenes/{path.stem}" for path in FOLDER.glob("holyscenes/*.yaml"))
 
 
 def train_flags(name: str) -> list[str]:
-    """Flags of `ns-train lang3dxl-paper`: a scene's crop range and what of its schedule differs from the
-    method's, or all that the authors' release does otherwise.
-
-    Raises UserError for a preset of something else.
-    """
+    """Return the flags of `ns-train lang3dxl-paper`: a scene's crop range and how its schedule differs from
+    the method's, or everything that the authors' release does differently. Raises UserError for a preset that
+    is not for training."""
     settings = load_preset(name)
     if "train" not in settings:
         choices = ", ".join([OFFICIAL, *scene_presets()])

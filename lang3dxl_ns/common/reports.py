@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from lang3dxl_ns.common.files import write_atomically
 
-if TYPE_CHECKING:  # imported where it is used: a command's help comes without it
+if TYPE_CHECKING:  # imported where it is used, because --help does not need it
     import torch
 
 Result = TypeVar("Result")
@@ -27,7 +27,7 @@ Result = TypeVar("Result")
 
 
 def describe_machine(device: torch.device | str = "cpu") -> str:
-    """One line on where and when figures were measured: processor, cores, threads, versions, date."""
+    """Describe where and when figures were measured: processor, cores, threads, versions, date."""
     import torch
 
     parts = [
@@ -50,10 +50,8 @@ def _processor_name() -> str:
 
 
 def command_line(command: str, settings: Any) -> str:
-    """The command that repeats a run: `command`, and a flag for each field of `settings` not at its default.
-
-    `settings` is a dataclass instance whose fields tyro turned into flags.
-    """
+    """Return the command that repeats a run: `command`, and a flag for each of the `settings` not at its
+    default. `settings` is a dataclass instance whose fields tyro turned into flags."""
     words = [command]
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
@@ -92,9 +90,9 @@ def synchronize() -> None:
 
 
 def host_peak(reset: bool = False) -> int:
-    """Peak memory of this process, bytes; `reset` first lowers the recorded peak to what is held now."""
+    """Return the peak memory of this process, bytes. `reset` first lowers the peak to the present memory."""
     if sys.platform == "linux":
-        # getrusage would include the parent's peak: Linux carries it over into a new process.
+        # getrusage would include the parent's peak, because Linux carries it over into a new process.
         if reset:
             Path("/proc/self/clear_refs").write_text("5")
         status = Path("/proc/self/status").read_text()
@@ -109,13 +107,13 @@ def host_peak(reset: bool = False) -> int:
 
 
 def progress_bar() -> Progress:
-    """A rich progress bar with the time left; add one task per kind of work."""
+    """Make a rich progress bar with the time left. Add one task per kind of work."""
     columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
     return Progress(*columns, speed_estimate_period=600)  # steps vary: a short window would make it jump
 
 
 def watched(items: Collection[Result], what: str, watch: Callable[[str], None] | None) -> Iterator[Result]:
-    """The items, one by one: `watch` is told which, or, if it is None, a progress bar shows it."""
+    """Yield the items one by one. `watch` is called with a message for each; None shows a progress bar."""
     if watch is None:
         with progress_bar() as bar:
             yield from bar.track(items, description=what)
@@ -126,7 +124,7 @@ def watched(items: Collection[Result], what: str, watch: Callable[[str], None] |
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A markdown table; None becomes a dash."""
+    """Format a markdown table. None becomes a dash."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join("–" if c is None else str(c) for c in line) + " |" for line in lines)
 

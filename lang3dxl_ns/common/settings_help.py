@@ -1,4 +1,4 @@
-"""What the help of a command shows of its settings."""
+"""Selection of the settings that the help of a command shows."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Class = TypeVar("Class", bound=type)
 
 
 def without(*names: str) -> Callable[[Class], Class]:
-    """A dataclass decorator that takes inherited settings off the command line."""
+    """Return a dataclass decorator that takes inherited settings off the command line."""
 
     def hide(kind: Class) -> Class:
         hints = get_type_hints(kind, include_extras=True)
@@ -25,8 +25,8 @@ def without(*names: str) -> Callable[[Class], Class]:
 
 
 def showing(*names: str) -> Callable[[Class], Class]:
-    """A dataclass decorator that keeps all but these settings out of what `--help` prints. Commands accept
-    the others, and `--help-all` prints them too."""
+    """Return a dataclass decorator that hides all but these settings from `--help`. Commands still accept the
+    others, and `--help-all` prints them too."""
 
     def hide(kind: Class) -> Class:
         if not {"-h", "--help"} & set(sys.argv[1:]):  # tyro would not accept what it does not print
@@ -40,5 +40,5 @@ def showing(*names: str) -> Callable[[Class], Class]:
 
 
 def asked_for_all(arguments: list[str]) -> list[str]:
-    """The arguments of a command, with `--help-all` as tyro spells it."""
+    """Replace `--help-all` in a command's arguments by `--help`, as tyro spells it."""
     return ["--help" if argument == "--help-all" else argument for argument in arguments]

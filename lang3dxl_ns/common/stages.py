@@ -1,4 +1,4 @@
-"""Stages of a long command: which one runs, the time left in all, seconds and memory of each."""
+"""Stages of a long command: which one runs, the total time left, and seconds and memory of each."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _FIRST_ESTIMATE_S = 20.0
 
 
 class Stages:
-    """Announces the stages of a command, and estimates what is left of all of them.
+    """Announcements of a command's stages, with an estimate of the time left for all of them.
 
     Args:
         shares: the stages in order, with their usual shares of the time.
-        path: keeps their seconds and peak memory, summed over interrupted commands; None: nothing is
-            kept, and memory is not measured, since that resets the process's peak.
+        path: file that keeps their seconds and peak memory, summed over interrupted commands. If None,
+            nothing is kept, and memory is not measured, because that resets the process's peak.
     """
 
     def __init__(self, shares: Mapping[str, float], path: Path | None = None) -> None:
@@ -35,7 +35,7 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """A stage, announced and measured."""
+        """Announce and measure a stage."""
         self.begin(name)
         try:
             yield
@@ -43,7 +43,7 @@ class Stages:
             self.end()
 
     def begin(self, name: str) -> None:
-        """Announce a stage; the one before it ends."""
+        """End the present stage, if there is one, and announce another."""
         self.end()
         self._current, self._start, self._tenths = name, time.perf_counter(), -1
         if self._path is not None:
@@ -62,11 +62,8 @@ class Stages:
             write_atomically(self._path, json.dumps(self._spent, indent=1))
 
     def progress(self, done: float) -> None:
-        """Say, as soon as the pace can be told and then at every tenth of the present stage, about how long
-        all that is left takes.
-
-        done: fraction of the stage, as far as this command does it.
-        """
+        """Say about how long everything that is left takes, once the pace is known and at every tenth of the
+        stage. `done` is the fraction of the stage, as far as this command does it."""
         elapsed = time.perf_counter() - self._start
         if self._current is None or int(10 * done) <= self._tenths or elapsed < _FIRST_ESTIMATE_S:
             return
@@ -77,12 +74,12 @@ class Stages:
             say(f"{self._current}: {100 * done:.0f} % done; {roughly(left)} left in all")
 
     def weigh(self, name: str, other: str, times: float) -> None:
-        """Expect a stage to take so many times as long as another one."""
+        """Expect a stage to take `times` as long as another one."""
         if name in self._shares and other in self._shares:
             self._shares[name] = times * self._shares[other]
 
     def figures(self) -> dict[str, dict[str, float]]:
-        """Seconds and peak memory (MB) by stage."""
+        """Return seconds and peak memory (MB) by stage."""
         return {
             kind: {name: math.ceil(10 * spent[kind]) / 10 for name, spent in self._spent.items()}
             for kind in ("seconds", "peak_mb")
@@ -94,7 +91,7 @@ class Stages:
         return order[order.index(self._current) + 1 :]
 
     def _announce(self) -> None:
-        """Say which stage begins and, from the second on, about how long all that is left will take."""
+        """Say which stage begins and, from the second on, about how long everything left will take."""
         order, later = list(self._shares), self._later()
         place = len(order) - len(later) - 1
         done = [stage for stage in order[:place] if stage in self._spent]
@@ -106,7 +103,7 @@ class Stages:
 
 
 def _spent(path: Path) -> dict[str, dict[str, float]]:
-    """Figures of an earlier command; none if they are damaged: only an estimate needs them."""
+    """Read the figures of an earlier command; empty if damaged, because only an estimate needs them."""
     try:
         found = read_json(path)
         return {n: {kind: float(f[kind]) for kind in ("seconds", "peak_mb")} for n, f in found.items()}
@@ -115,7 +112,7 @@ def _spent(path: Path) -> dict[str, dict[str, float]]:
 
 
 def roughly(seconds: float) -> str:
-    """A duration in words, rounded up: "about 3 minutes"."""
+    """Format a duration in words, rounded up: "about 3 minutes"."""
     if seconds < 90:
         return f"about {10 * math.ceil(seconds / 10)} seconds"
     if seconds < 5400:

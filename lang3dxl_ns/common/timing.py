@@ -14,7 +14,7 @@ _seconds: dict[str, list[float]] | None = None
 
 @contextmanager
 def part(name: str) -> Iterator[None]:
-    """Time the enclosed block as `name`; does nothing outside `measure()`."""
+    """Time the enclosed block as `name`. Does nothing outside `measure()`."""
     if _seconds is None:
         yield
         return
@@ -27,7 +27,7 @@ def part(name: str) -> Iterator[None]:
 
 @contextmanager
 def measure() -> Iterator[dict[str, list[float]]]:
-    """Collect the seconds of every `part` inside; yields {name: one entry per visit}."""
+    """Collect the seconds of every enclosed `part`. Yields {name: one entry per visit}."""
     global _seconds
     _seconds = defaultdict(list)
     try:

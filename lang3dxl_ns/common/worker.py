@@ -8,10 +8,8 @@ from collections.abc import Callable
 
 
 class Worker:
-    """Runs jobs in its own thread, one at a time; a new job replaces one still waiting.
-
-    So a text box can submit a delayed job per keystroke, and only the last one runs.
-    """
+    """Thread that runs jobs one at a time. A new job replaces one that is still waiting, so a text box can
+    submit a delayed job per keystroke, and only the last one runs."""
 
     def __init__(self, name: str) -> None:
         self._changed = threading.Condition()
@@ -26,7 +24,7 @@ class Worker:
             self._changed.notify_all()
 
     def wait(self, timeout: float = 60.0) -> bool:
-        """Wait until all jobs are done; False if that takes longer."""
+        """Wait until all jobs are done. Return False if that takes longer than `timeout` seconds."""
         with self._changed:
             return self._changed.wait_for(lambda: self._waiting is None and not self._busy, timeout)
 

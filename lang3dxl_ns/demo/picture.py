@@ -16,27 +16,27 @@ from lang3dxl_ns.query.heat_maps import overlay
 from lang3dxl_ns.query.match import Match
 
 COLUMNS = 4
-"""Prompts shown per photo."""
+"""Number of prompts shown per photo."""
 FOUND = (1.0, 0.0, 1.0)
-"""Color of the outline of what is found: magenta, which no heat has."""
+"""Outline color of matches: magenta, which no heat map contains."""
 
 
 @dataclass
 class PictureRow:
-    """One held-out photo and its renderings; colors in 0…1."""
+    """A held-out photo and its renderings. Colors are 0…1."""
 
     name: str
     photo: Float[Array, "h w 3"]
     rendering: Float[Array, "h w 3"]
     codes: Float[Array, "h w 3"]
     matches: Mapping[str, Match]
-    """By prompt, in the view of the photo."""
+    """Match of each prompt in the view of the photo."""
     truth: Mapping[str, Bool[Array, "mh mw"]]
-    """By prompt; prompts without truth are not shown."""
+    """Ground truth of each prompt. Prompts without ground truth are not shown."""
 
 
 def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
-    """The rows that show the most, chosen greedily by the prompts not yet covered."""
+    """Choose the rows that show the most, greedily by the number of prompts not yet covered."""
     chosen: list[PictureRow] = []
     shown: set[str] = set()
     while len(chosen) < min(count, len(rows)):
@@ -48,8 +48,8 @@ def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
 
 
 def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
-    """Write a PNG with a row per photo: photo, rendering, codes as color, and what is found of each prompt:
-    its heat, outlined in magenta, with the ground truth outlined in white."""
+    """Write a PNG with one row per photo: photo, rendering, codes as color, and the match of each prompt. A
+    match is drawn as its heat map, outlined in magenta, with the ground truth outlined in white."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -81,7 +81,7 @@ def _draw_prompt(axis, prompt: str, row: PictureRow) -> None:
     axis.imshow(overlay(picture, relevancy, mask, match.threshold).numpy(), extent=(0, width, height, 0))
     for region, color in ((truth, "white"), (match.mask, FOUND)):
         place = {"extent": (0, width, 0, height), "levels": [0.5], "linewidths": 1}
-        if region.any() and not region.all():  # matplotlib warns of a contour without a line
+        if region.any() and not region.all():  # matplotlib warns about a contour without a line
             axis.contour(region.astype(float), colors=[color], **place)
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)

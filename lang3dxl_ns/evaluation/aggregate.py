@@ -1,4 +1,4 @@
-"""Aggregation of scores: photos to scene, scenes to benchmark."""
+"""Aggregation of scores: from photos to scene, and from scenes to benchmark."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ PREFIXES = {
     "limit_": "limit",
     "chance_": "chance",
 }
-"""Which maps, and their name in reports: the field's, the same unblurred or processed as published, the 2D
-teacher's, the lifted labels', and maps without information."""
+"""Prefixes of scored maps, and their names in reports: the field's maps, the same unblurred or processed as
+published, the 2D teacher's, the lifted labels', and maps without information."""
 TOTALS = {
     "located": "localization_accuracy",
     "iou": "miou",
@@ -29,18 +29,18 @@ TOTALS = {
     "smooth_pixel_accuracy": "smooth_mpa",
     "smooth_precision": "smooth_mp",
 }
-"""Measures whose total is the mean over all pairs of a photo and a category, as for LERF-OVS and PT-OVS."""
+"""Measures whose total is the mean over all pairs of a photo and a category, as in LERF-OVS and PT-OVS."""
 Figures = Mapping[str, float]
 """Figures of one photo: psnr etc., and `{prefix}{measure}_{category}`."""
 
 
 def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str, Any]:
-    """Means over the photos that have a figure, for every figure, and totals.
+    """Average every figure over the photos that have it, and add totals.
 
-    `{prefix}map`: unweighted mean of average precision over the categories. `{prefix}miou`,
-    `{prefix}localization_accuracy` etc.: means over all pairs of a photo and a category.
-    `ap_{category}_photos`: number of photos with that category. with_deviation: adds `…_std` of every mean,
-    the sample standard deviation, 0 for a single photo.
+    `{prefix}map` is the unweighted mean of average precision over the categories. `{prefix}miou`,
+    `{prefix}localization_accuracy` etc. are means over all pairs of a photo and a category.
+    `ap_{category}_photos` is the number of photos with that category. `with_deviation` adds `…_std` for every
+    mean, the sample standard deviation, which is 0 for a single photo.
     """
     values = _by_name(photos)
     means: dict[str, Any] = {name: float(np.mean(found)) for name, found in values.items()}
@@ -67,18 +67,18 @@ def _by_name(photos: Iterable[Figures]) -> dict[str, list[float]]:
 
 
 def _mean_average_precision(means: Figures, prefix: str) -> dict[str, float]:
-    """`{prefix}map`, the unweighted mean of the categories' APs in `means`; nothing if there are none."""
+    """Compute `{prefix}map`, the unweighted mean of the categories' APs in `means`, if there are any."""
     found = [value for name, value in means.items() if name.startswith(f"{prefix}ap_")]
     return {f"{prefix}map": float(np.mean(found))} if found else {}
 
 
 def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
-    """Figures of several scenes together, by the two ways of reading a benchmark's table.
+    """Aggregate figures of several scenes in the two ways in which a benchmark's table can be read.
 
-    `image_pooled`: `average` over the photos of all scenes, so that each photo counts alike (which fits the
-    published tables of HolyScenes). `scene_mean`: mean over scenes of each scene's mean, so that each scene
-    with a category counts alike; its `map` is the mean of those over categories. `per_scene`: means and
-    totals of each scene.
+    `image_pooled` is `average` over the photos of all scenes, so that each photo counts alike (this matches
+    the published tables of HolyScenes). `scene_mean` is the mean over scenes of each scene's mean, so that
+    each scene with a category counts alike; its `map` is the mean of those over categories. `per_scene` has
+    means and totals of each scene.
     """
     per_scene = {name: average(photos) for name, photos in scenes.items()}
     values = _by_name(per_scene.values())

@@ -15,35 +15,35 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""Picture suffixes, lower case."""
+"""Suffixes of pictures, lower case."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The ground truth of a category in a photo, at the size of a map."""
+    """Ground truth of a category in a photo, at the size of a map."""
 
     mask: Bool[Array, "h w"]
     """True on the object."""
     boxes: Float[Array, "n 4"] | None = None
-    """Left, top, right, bottom in pixels of the mask, edges included; None if the labels have no boxes."""
+    """Left, top, right and bottom in pixels of the mask, edges included; None if the labels have no boxes."""
 
 
 class Annotation(Protocol):
-    """A category in a photo, read on demand."""
+    """Label of a category in a photo, read on demand."""
 
     def size(self) -> tuple[int, int]:
-        """Height and width of the labeled photo."""
+        """Return height and width of the labeled photo."""
 
     def truth(self, size: tuple[int, int]) -> Truth:
-        """The annotation at `size` (height, width). Raises UserError for another aspect ratio."""
+        """Read the annotation at `size` (height, width). Raises UserError for another aspect ratio."""
 
 
 Annotations = Mapping[str, Mapping[str, Annotation]]
-"""By category, then by photo: its name without suffix, or the end of that name."""
+"""Annotations by category, then by photo. A photo is named by its name without suffix, or the end of that."""
 
 
 def read_gray(path: Path, what: str = "ground truth") -> Image.Image:
-    """A picture as gray values 0…255. Raises UserError where it can't be read."""
+    """Read a picture as gray values 0…255. Raises UserError if it cannot be read."""
     try:
         with open_picture(path) as image:
             return image.convert("L")
@@ -52,7 +52,7 @@ def read_gray(path: Path, what: str = "ground truth") -> Image.Image:
 
 
 def check_shape(path: Path, mine: tuple[int, int], other: tuple[int, int]) -> None:
-    """Raises UserError unless the sizes (height, width) differ only by a factor, within a rounded pixel."""
+    """Check that two sizes (height, width) differ by a factor, within a rounded pixel, or raise UserError."""
     (height, width), (other_height, other_width) = mine, other
     difference = abs(width * other_height - height * other_width)
     if difference > max(0.01 * height * other_width, height, width):

@@ -1,4 +1,4 @@
-"""An evaluated photo: its figures, and the pictures behind them."""
+"""Evaluated photos: their figures, and the pictures behind them."""
 
 from __future__ import annotations
 
@@ -13,16 +13,15 @@ from lang3dxl_ns.evaluation.scores import Maps
 
 @dataclass
 class EvaluatedPhoto:
-    """An evaluated photo: its figures, and the pictures behind them."""
+    """Evaluated photo with its figures and the pictures behind them."""
 
     name: str
     metrics: dict[str, float]
-    """psnr etc., `render_seconds`, with appearance `half_psnr` etc., and with ground truth `query_seconds`
-    and the figures of `evaluation.aggregate.average`: `ap_{category}` etc., with the prefixes of
-    `evaluation.aggregate`."""
+    """Figures of the photo: psnr etc., `render_seconds`, and with appearance `half_psnr` etc. With ground
+    truth also `query_seconds`, and `ap_{category}` etc. with the prefixes of `evaluation.aggregate`."""
     images: dict[str, Tensor]
-    """`img` (photo beside rendering, [H, 2W, 3]); with semantics `bottleneck`; with appearance `fitted`, the
-    rendering in the look of the half-image protocol."""
+    """Pictures by name: `img` (photo beside rendering, [H, 2W, 3]), with semantics `bottleneck`, and with
+    appearance `fitted`, the rendering in the look of the half-image protocol."""
     maps: Maps
     """Relevancy by category, as queries show it, at the size of scoring; empty without ground truth."""
     masked: bool = False

@@ -18,8 +18,8 @@ def match(
     crop_sides: Sequence[float],
     mask: Float[Tensor, "h w"] | None = None,
 ) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
-    """Features averaged over the target's crops, and the weight of each cell: the downsampler's kernel
-    without its learned attenuation, the same for every way of training."""
+    """Average features over the target's crops, and compute the weight of each cell. The kernel is the
+    downsampler's without its learned attenuation, so it is the same for every way of training."""
     kernel = AttenuatedDownsampler(DownsamplerConfig(hidden=0), features.shape[-1])
     return kernel(features, (target.shape[0], target.shape[1]), crop_sides, mask)
 
@@ -31,10 +31,10 @@ def feature_metrics(
     mean: Float[Tensor, " c"],
     weight: Float[Tensor, "h w"] | None = None,
 ) -> dict[str, float]:
-    """L1, PSNR (peak 1) and cosine of `predicted`, each beside that of predicting the `mean` everywhere.
+    """Compute L1, PSNR (peak 1) and cosine of `predicted`, and the same for predicting the `mean` everywhere.
 
-    On the encoder's own scale, as in Lang3D-XL's encoder ablation. Cells of zero weight (no foreground) are
-    ignored. Keys: `{kind}_l1`, `{kind}_psnr`, `{kind}_cosine`, and the same with
+    Features are compared on the encoder's own scale, as in Lang3D-XL's encoder ablation. Cells of zero weight
+    (no foreground) are ignored. Keys are `{kind}_l1`, `{kind}_psnr` and `{kind}_cosine`, and the same with
     `_of_mean` appended.
     """
     cells = target.new_ones(target.shape[:2], dtype=torch.bool) if weight is None else weight > 0

@@ -27,11 +27,12 @@ class GroundTruth:
     """Labels of a scene's photos, by category.
 
     Args:
-        folder: of one scene: <category>/NNNN-gt.jpg ("holyscenes"), <photo>.json ("lerf_ovs", also used by
-            PT-OVS), or <prompt>/<photo>.png ("plain").
+        folder: folder of one scene, which holds <category>/NNNN-gt.jpg ("holyscenes"), <photo>.json
+            ("lerf_ovs", also used by PT-OVS), or <prompt>/<photo>.png ("plain").
         layout: one of these; "auto" detects it.
 
-    Raises UserError for a folder that is missing or holds something else.
+    Raises:
+        UserError: the folder is missing or holds something else.
     """
 
     def __init__(self, folder: Path, layout: Layout | Literal["auto"] = "auto") -> None:
@@ -49,38 +50,38 @@ class GroundTruth:
 
     @property
     def labeled(self) -> list[str]:
-        """All labeled photos, sorted, as named by the labels: without suffix."""
+        """Labeled photos, sorted, with the names that the labels use (no suffix)."""
         return sorted(self._labeled)
 
     def photos(self, category: str) -> list[str]:
-        """The photos with a label of the category, as named by the labels."""
+        """List the photos with a label of the category, with the names that the labels use."""
         return list(self._annotations[category])
 
     def key(self, photo: str) -> str | None:
-        """The labels' name for a photo (whose name may contain folders); None if it has no label."""
+        """Find the labels' name for a photo (whose name may contain folders); None if it has no label."""
         path = PurePosixPath(photo)
         names = (path.with_suffix("").as_posix(), path.as_posix(), path.stem, path.name)
         return next((name for name in names if name in self._labeled), None)
 
     def size(self, photo: str) -> tuple[int, int]:
-        """Height and width of a labeled photo."""
+        """Return height and width of a labeled photo."""
         return next(iter(self._of(photo).values())).size()
 
     def scoring_size(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width at which maps of a photo are scored: half the photo's for masks, as in Lang3D-XL;
-        the photo's own for LERF-OVS, whose filter sizes are in its pixels."""
+        """Return height and width at which maps of a photo are scored: half the photo's size for masks, as in
+        Lang3D-XL, and the photo's own size for LERF-OVS, whose filter sizes are in its pixels."""
         return (height, width) if self.layout == "lerf_ovs" else (max(height // 2, 1), max(width // 2, 1))
 
     def truths(self, photo: str, size: tuple[int, int]) -> dict[str, Truth]:
-        """The photo's labels by category, at `size` (height, width).
+        """Read the photo's labels by category, at `size` (height, width).
 
-        A category without a label in this photo is left out: it wasn't annotated. Raises UserError for an
-        unreadable label, and for one with another aspect ratio than `size`.
+        A category without a label in this photo was not annotated and is left out. Raises UserError for an
+        unreadable label, and for one whose aspect ratio is not the one of `size`.
         """
         return {category: label.truth(size) for category, label in self._of(photo).items()}
 
     def masks(self, photo: str, size: tuple[int, int]) -> dict[str, Bool[Array, "h w"]]:
-        """The masks of `truths` alone."""
+        """Read only the masks of `truths`."""
         return {category: truth.mask for category, truth in self.truths(photo, size).items()}
 
     def _of(self, photo: str) -> dict[str, Annotation]:
@@ -93,15 +94,15 @@ def _layout(folder: Path) -> Layout:
         raise UserError(f"{folder} holds masks NNNN-gt.jpg and labels <photo>.json: name the layout to read")
     if is_lerf_ovs(folder):
         return "lerf_ovs"
-    # A folder above one in a layout gets the error message of that layout's reader.
+    # For a folder above one in a layout, that layout's reader gives the error message.
     if is_holyscenes(folder) or any(folder.glob("*/*/*-gt.*")):
         return "holyscenes"
     return "lerf_ovs" if any(folder.glob("*/*.json")) else "plain"
 
 
 def find_ground_truth(data: Path) -> Path | None:
-    """The ground truth beside a scene's data: ground_truth/ or label/ in its folder, or label/<scene> next to
-    it (as LERF-OVS and PT-OVS are published)."""
+    """Find the ground truth of a scene's data: ground_truth/ or label/ in its folder, or label/<scene> next
+    to it (as LERF-OVS and PT-OVS are published)."""
     if (data / "ground_truth").is_dir():
         return data / "ground_truth"
     labels = (data / "label", data / "label" / data.name, data.parent / "label" / data.name)
@@ -109,7 +110,7 @@ def find_ground_truth(data: Path) -> Path | None:
 
 
 def held_out_photos(truth: GroundTruth, per_category: int = 5) -> list[str]:
-    """Labeled photos to hold out of training, sorted: up to `per_category` that show each category,
+    """Choose labeled photos to hold out of training, sorted: up to `per_category` that show each category,
     preferring those already chosen for another (Lang3D-XL's rule; its own list is not published). The rest
     are spread evenly over the category's photos, so the same labels always give the same list."""
     chosen: set[str] = set()

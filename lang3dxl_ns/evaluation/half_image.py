@@ -1,8 +1,8 @@
 """Half-image protocol: the look of an unseen photo is fitted on its left half, and its right half is scored.
 
-Nobody can know the light of a photo that training never saw, so a comparison of the whole photo measures the
-guess of its light more than the scene. NeRF in the Wild (Martin-Brualla et al. 2021), WildGaussians and
-NerfBaselines therefore let half of the photo tell its light.
+The lighting of an unseen photo is unknown, so comparing the whole photo mostly measures how well its lighting
+was guessed. NeRF in the Wild (Martin-Brualla et al. 2021), WildGaussians and NerfBaselines therefore fit the
+lighting on half of the photo.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, in_view
 
 STEPS = 64
-"""Steps of the fit."""
+"""Number of steps of the fit."""
 RATE = 0.1
-"""Adam's rate at its beginning; it falls to nothing as a cosine."""
+"""Adam's initial learning rate, which decays to zero along a cosine."""
 PROTOCOL = "half_…: each photo's look is fitted on its left half, and its right half is scored"
 
 
 @dataclass(frozen=True)
 class HalfImage:
-    """A photo in the look of its left half."""
+    """Result of the protocol for one photo, in the look of its left half."""
 
     vector: Float[Tensor, " v"]
-    """The fitted look."""
+    """Appearance vector of the fitted look."""
     rendering: Float[Tensor, "h w 3"]
-    """The whole photo's view, in this look."""
+    """Rendering of the whole photo's view in this look."""
     figures: dict[str, float]
     """Figures of the right half: `half_psnr` (dB), `half_ssim`, and `half_lpips` if its weights are
-    available; and `fit_seconds`."""
+    available. `fit_seconds` is the time of the fit."""
 
 
 @dataclass(frozen=True)
 class HalfImageProtocol:
-    """The protocol for photos of one scene, whose Gaussians and looks stay as they are."""
+    """Half-image protocol for photos of one scene, whose Gaussians and looks are not changed."""
 
     splats: Splats
     field: AppearanceField
-    """Makes the looks."""
+    """Appearance field that makes the looks."""
     metrics: Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], dict[str, float]]
-    """Scores of a rendering, and of the photo that it should be: `psnr` etc."""
+    """Function that scores a rendering against its photo: `psnr` etc."""
     background: Float[Tensor, "3"]
     """Color behind the scene, 0…1."""
     ssim_weight: float
@@ -63,12 +63,12 @@ class HalfImageProtocol:
     def measure(
         self, camera: Camera, photo: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None
     ) -> HalfImage:
-        """Fit the look on a photo's left half, and score the right one.
+        """Fit the look on a photo's left half, and score its right half.
 
         Args:
-            camera: the photo's, of its size.
-            photo: its colors, 0…1.
-            mask: its foreground.
+            camera: camera of the photo, at its size.
+            photo: colors of the photo, 0…1.
+            mask: foreground of the photo.
         """
         middle = photo.shape[1] // 2
         start = perf_counter()
@@ -90,14 +90,15 @@ class HalfImageProtocol:
         mask: Bool[Tensor, "h w"] | None = None,
         steps: int = STEPS,
     ) -> Float[Tensor, " v"]:
-        """The appearance vector that fits the left part of a photo, by the training's color loss. It begins
-        as the vector of an unseen view.
+        """Fit the appearance vector to the left part of a photo, from the vector of an unseen view.
+
+        The loss is the color loss of training.
 
         Args:
-            camera: the photo's.
+            camera: camera of the photo.
             left: the leftmost w columns of the photo, 0…1.
-            mask: their foreground.
-            steps: 0 for the vector to begin with.
+            mask: foreground of these columns.
+            steps: number of steps; 0 returns the initial vector.
         """
         camera = camera.to(self.splats.means.device)
         vector = Looks(self.field).of_view(camera).vector.clone().requires_grad_()
@@ -113,7 +114,7 @@ class HalfImageProtocol:
                 lit, shown = self.field(gaussians, colors, vector, everything)
                 image = rasterize(shown.seen_from(view), view, lit, self.background, **settings).image
                 loss = rgb_loss(image.clamp(0.0, 1.0), left, mask, self.ssim_weight)
-                # Of the vector alone: the field's parameters get no gradient.
+                # Only the vector gets a gradient; the field's parameters get none.
                 (vector.grad,) = torch.autograd.grad(loss, [vector])
                 optimizer.step()
                 schedule.step()

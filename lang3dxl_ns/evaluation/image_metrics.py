@@ -13,19 +13,19 @@ from torch import Tensor, nn
 from lang3dxl_ns.common.console import say
 
 ALEXNET = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
-"""The weights that LPIPS looks with, as torchvision publishes them."""
+"""Address of the AlexNet weights that LPIPS uses, as torchvision publishes them."""
 
 
 def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
-    """Peak signal-to-noise ratio in decibels, for a peak of 1."""
+    """Compute the peak signal-to-noise ratio in decibels, for a peak of 1."""
     return -10 * torch.log10(F.mse_loss(predicted, target).clamp_min(1e-10))
 
 
 class Lpips:
-    """LPIPS (AlexNet), loaded at first use; skipped unless its weights are in torch's cache: nothing is
-    downloaded without being asked.
+    """LPIPS (AlexNet), loaded at first use.
 
-    Not an nn.Module, so that AlexNet stays out of checkpoints.
+    It is skipped unless its weights are in torch's cache, because nothing is downloaded without a request. It
+    is not an nn.Module, so that AlexNet stays out of checkpoints.
     """
 
     @cached_property
@@ -37,12 +37,12 @@ class Lpips:
 
         try:
             return LearnedPerceptualImagePatchSimilarity(normalize=True)
-        except (OSError, RuntimeError) as error:  # a damaged file
+        except (OSError, RuntimeError) as error:  # damaged file
             say(f"LPIPS is skipped: its weights cannot be loaded ({error})")
             return None
 
     def __call__(self, target: Float[Tensor, "1 3 h w"], predicted: Float[Tensor, "1 3 h w"]) -> float | None:
-        """Distance of two images in [0, 1]; None without weights."""
+        """Compute the distance of two images in [0, 1]; None without weights."""
         if self._metric is None:
             return None
         return float(self._metric.to(target.device)(target, predicted.clamp(0, 1)))

@@ -28,7 +28,7 @@ def label_limit(
     categories: list[str],
     backend: Backend = "auto",
 ) -> Callable[[Camera], Maps]:
-    """Returns a function from a view to its maps by category, at the size of the rendering."""
+    """Return a function from a view to its maps by category, at the size of the rendering."""
     shares = lifted_labels(splats, views, categories, backend)
 
     def maps(camera: Camera) -> Maps:
@@ -44,8 +44,8 @@ def lifted_labels(
     categories: list[str],
     backend: Backend = "auto",
 ) -> Float[Tensor, "n categories"]:
-    """Each Gaussian's mean label of the pixels that it contributes to, weighted by compositing weight, over
-    all `views`; a category uses those with a label of it. 0 for Gaussians that none of these shows."""
+    """Compute each Gaussian's mean label over the pixels that it contributes to, weighted by compositing
+    weight, in all `views` that label the category. It is 0 for Gaussians that none of these views shows."""
 
     def probes():
         for camera, masks in views:
@@ -59,7 +59,7 @@ def lifted_labels(
 
 
 def _labels(masks: Masks, categories: list[str], size: tuple[int, int]) -> Float[Tensor, "h w channels"]:
-    """A channel per category with its label, and one per category that is 1 if it is labeled here."""
+    """Stack a channel per category with its label, and one per category that is 1 if it is labeled here."""
     labels, labeled = torch.zeros(2, len(categories), *size)
     for index, category in enumerate(categories):
         if category in masks:

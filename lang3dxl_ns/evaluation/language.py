@@ -14,10 +14,10 @@ from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextConfig, TextEncoder
 
 
 class LanguageScorer(MapScorer):
-    """Relevancy maps for a scene's categories, from the 3D field and from its 2D teacher, by the same rules.
+    """Scorer of relevancy maps for a scene's categories, which treats the 3D field and its 2D teacher alike.
 
-    The prompts are the category names. The teacher is the photo's own CLIP target: what the field would have
-    learned from, had the photo been used in training.
+    The prompts are the category names. The teacher is the photo's own CLIP target, from which the field would
+    have learned if the photo had been used in training.
     """
 
     def __init__(self, truth: GroundTruth, encode_texts: EncodeTexts) -> None:
@@ -26,17 +26,17 @@ class LanguageScorer(MapScorer):
         self.queries = text.plain_queries(truth.categories)
         """Queries of the categories, in their order."""
         self.yardstick = text.yardstick
-        """Words that calibrate relevancies: `TextEncoder.yardstick`."""
+        """Words that calibrate relevancies, from `TextEncoder.yardstick`."""
         published = TextEncoder(encode_texts, TextConfig(combine="joined", negatives=CANONICAL))
         self.published_queries = published.queries([Prompt(category) for category in truth.categories])
-        """As published: a specialist word joined with common ones, against canonical phrases alone."""
+        """Queries as published: a specialist word joined with common ones, against canonical phrases."""
 
     def named(self, maps: Float[Tensor, "q H W"], size: tuple[int, int]) -> Maps:
-        """Maps of the categories, at `size`, by name."""
+        """Return the categories' maps by name, resized to `size`."""
         return dict(zip(self.truth.categories, resize_map(maps, size), strict=True))
 
     def teacher_maps(self, target: Float[Tensor, "hd wd c"], size: tuple[int, int]) -> Maps:
-        """Maps of a CLIP target, whose features are first interpolated to `size`, as in Lang3D-XL."""
+        """Compute maps of a CLIP target, whose features are first interpolated to `size`, as in Lang3D-XL."""
         features = resize_map(target.permute(2, 0, 1), size).permute(1, 2, 0)
         queries, words = self.queries.to(features.device), self.yardstick.to(features.device)
         temperature = calibrated(TEMPERATURE, words.cosines(target.flatten(0, 1).float()))
@@ -44,5 +44,5 @@ class LanguageScorer(MapScorer):
 
 
 def open_scorer(truth: GroundTruth, clip: str, device: torch.device | str) -> LanguageScorer:
-    """The scorer for targets made with this CLIP (name or folder)."""
+    """Open the scorer for targets made with this CLIP (name or folder)."""
     return LanguageScorer(truth, load_image_text_encoder(clip, device).encode_texts)

@@ -1,8 +1,8 @@
 """Ground truth in the layout of LERF-OVS (LangSplat's labels of LERF's scenes) and PT-OVS: polygons in JSON.
 
-One file per photo, `label/<scene>/<photo>.json`:
-`{"info": {"width", "height"}, "objects": [{"category", "bbox": [left, top, right, bottom],
-"segmentation": [[x, y], …]}, …]}`, in pixels. Several objects may share a category.
+There is one file per photo, `label/<scene>/<photo>.json`: `{"info": {"width", "height"}, "objects":
+[{"category", "bbox": [left, top, right, bottom], "segmentation": [[x, y], …]}, …]}`, in pixels. Several
+objects may share a category.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth, check_shape
 
 _SLACK = 0.02
-"""Share of a side by which hand-drawn outlines may exceed the photo; they are clipped to it."""
+"""Share of a side by which hand-drawn outlines may exceed the photo. They are clipped to it."""
 
 
 @dataclass(frozen=True)
 class Outlines:
-    """The objects of one category in one photo: the mask is their union, the boxes stay separate."""
+    """Objects of one category in one photo. The mask is their union; the boxes stay separate."""
 
     path: Path
     height: int
     width: int
     polygons: tuple[tuple[tuple[float, float], ...], ...]
-    """x, y in pixels, origin at the photo's top-left corner."""
+    """Outlines as x, y in pixels, with the origin at the photo's top-left corner."""
     boxes: tuple[tuple[float, ...], ...]
 
     def size(self) -> tuple[int, int]:
-        """Height and width of the labeled photo, in pixels."""
+        """Return height and width of the labeled photo, in pixels."""
         return self.height, self.width
 
     def truth(self, size: tuple[int, int]) -> Truth:
-        """Polygons filled at the labeled size, then resized and thresholded at half; boxes scaled."""
+        """Fill the polygons at the labeled size, resize and threshold the mask at half, scale the boxes."""
         check_shape(self.path, self.size(), size)
         image = Image.new("L", (self.width, self.height))
         draw = ImageDraw.Draw(image)
@@ -51,12 +51,12 @@ class Outlines:
 
 
 def is_lerf_ovs(folder: Path) -> bool:
-    """Whether the folder holds label files."""
+    """Return whether the folder holds label files."""
     return any(folder.glob("*.json"))
 
 
 def read_lerf_ovs(folder: Path) -> Annotations:
-    """Labels of a scene, `folder`/<photo>.json. Raises UserError naming the file for anything invalid."""
+    """Read the labels of a scene, `folder`/<photo>.json. Raises UserError that names an invalid file."""
     paths = sorted(folder.glob("*.json"))
     if not paths:
         deeper = next(folder.glob("**/*.json"), None)
@@ -76,8 +76,8 @@ def read_lerf_ovs(folder: Path) -> Annotations:
 
 
 def _read_labels(path: Path) -> dict[str, Outlines]:
-    """A photo's labels by category. Label files come from others, so everything is validated."""
-    from lang3dxl_ns.scene.camera import MOST_PIXELS  # loads torch, which a help does without
+    """Read a photo's labels by category. Label files come from others, so everything is validated."""
+    from lang3dxl_ns.scene.camera import MOST_PIXELS  # loads torch, which --help does not need
 
     content = read_json(path)
     height, width = (content["info"][side] for side in ("height", "width"))
@@ -92,7 +92,8 @@ def _read_labels(path: Path) -> dict[str, Outlines]:
 
 
 def _read_object(item: Any, height: int, width: int) -> tuple[str, tuple[Any, ...], tuple[float, ...]]:
-    """Name, outline and box of an object. The name becomes part of a path, and must not leave its folder."""
+    """Read name, outline and box of an object. The name becomes part of a path and must stay in its
+    folder."""
     category = item["category"].strip()
     plain = category not in ("", ".", "..") and not set(category) & set("/\\\0")
     expect(plain, f"{category!r} is not a plain name")

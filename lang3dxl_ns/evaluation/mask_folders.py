@@ -1,7 +1,8 @@
-"""Ground truth as pictures of masks, a folder per category: HolyScenes' layout, or plain masks.
+"""Ground truth as pictures of masks, with a folder per category: HolyScenes' layout, or plain masks.
 
-HolyScenes (HaLo-NeRF, Dudai et al. 2024): <category>/NNNN-gt.jpg, black on white, beside copies NNNN-img.jpg
-of the photos. Plain masks are <prompt>/<photo>.png, white on black; a folder images/ may hold the photos.
+HolyScenes (HaLo-NeRF, Dudai et al. 2024) has <category>/NNNN-gt.jpg, black on white, beside copies
+NNNN-img.jpg of the photos. Plain masks are <prompt>/<photo>.png, white on black; a folder images/ may hold
+the photos.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ _MASK, _PHOTO = "-gt", "-img"
 
 @dataclass(frozen=True)
 class MaskFile:
-    """An annotation stored as a picture, of the photo's size or in proportion."""
+    """Annotation stored as a picture, of the photo's size or in proportion to it."""
 
     path: Path
     dark: bool = False
     """Whether the object is dark on bright instead of bright on dark."""
 
     def size(self) -> tuple[int, int]:
-        """Height and width in pixels. Raises UserError for an unreadable file."""
+        """Read height and width in pixels. Raises UserError for an unreadable file."""
         return self._read().size[::-1]
 
     def truth(self, size: tuple[int, int]) -> Truth:
-        """Resized as gray values, then thresholded at half, so that JPEG noise does not matter."""
+        """Resize the mask as gray values, then threshold it at half, so that JPEG noise does not matter."""
         image = self._read()
         check_shape(self.path, image.size[::-1], size)
         gray = np.asarray(image.resize(size[::-1], Image.Resampling.BILINEAR))
@@ -52,12 +53,12 @@ class MaskFile:
 
 
 def is_holyscenes(folder: Path) -> bool:
-    """Whether the folder is a scene in HolyScenes' layout."""
+    """Return whether the folder is a scene in HolyScenes' layout."""
     return any(path.stem.endswith(_MASK) for path in folder.glob("*/*"))
 
 
 def read_holyscenes(folder: Path) -> Annotations:
-    """Masks of a scene in HolyScenes' layout.
+    """Read the masks of a scene in HolyScenes' layout.
 
     Raises UserError for a folder without masks, a category without any, and a photo without its mask.
     """
@@ -82,7 +83,7 @@ def read_holyscenes(folder: Path) -> Annotations:
 
 
 def read_plain(folder: Path) -> Annotations:
-    """Plain masks of a scene.
+    """Read the plain masks of a scene.
 
     Raises UserError for a folder without masks, and for a prompt without any.
     """
@@ -100,7 +101,7 @@ def read_plain(folder: Path) -> Annotations:
 
 
 def _categories(folder: Path) -> Iterator[tuple[Path, list[Path]]]:
-    """Folders of categories and their pictures at any depth, sorted, without hidden ones."""
+    """Yield the folders of categories with their pictures at any depth, sorted, without hidden ones."""
     for category in sorted(folder.iterdir()):
         if category.is_dir() and not category.name.startswith("."):
             found = (path for path in category.rglob("*") if path.suffix.lower() in PICTURES)

@@ -21,7 +21,7 @@ from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest
 from lang3dxl_ns.preparation.foreground import find_mask
 
 _LARGEST = 1e30
-"""Scores beyond are as good as infinite: their squares overflow float32."""
+"""Largest score taken as finite. The squares of larger ones overflow float32."""
 
 
 def score_predictions(
@@ -31,7 +31,7 @@ def score_predictions(
     masks: Path | None = None,
     temperature: float = 1.0,
 ) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
-    """Figures of every labeled photo, by name, and the scoring protocol.
+    """Score every labeled photo; return the figures by photo name, and the scoring protocol.
 
     Args:
         truth: the labels.
@@ -40,7 +40,7 @@ def score_predictions(
             the ground truth, or as `lang3dxl query` names its files.
         photos: names of the photos (or labels) to score; by default all with a label.
         masks: folder of foreground masks, white = keep; predictions become 0 elsewhere.
-        temperature: the one the maps were made with (see `MapScorer.variants`).
+        temperature: temperature that the maps were made with (see `MapScorer.variants`).
 
     Raises:
         UserError: a map is missing, damaged or of another aspect ratio.
@@ -69,7 +69,7 @@ def score_predictions(
 def _read_map(
     maps: Path, folders: tuple[str, str], photo: str, size: tuple[int, int]
 ) -> Float[Tensor, "h w"]:
-    """A prompt's map at `size`, from the first of the prompt's folders that holds one of the photo."""
+    """Read a prompt's map at `size`, from the first of the prompt's folders that holds one for the photo."""
     names = dict.fromkeys((photo, photo.replace("/", "_")))
     suffixes = (".npy", *PICTURES, ".JPG", ".JPEG", ".PNG")
     paths = [maps / folder / f"{name}{suffix}" for folder in folders for name in names for suffix in suffixes]

@@ -1,4 +1,4 @@
-"""Reports of evaluations: their tables in markdown, and reading them again."""
+"""Reports of evaluations: writing their tables in markdown, and reading them again."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _OTHERS = (
 
 
 def read_results(path: Path) -> tuple[str, dict[str, Any]]:
-    """Scene and results of a report, also in the form of `ns-eval`.
+    """Read scene and results of a report, also one in the form of `ns-eval`.
 
     Raises UserError for another file, and for figures that are not numbers.
     """
@@ -43,7 +43,7 @@ def read_results(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def scene_table(scene: str, results: Mapping[str, Any]) -> str:
-    """The report in markdown: average precision by category, then totals, then the protocol."""
+    """Write the report in markdown: average precision by category, then totals, then the protocol."""
 
     def figure(name: str) -> str:
         deviation = results.get(f"{name}_std")
@@ -72,7 +72,7 @@ def scene_table(scene: str, results: Mapping[str, Any]) -> str:
 
 
 def pooled_table(pooled: Mapping[str, Mapping[str, Any]]) -> str:
-    """Average precision of several scenes, by category: the table of `aggregate.pool`."""
+    """Write the table of `aggregate.pool`: average precision of several scenes, by category."""
     images, scenes, each = pooled["image_pooled"], pooled["scene_mean"], pooled["per_scene"]
 
     def row(name: str) -> list[str | None]:

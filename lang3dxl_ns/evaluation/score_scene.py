@@ -1,4 +1,4 @@
-"""Scores of a scene by itself: its words against ground truth, without its run, targets or photos."""
+"""Scores of a scene file: its words against ground truth, without its run, targets or photos."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ def score_scene(
     Args:
         scene: the scene.
         truth: labels of its photos.
-        split: photos held out of training, those seen in it, or both.
+        split: photos held out of training, photos used in it, or both.
 
     Returns:
-        The figures of each photo (`ap_{category}` etc., see `evaluation.aggregate`), and what they mean.
+        The figures of each photo (`ap_{category}` etc., see `evaluation.aggregate`), and the protocol that
+            explains them.
 
     Raises:
-        UserError: the scene has colors alone, or no photo of the split has a label.
+        UserError: the scene has colors only, or no photo of the split has a label.
     """
     photos = labeled_photos(scene, truth, split)
     scorer = LanguageScorer(truth, scene.text.vectors)
@@ -66,7 +67,7 @@ def score_scene(
 
 
 def labeled_photos(scene: Scene, truth: GroundTruth, split: SceneSplit) -> list[ScenePhoto]:
-    """The photos of a split that have labels. Raises UserError if there are none."""
+    """List the photos of a split that have labels. Raises UserError if there are none."""
     wanted = {"held-out": ("eval",), "seen": ("train",), "all": ("train", "eval")}[split]
     photos = [p for p in scene.photos if p.split in wanted and truth.key(p.name) is not None]
     if not photos:
@@ -75,8 +76,8 @@ def labeled_photos(scene: Scene, truth: GroundTruth, split: SceneSplit) -> list[
 
 
 def truths_of(truth: GroundTruth, photo: Photo, size: tuple[int, int]) -> dict[str, Truth]:
-    """The photo's labels, undistorted like the photo, on whose file they were drawn. (Boxes no longer
-    fit then, so masks take their place.)"""
+    """Read the photo's labels and undistort them like the photo, because they were drawn on its file. Boxes
+    do not match undistorted photos, so masks take their place."""
     truths = truth.truths(photo.name, size)
     if not photo.lens.distorts:
         return truths

@@ -17,11 +17,11 @@ from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
 Maps = dict[str, Float[Tensor, "h w"]]
-"""Relevancy by category, 0…1, above 0.5 where found."""
+"""Relevancy maps by category, 0…1, above 0.5 at matches."""
 BLUR = 2.5
-"""Blur of relevancy maps in Lang3D-XL: pixels at half the photo's size."""
+"""Blur of relevancy maps in Lang3D-XL, in pixels at half the photo's size."""
 THRESHOLD = 0.5
-"""Relevancy above which a pixel counts as found."""
+"""Relevancy above which a pixel counts as a match."""
 SMOOTHING = 30
 """Side of LangSplat's mean filter, pixels."""
 SMOOTH_THRESHOLD = 0.4
@@ -33,10 +33,10 @@ _VOTERS = 7
 
 
 def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"]) -> float | None:
-    """AP = Σ (R_n − R_{n−1}) P_n over all pixels, as in scikit-learn; None without a positive pixel.
+    """Compute AP = Σ (R_n − R_{n−1}) P_n over all pixels as scikit-learn does; None without a positive.
 
-    Equal scores form one step, so the order of pixels does not matter.
-    Raises ValueError on NaN or on shapes that differ.
+    Equal scores form one step, so the order of pixels does not matter. Raises ValueError on NaN or on shapes
+    that differ.
     """
     from sklearn.metrics import average_precision_score
 
@@ -46,10 +46,10 @@ def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"
 
 
 def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) -> dict[str, float]:
-    """All measures of a map; empty if the object isn't in the photo, where average precision is undefined.
+    """Compute all measures of a map; empty if the object is not in the photo, where AP is undefined.
 
-    `ap`: average precision. Those of `overlap`: of the pixels above 0.5. `located`: 1 if the highest pixel
-    lies in a box, or on the mask if there are no boxes, else 0 (LERF's accuracy). smooth: adds
+    `ap` is the average precision. The measures of `overlap` use the pixels above 0.5. `located` is 1 if the
+    highest pixel lies in a box, or on the mask if there are no boxes, else 0 (LERF's accuracy). `smooth` adds
     `smooth_located` and the `overlap` of LangSplat's mask, `smooth_iou` etc.
     """
     precision = average_precision(score, truth.mask)
@@ -65,9 +65,9 @@ def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) ->
 
 
 def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, float]:
-    """Intersection over union, F1, balanced accuracy, pixel accuracy (share of pixels judged right) and
-    precision (0 if nothing is found) of a mask. The truth must have a positive; if it has no negative,
-    balanced accuracy is the share found."""
+    """Compute intersection over union, F1, balanced accuracy, pixel accuracy (share of pixels classified
+    correctly) and precision (0 if there is no match) of a mask. The truth must have a positive. If it has no
+    negative, balanced accuracy is the recall."""
     both, missed = np.count_nonzero(found & truth), np.count_nonzero(truth & ~found)
     extra = np.count_nonzero(found & ~truth)
     negatives = truth.size - both - missed
@@ -82,7 +82,7 @@ def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, f
 
 
 def located(score: Float[Array, "h w"], truth: Truth) -> float:
-    """1 if any of the highest pixels lies on the object, else 0. A constant map locates nothing."""
+    """Return 1 if any of the highest pixels lies on the object, else 0. A constant map locates nothing."""
     highest = score == score.max()
     if highest.all():
         return 0.0
@@ -94,8 +94,8 @@ def located(score: Float[Array, "h w"], truth: Truth) -> float:
 
 
 def smooth_mask(score: Float[Array, "h w"], mean: Float[Array, "h w"]) -> Bool[Array, "h w"]:
-    """LangSplat's mask: the mean of the map and its mean-filtered copy, stretched to −1…1, above 0.4 by
-    majority of the neighbors (Qin et al. 2024). The threshold is fixed, not chosen by the truth."""
+    """Compute LangSplat's mask: the mean of the map and its mean-filtered copy, stretched to −1…1, above 0.4
+    by majority of the neighbors (Qin et al. 2024). The threshold is fixed, not chosen by the truth."""
     mixed = (score + mean) / 2
     lowest, highest = mixed.min(), mixed.max()
     stretched = 2 * (mixed - lowest) / max(highest - lowest, 1e-9) - 1
@@ -104,7 +104,7 @@ def smooth_mask(score: Float[Array, "h w"], mean: Float[Array, "h w"]) -> Bool[A
 
 
 def strongest_level(levels: Float[Array, "l h w"]) -> Float[Array, "h w"]:
-    """The map with the highest smoothed peak among maps at several levels (LangSplat has three)."""
+    """Choose the map with the highest smoothed peak among maps at several levels (LangSplat has three)."""
     peaks = [uniform_filter(level.astype(np.float64), SMOOTHING, mode="mirror").max() for level in levels]
     return levels[int(np.argmax(peaks))]
 
@@ -113,30 +113,30 @@ def strongest_level(levels: Float[Array, "l h w"]) -> Float[Array, "h w"]:
 
 
 def resize_map(image: Float[Tensor, "n H W"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
-    """Maps or feature channels resized to (height, width), bilinear."""
+    """Resize maps or feature channels to (height, width), bilinearly."""
     if tuple(image.shape[-2:]) == size:
         return image
     return F.interpolate(image[None].float(), size, mode="bilinear", align_corners=False)[0]
 
 
 def map_size(maps: Maps) -> tuple[int, int]:
-    """Height and width of a photo's maps."""
+    """Return height and width of a photo's maps."""
     height, width = next(iter(maps.values())).shape
     return height, width
 
 
 def resized(maps: Maps, size: tuple[int, int]) -> Maps:
-    """Every map resized to (height, width)."""
+    """Resize every map to (height, width)."""
     return {name: resize_map(scores[None], size)[0] for name, scores in maps.items()}
 
 
 def blurred(maps: Maps) -> Maps:
-    """Every map blurred by a Gaussian of `BLUR` pixels."""
+    """Blur every map by a Gaussian of `BLUR` pixels."""
     return _each(maps, lambda score: gaussian_filter(score, BLUR))
 
 
 def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
-    """Every map, set to 0 outside the foreground `keep` if given."""
+    """Set every map to 0 outside the foreground `keep`, if given."""
     if keep is None:
         return maps
     there = resize_map(keep[None].float(), map_size(maps))[0] >= 0.5
@@ -144,8 +144,8 @@ def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
 
 
 def as_published(maps: Maps) -> Maps:
-    """Lang3D-XL's processing of every (masked) map: 0 up to 0.5, the rest stretched to 0…1 by the photo's
-    maximum, then blurred. All rejected pixels tie, but for the blur."""
+    """Process every (masked) map as Lang3D-XL does: 0 up to 0.5, the rest stretched to 0…1 by the photo's
+    maximum, then blurred. Except for the blur, all rejected pixels tie."""
 
     def process(score: Float[Array, "h w"]) -> Float[Array, "h w"]:
         floor = max(float(score.min()), THRESHOLD)
@@ -156,7 +156,7 @@ def as_published(maps: Maps) -> Maps:
 
 
 def softened(maps: Maps, temperature: float) -> Maps:
-    """Relevancy maps of this temperature converted to temperature 1, which the publication uses."""
+    """Convert relevancy maps of this temperature to temperature 1, which the publication uses."""
     if temperature == 1:
         return maps
     return {
@@ -178,7 +178,7 @@ def score_maps(
     prefix: str = "",
     smooth: bool = False,
 ) -> dict[str, float]:
-    """`{prefix}{measure}_{category}` for every category that has a truth and is in the photo."""
+    """Compute `{prefix}{measure}_{category}` for every category that has a truth and is in the photo."""
     scores = {}
     for category, truth in truths.items():
         for measure, value in score_map(maps[category].detach().cpu().numpy(), truth, smooth).items():
@@ -187,33 +187,34 @@ def score_maps(
 
 
 def bounds(labels: Maps, truths: Mapping[str, Truth]) -> dict[str, float]:
-    """Average precision by chance and at best, for every category in the photo.
+    """Compute average precision by chance and at best, for every category in the photo.
 
-    `chance_ap_{category}`: of a map without information, the share of positives.
-    `limit_ap_{category}`: of `labels`, the exact labels after lifting and rendering (`label_limit`).
+    `chance_ap_{category}` is the one of a map without information, the share of positives.
+    `limit_ap_{category}` is the one of `labels`, the exact labels after lifting and rendering
+    (`label_limit`).
     """
     found: dict[str, float] = {}
     for category, truth in truths.items():
         if truth.mask.any():
             found[f"chance_ap_{category}"] = float(truth.mask.mean())
             best = average_precision(labels[category].cpu().numpy(), truth.mask)
-            assert best is not None  # it has a positive
+            assert best is not None  # the truth has a positive
             found[f"limit_ap_{category}"] = best
     return found
 
 
 class MapScorer:
-    """Scores maps against a scene's ground truth, for runs and for predictions of other programs alike."""
+    """Scorer of maps against a scene's ground truth, for runs and for predictions of other programs alike."""
 
     def __init__(self, truth: GroundTruth) -> None:
         self.truth = truth
         self.without: dict[str, set[str]] = {}
-        """By category, the photos left out because their label of it is empty."""
+        """Photos left out because their label of a category is empty, by category."""
         self._scored: set[str] = set()
 
     @property
     def smooths(self) -> bool:
-        """Whether the measures smooth maps themselves, so that there is one variant only."""
+        """Whether the measures smooth maps themselves, so that there is only one variant."""
         return self.truth.layout == "lerf_ovs"
 
     def variants(
@@ -223,11 +224,12 @@ class MapScorer:
         temperature: float = 1.0,
         of_published_prompts: Maps | None = None,
     ) -> dict[str, Maps]:
-        """The maps to score, by the prefix of their figures.
+        """Return the maps to score, by the prefix of their figures.
 
-        For masks: "" blurred, "raw_" unprocessed, "authors_" `as_published`. For LERF-OVS, whose measures
-        include smoothing: "" unprocessed. keep: maps are 0 outside, before and after the blur.
-        of_published_prompts: what "authors_" is made of, if not `maps`.
+        For masks, "" is blurred, "raw_" unprocessed, and "authors_" processed by `as_published`. For
+        LERF-OVS, whose measures include smoothing, there is only "", unprocessed. Maps are set to 0 outside
+        `keep`, before and after the blur. "authors_" is made from `of_published_prompts`, or from `maps` if
+        that is None.
         """
         raw = inside(maps, keep)
         if self.smooths:
@@ -239,9 +241,9 @@ class MapScorer:
     def scores(
         self, photo: str, maps: Maps, prefix: str = "", truths: Mapping[str, Truth] | None = None
     ) -> dict[str, float]:
-        """`{prefix}{measure}_{category}` for every labeled category that the photo shows.
+        """Compute `{prefix}{measure}_{category}` for every labeled category that the photo shows.
 
-        truths: the photo's labels at the size of the maps; by default as the files have them.
+        `truths` are the photo's labels at the size of the maps; by default they are read from the files.
         """
         if truths is None:
             truths = self.truth.truths(photo, map_size(maps))
@@ -255,14 +257,14 @@ class MapScorer:
     def scores_of(
         self, photo: str, variants: Mapping[str, Maps], truths: Mapping[str, Truth] | None = None
     ) -> dict[str, float]:
-        """`scores` of maps by their prefix, together."""
+        """Compute `scores` of several variants of maps by their prefixes."""
         found: dict[str, float] = {}
         for prefix, maps in variants.items():
             found |= self.scores(photo, maps, prefix, truths)
         return found
 
     def protocol(self, mask: str) -> dict[str, Any]:
-        """What the figures mean, for a report. mask: how the foreground was treated."""
+        """Describe for a report what the figures mean. `mask` says how the foreground was treated."""
         truth = self.truth
         size = "the labels'" if self.smooths else "half the photo's"
         return {

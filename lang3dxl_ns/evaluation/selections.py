@@ -18,16 +18,17 @@ from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.scene.camera import Camera
 
 _LEAST_SHARE = 0.03
-"""Share of all that is labeled with a word, below which a group is no thing of its own."""
+"""Share of all that is labeled with a word, below which a group is not a separate object."""
 
 
 def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePhoto]) -> dict[str, float]:
-    """Figures of every category that the labels show, 0…1:
+    """Compute figures of every category that the labels show, 0…1.
 
     - `mask_iou_{category}`: IoU of the mask of `Scene.matches` with the label, mean over photos.
-    - `selection_iou_{category}`: IoU of the Gaussians that match with those that the labels mark, most of
-      whose pixels in the labeled photos are marked. Gaussians weigh as many pixels as they fill.
-    - `box_iou_{category}`: IoU of the box of `Scene.find` with that of the labeled thing it fits best.
+    - `selection_iou_{category}`: IoU of the matching Gaussians with the labeled ones. A Gaussian is labeled
+      if the labels mark most of its pixels in the labeled photos. Gaussians are weighted by the pixels that
+      they fill.
+    - `box_iou_{category}`: IoU of the box of `Scene.find` with the labeled object's box that it matches best.
 
     Args:
         scene: the scene.
@@ -62,7 +63,7 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
 
 
 def box_iou(a: Box, b: Box) -> float:
-    """Intersection over union of two boxes' volumes; 0 if both are flat."""
+    """Compute intersection over union of two boxes' volumes; 0 if both are flat."""
     low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
     both = float(np.prod((high - low).clip(0)))
     whole = sum(float(np.prod(np.subtract(box.high, box.low))) for box in (a, b)) - both

@@ -1,4 +1,4 @@
-"""Compositing on the CPU in fused kernels: as `torch_rasterizer`, but many times as fast."""
+"""Compositing on the CPU in fused kernels: the function of `torch_rasterizer`, but many times as fast."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ from lang3dxl_ns.rendering.fused_tiles import (
 )
 
 PARTS_PER_THREAD = 8
-"""Tiles may stop early, by an unknown amount: small parts spread the rest over the threads."""
+"""Parts per thread. Tiles may stop early, by an unknown amount, so small parts spread the rest over the
+threads."""
 _MOST_KEPT = 64 * 2**20  # bytes
 
 
 class _Kept(threading.local):
-    """Memory kept from one backward pass to the next: new pages cost more than the sums themselves."""
+    """Memory kept from one backward pass to the next. New pages would cost more than the sums themselves."""
 
     memory = np.empty(0, np.uint8)
 
     def take(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        """An array of arbitrary content, valid until the thread takes the next one."""
+        """Return an array of arbitrary content that is valid until the thread takes the next one."""
         size = math.prod(shape) * dtype.itemsize
         if size > _MOST_KEPT:
             return np.empty(shape, dtype)
@@ -48,7 +49,7 @@ _kept = _Kept()
 
 
 class FusedCompositing(torch.autograd.Function):
-    """What `torch_rasterizer.Compositing` computes, in compiled kernels; no gradient for the variances."""
+    """Compositing as in `torch_rasterizer.Compositing`, compiled. The variances get no gradient."""
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -94,7 +95,7 @@ class FusedCompositing(torch.autograd.Function):
         maps = Maps(*(slope.numpy() for slope in slopes))
         threads = torch.get_num_threads()
         parts = _parts(ctx.trace.ends)
-        # Every thread has fixed tiles and its own sums, so that the result doesn't depend on their order.
+        # Every thread has fixed tiles and its own sums, so the result does not depend on their order.
         dealt = [np.concatenate(parts[k::threads]) for k in range(min(threads, len(parts)))]
         columns = CHANNELS_FROM + plan.table.shape[1]
         sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
@@ -111,7 +112,7 @@ class FusedCompositing(torch.autograd.Function):
 
 
 class _Gradients(NamedTuple):
-    """Gradients by Gaussian."""
+    """Gradients per Gaussian."""
 
     position: Float[np.ndarray, "n 2"]
     conic: Float[np.ndarray, "n 3"]
@@ -122,7 +123,8 @@ class _Gradients(NamedTuple):
 
 
 def _parts(work: np.ndarray) -> list[np.ndarray]:
-    """Consecutive tiles with about equal work, several parts per thread; empty tiles count a little too."""
+    """Split the tiles into consecutive parts of about equal work, several per thread. Empty tiles count a
+    little, too."""
     threads = torch.get_num_threads()
     parts = PARTS_PER_THREAD * threads if threads > 1 else 1
     ends = np.cumsum(work + 8.0)
@@ -132,7 +134,7 @@ def _parts(work: np.ndarray) -> list[np.ndarray]:
 
 @kernel
 def _collect(first, last, plan, conics, opacities, sums, found) -> None:
-    """Gradients of a range of Gaussians, from the sums of all threads."""
+    """Collect the gradients of a range of Gaussians from the sums of all threads."""
     row = np.empty(sums.shape[2], sums.dtype)
     for rank in range(first, last):
         row[:] = sums[0, rank]

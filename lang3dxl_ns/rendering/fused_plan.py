@@ -15,25 +15,26 @@ from lang3dxl_ns.rendering.ellipses import REACH_SLACK
 
 LOG2_E = math.log2(math.e)
 TILE = 16
-"""Tiles of 16 × 16 pixels."""
+"""Side of a tile, pixels."""
 SPLAT_COLUMNS = 6
-"""x, y, shear, steepness, rise, log2 of opacity: log2 of alpha at (dx, dy) from the center is
-log2 opacity − steepness·(dx + shear·dy)² − rise·dy², which stays accurate far from the center of a needle."""
+"""Columns of a splat: x, y, shear, steepness, rise and log2 of opacity. At (dx, dy) from the center, log2 of
+alpha is log2 opacity − steepness·(dx + shear·dy)² − rise·dy², which stays accurate far from the center of a
+needle."""
 UNROLL = 4
-"""Channels are composited four at a time, so their number is rounded up to a multiple of four."""
+"""Channels composited at a time. Their number is rounded up to a multiple of this."""
 
 
 class Plan(NamedTuple):
-    """The visible Gaussians in depth order and, for each tile, those that may touch it."""
+    """Visible Gaussians in depth order and, for each tile, those that may touch it."""
 
     order: Int[np.ndarray, " v"]
     """Indices of the Gaussians, front to back."""
     splats: Float[np.ndarray, "v 6"]
     table: Float[np.ndarray, "v c"]
-    """Channels with a gradient to the geometry, a one for alpha, zeros up to a multiple of four; then the
+    """Channels with a gradient to the geometry, a one for alpha, and zeros up to a multiple of four; then the
     detached channels, padded likewise."""
     attached: int
-    """Number of columns of the table up to the detached ones."""
+    """Number of columns of the table before the detached ones."""
     starts: Int[np.ndarray, " tiles+1"]
     """First row of each tile."""
     ranks: Int[np.ndarray, " rows"]
@@ -81,7 +82,7 @@ def make_plan(
 
 
 def depth_order(depths: Float[Tensor, " v"]) -> Int[Tensor, " v"]:
-    """Indices front to back. Positive floats sort like their bits, and integers have a radix sort."""
+    """Return indices front to back. Positive floats sort like their bits, and integers have a radix sort."""
     keys = depths.view(torch.int32) if depths.dtype == torch.float32 else depths
     return torch.sort(keys, stable=True).indices
 
@@ -92,7 +93,7 @@ def _rounded_up(count: int) -> int:
 
 @kernel
 def _find_visible(means2d, variances, opacities, width, height, boxes, visible):
-    """List the Gaussians that reach some pixel, with their ranges of tiles; returns their number."""
+    """List the Gaussians that reach some pixel, with their ranges of tiles, and return their number."""
     count = 0
     for g in range(len(opacities)):
         opacity = opacities[g]
@@ -104,7 +105,7 @@ def _find_visible(means2d, variances, opacities, width, height, boxes, visible):
         x, y = means2d[g, 0] - 0.5, means2d[g, 1] - 0.5
         left, right = max(x - reach_x, 0.0), min(x + reach_x, width - 1.0)
         top, bottom = max(y - reach_y, 0.0), min(y + reach_y, height - 1.0)
-        # False for NaN, too.
+        # This test also fails for NaN.
         if not (left <= right and top <= bottom):
             continue
         first_x, last_x = math.ceil(left), int(right)
@@ -141,7 +142,7 @@ def _pack(
 
 @kernel
 def _count_rows(order, boxes, columns, first, last, sizes) -> None:
-    """For rows of tiles, add each tile's number of Gaussians to the entry after its own."""
+    """Add each tile's number of Gaussians, for a range of tile rows, to the entry after its own."""
     for g in order:
         for y in range(max(boxes[g, 2], first), min(boxes[g, 3] + 1, last)):
             for x in range(boxes[g, 0], boxes[g, 1] + 1):

@@ -1,4 +1,5 @@
-"""Projection on the CPU in fused kernels, 16 Gaussians at a time: same function as `projection.project`."""
+"""Projection on the CPU in fused kernels, 16 Gaussians at a time: the same function as
+`projection.project`."""
 
 from __future__ import annotations
 
@@ -32,18 +33,18 @@ from lang3dxl_ns.scene.camera import Camera
 
 _DETERMINANT_MIN = 1e-10
 _LENGTH_MIN = 1e-12
-"""A quaternion shorter than this is divided by this, as by `torch.nn.functional.normalize`."""
+"""Shortest length by which a quaternion is divided, as in `torch.nn.functional.normalize`."""
 
 
 class Lens(NamedTuple):
-    """The camera without its pose, and the settings of a projection; numbers of the Gaussians' type."""
+    """Intrinsics of the camera and settings of a projection, as numbers of the Gaussians' type."""
 
     focal_x: float
     focal_y: float
     center_x: float
     center_y: float
     low_x: float
-    """Slopes x / z and y / z are held between these for the Jacobian."""
+    """Limits of the slopes x / z and y / z in the Jacobian."""
     low_y: float
     high_x: float
     high_y: float
@@ -52,16 +53,16 @@ class Lens(NamedTuple):
     near: float
     eps2d: float
     antialiased: float
-    """1 or 0."""
+    """Whether opacities are scaled for antialiasing: 1 or 0."""
 
 
 def project(
     gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool
 ) -> Ellipses:
-    """See `projection.project`; no gradient for the intrinsics, and none from the variances."""
+    """Project Gaussians as `projection.project` does. Neither intrinsics nor variances carry gradients."""
     count = len(gaussians.means)
     parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
-    if count < LANES:  # a vector's worth at least; the rest is out of sight
+    if count < LANES:  # at least one full vector; the padding is not visible
         missing = LANES - count
         parts = [F.pad(part, (0, 0) * (part.dim() - 1) + (0, missing)) for part in parts]
     intrinsics = camera.intrinsics.to(gaussians.means)
@@ -77,7 +78,7 @@ def project(
 
 
 class _World(NamedTuple):
-    """Gaussians and the camera's pose; or their gradients, without that of the pose."""
+    """Gaussians and the camera's pose, or the Gaussians' gradients without one for the pose."""
 
     means: Float[np.ndarray, "n 3"]
     quats: Float[np.ndarray, "n 4"]
@@ -87,7 +88,7 @@ class _World(NamedTuple):
 
 
 class _Screen(NamedTuple):
-    """Ellipses, or their gradients."""
+    """Screen ellipses, or their gradients."""
 
     means2d: Float[np.ndarray, "n 2"]
     conics: Float[np.ndarray, "n 3"]
@@ -131,7 +132,7 @@ class _Projection(torch.autograd.Function):
 
 
 def _vectors(count: int) -> list[tuple[int, int]]:
-    """A range of Gaussians for each thread, divided between vectors."""
+    """Return a range of Gaussians for each thread, divided at vector boundaries."""
     return [(first * LANES, min(last * LANES, count)) for first, last in ranges(-(-count // LANES))]
 
 
@@ -167,7 +168,7 @@ def _only(condition, a):
 
 @numba.njit(forceinline=True)
 def _weighted(a, b, c, weights):
-    """a · weights[0] + b · weights[1] + c · weights[2]."""
+    """Compute a · weights[0] + b · weights[1] + c · weights[2]."""
     return _plus(_plus(_scaled(a, weights[0]), _scaled(b, weights[1])), _scaled(c, weights[2]))
 
 
@@ -184,28 +185,28 @@ def _store3(matrix, row, value):
 
 
 class _Vector(NamedTuple):
-    """16 Gaussians on their way to the screen, in vectors of 16 numbers and tuples of such vectors."""
+    """State of 16 Gaussians during projection, in vectors of 16 numbers and tuples of such vectors."""
 
     mean: Any
-    scale: Any  # 0 where it is not drawable
+    scale: Any  # 0 where the Gaussian is not drawable
     drawable: Any
     z: Any
     slope_x: Any
     slope_y: Any
-    held_x: Any  # slopes as the Jacobian takes them
+    held_x: Any  # slopes clamped for the Jacobian
     held_y: Any
     row_x: Any  # rows of the Jacobian: derivatives of the pixel coordinates by the world position
     row_y: Any
     quat: Any  # w, x, y, z of length 1 (or 0)
-    length: Any  # what it was divided by
+    length: Any  # the divisor that normalized it
     columns: Any  # of the rotation matrix
-    plain_x: Any  # the rows in the Gaussian's own axes, and scaled
+    plain_x: Any  # the rows in the Gaussian's own axes, then scaled
     plain_y: Any
     axes_x: Any
     axes_y: Any
     normal: Any  # cross product of the scaled rows, and its squared length
     area2: Any
-    xx: Any  # covariance and its determinant, blurred (`projection.project` has the reason for this form)
+    xx: Any  # covariance and its determinant, blurred (`projection.project` explains this form)
     yy: Any
     xy: Any
     determinant: Any
@@ -229,7 +230,7 @@ def _jacobian_row(axis, forward, slope, focal, z):
 
 @numba.njit(forceinline=True)
 def _look(world, lens, g):
-    """Gaussians g … g + 15; those that are not drawable stand at (0, 0, 1) and have no size."""
+    """Transform Gaussians g … g + 15. Those that are not drawable are at (0, 0, 1) and have no size."""
     right, down, forward = _camera_axes(world.pose)
     mean, scale = _load3(world.means, g), _load3(world.scales, g)
     z = _dot(mean, forward) + world.pose[2, 3]
@@ -271,7 +272,7 @@ def _look(world, lens, g):
 def _project(first, last, world, lens, screen):
     reach = np.empty(LANES, world.means.dtype)
     for start in range(first, last, LANES):
-        g = min(start, len(world.means) - LANES)  # the last vector repeats some of the one before it
+        g = min(start, len(world.means) - LANES)  # the last vector overlaps the one before it
         v = _look(world, lens, g)
         x, y = v.slope_x * lens.focal_x + lens.center_x, v.slope_y * lens.focal_y + lens.center_y
         determinant = maximum(v.determinant, _DETERMINANT_MIN)
@@ -297,7 +298,7 @@ def _project(first, last, world, lens, screen):
 
 @kernel
 def _backward(first, last, world, lens, upstream, found, g_view):
-    """The chain rule through `_project`, from its outputs back."""
+    """Apply the chain rule through `_project`, from its outputs back."""
     right, down, forward = _camera_axes(world.pose)
     lanes = np.empty(LANES, world.means.dtype)
     for lane in range(LANES):
@@ -311,7 +312,7 @@ def _backward(first, last, world, lens, upstream, found, g_view):
         v = _look(world, lens, g)
         g_row_x, g_row_y = _to_rows(world, lens, upstream, found, v, g, zero)
 
-        # To the camera's axes and the point in its frame.
+        # Next: gradients of the camera's axes and of the point in its frame.
         g_right, g_down = _scaled(g_row_x, lens.focal_x / v.z), _scaled(g_row_y, lens.focal_y / v.z)
         g_forward = _scaled(_plus(_scaled(g_right, v.held_x), _scaled(g_down, v.held_y)), -1.0)
         free_x = (v.slope_x >= lens.low_x) & (v.slope_x <= lens.high_x)
@@ -339,9 +340,9 @@ def _backward(first, last, world, lens, upstream, found, g_view):
 
 @numba.njit(forceinline=True)
 def _to_rows(world, lens, upstream, found, v, g, zero):
-    """Stores the gradients of opacities, scales and quaternions; returns those of the Jacobian's rows."""
+    """Store the gradients of opacities, scales and quaternions, and return those of the Jacobian's rows."""
     determinant = maximum(v.determinant, _DETERMINANT_MIN)
-    # Conic and opacity to the covariance, its determinant and the area of the sharp ellipse.
+    # From conic and opacity to the covariance, its determinant and the area of the sharp ellipse.
     c0, c1, c2 = _load3(upstream.conics, g)
     g_alpha = where(v.drawable, load(upstream.opacities, g), 0.0)
     g_xx, g_yy, g_xy = c2 / determinant, c0 / determinant, c1 * -1.0 / determinant
@@ -351,7 +352,7 @@ def _to_rows(world, lens, upstream, found, v, g, zero):
         ratio = sqrt(v.area2 / determinant)
         g_ratio = g_alpha * load(world.opacities, g)
         g_determinant -= g_ratio * ratio * 0.5 / determinant
-        # The area's own gradient; zero where the area is 0, as for a vector's length.
+        # The area's own gradient. It is zero where the area is 0, as for a vector's length.
         g_area2 = where(v.area2 > 0.0, g_ratio * 0.5 / (sqrt(v.area2) * sqrt(determinant)), 0.0)
         g_alpha *= ratio
     store(found.opacities, g, g_alpha)
@@ -360,7 +361,7 @@ def _to_rows(world, lens, upstream, found, v, g, zero):
     g_yy += g_determinant * lens.eps2d
     g_normal = _scaled(v.normal, (g_determinant + g_area2) * 2.0)
 
-    # To the scaled axes, the scales, the rotation and the rows of the Jacobian.
+    # From there to the scaled axes, the scales, the rotation and the rows of the Jacobian.
     g_axes_x = _plus(_scaled(v.axes_x, g_xx * 2.0), _scaled(v.axes_y, g_xy))
     g_axes_x = _plus(g_axes_x, _cross(v.axes_y, g_normal))
     g_axes_y = _plus(_scaled(v.axes_y, g_yy * 2.0), _scaled(v.axes_x, g_xy))
@@ -384,7 +385,7 @@ def _store_total(view, row, axis, shift):
 
 @numba.njit(forceinline=True)
 def _store_quaternion(g_quats, g, quat, length, a, b, c):
-    """Gradient of the quaternion as given, from that of the rotation's columns a, b and c."""
+    """Store the gradient of the quaternion as given, from those of the rotation's columns a, b and c."""
     w, x, y, z = quat
     g_w = ((a[1] - b[0]) * z + (c[0] - a[2]) * y + (b[2] - c[1]) * x) * 2.0
     g_x = ((a[1] + b[0]) * y + (a[2] + c[0]) * z + (b[2] - c[1]) * w - (b[1] + c[2]) * x * 2.0) * 2.0

@@ -1,8 +1,8 @@
 """Numba kernels that composite tiles, forward and backward, in vectors of 16 pixels.
 
 A tile of 16 × 16 pixels is divided into 16 blocks of 8 × 2, one vector each. Front to back, each Gaussian is
-composited into those blocks of its tile that it reaches and that have not stopped. Rows are the
-pairs of tile and Gaussian (see `fused_plan.Plan`); they are processed in waves of 32.
+composited into those blocks of its tile that it reaches and that have not stopped. Rows are pairs of tile and
+Gaussian (see `fused_plan.Plan`). They are processed in waves of 32.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from lang3dxl_ns.rendering.simd import (
 WAVE = 32
 PIXELS = TILE * TILE
 CHANNELS_FROM = 8
-"""Columns of a row's gradients: conic xx, xy, yy; first moments x, y; ln opacity; sums of the absolute pixel
-gradients of the screen position, x and y; from this one on the channels."""
+"""First channel column of a row's gradients. The eight columns before it are the conic (xx, xy, yy), first
+moments (x, y), ln opacity, and sums of the absolute pixel gradients of the screen position (x, y)."""
 _BLOCKS = PIXELS // LANES
 _BLOCK_WIDTH, _BLOCK_HEIGHT = 8, 2
 _REACH = math.log2(ALPHA_MIN) - 0.01  # with a margin for rounding
 
 
 class Maps(NamedTuple):
-    """What is composited, or its gradient."""
+    """Composited maps, or their gradients."""
 
     image: Float[np.ndarray, "h w c"]
     features: Float[np.ndarray, "h w d"]
@@ -51,18 +51,18 @@ class Maps(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What the forward pass leaves to the backward pass."""
+    """Data that the forward pass leaves for the backward pass."""
 
     wave_starts: Int[np.ndarray, " tiles+1"]
     """First record of each tile."""
     records: Float[np.ndarray, "waves pixels"]
     """Transmittance in front of each wave."""
     ends: Int[np.ndarray, " tiles"]
-    """Rows of each tile until all its pixels stopped."""
+    """Number of rows of each tile that were processed before all its pixels stopped."""
 
 
 class _Splat(NamedTuple):
-    """A Gaussian on the screen, in pixels from the tile's corner: see `fused_plan.SPLAT_COLUMNS`."""
+    """A Gaussian on the screen, in pixels from the tile's corner (see `fused_plan.SPLAT_COLUMNS`)."""
 
     x: float
     y: float
@@ -73,7 +73,7 @@ class _Splat(NamedTuple):
 
 
 class _Wave(NamedTuple):
-    """The rows of a wave, one after the other, each with a slot for every block that it reaches."""
+    """The rows of a wave in order, each with a slot for every block that it reaches."""
 
     places: Int[np.ndarray, " slots"]
     """First pixel of each slot's block."""
@@ -85,7 +85,7 @@ class _Wave(NamedTuple):
 
 @numba.njit
 def _aligned(size, like):
-    """An array aligned to cache lines: a vector across two of them costs twice as much."""
+    """Allocate an array aligned to cache lines, because a vector across two of them costs twice as much."""
     room = np.empty(size + 64 // like.itemsize, like.dtype)
     first = -room.ctypes.data % 64 // like.itemsize
     return room[first : first + size]
@@ -93,14 +93,14 @@ def _aligned(size, like):
 
 @numba.njit(forceinline=True)
 def _place(pixel):
-    """Column and row in the tile of a pixel, which are numbered block by block."""
+    """Return column and row in the tile of a pixel. Pixels are numbered block by block."""
     block, lane = pixel // LANES, pixel % LANES
     return block % 2 * _BLOCK_WIDTH + lane % _BLOCK_WIDTH, block // 2 * _BLOCK_HEIGHT + lane // _BLOCK_WIDTH
 
 
 @numba.njit
 def _pixel_centers(like):
-    """x and y of all blocks' pixels from the tile's corner, and y of the pixel rows."""
+    """Return x and y of all blocks' pixels from the tile's corner, and y of the pixel rows."""
     across, down, lines = _aligned(PIXELS, like), _aligned(PIXELS, like), _aligned(LANES, like)
     for pixel in range(PIXELS):
         column, row = _place(pixel)
@@ -112,7 +112,7 @@ def _pixel_centers(like):
 
 @numba.njit
 def _blocks_inside(tile, width, height):
-    """The tile's first pixel, and the mask of blocks that have pixels in the image."""
+    """Return the tile's first pixel, and the mask of blocks that have pixels in the image."""
     columns = (width + TILE - 1) // TILE
     y, x = tile // columns * TILE, tile % columns * TILE
     mask = 0
@@ -133,10 +133,8 @@ def _splat(splats, rank, corner_x, corner_y):
 
 @numba.njit(forceinline=True)
 def _blocks_reached(splat, lines):
-    """The mask of blocks in which a Gaussian reaches 1/255.
-
-    Row by row: along a row of pixels alpha is largest where dx = −shear·dy, or at the end nearest to it.
-    """
+    """Return the mask of blocks in which a Gaussian reaches 1/255. Along a row of pixels, alpha is largest
+    where dx = −shear·dy, or at the end nearest to it."""
     dy = lines - splat.y
     peak = dy * -splat.shear
     height = splat.log2_opacity - dy * dy * splat.rise
@@ -150,7 +148,7 @@ def _blocks_reached(splat, lines):
 
 @numba.njit(forceinline=True)
 def _reach(plan, begin, count, corner_x, corner_y, lines, masks):
-    """The masks of one wave's rows, computed together to avoid stalls."""
+    """Compute the masks of one wave's rows together, which avoids stalls."""
     for k in range(count):
         masks[k] = _blocks_reached(_splat(plan.splats, plan.ranks[begin + k], corner_x, corner_y), lines)
 
@@ -165,7 +163,7 @@ def _alpha(dx, dy, splat):
 
 @numba.njit(forceinline=True)
 def _blend(transmittance, at, alpha):
-    """The weight in a block's pixels, and where they go on; stores the transmittance behind."""
+    """Return the weight in a block's pixels, and which of them continue. Stores the transmittance behind."""
     before = load(transmittance, at)
     weight = before * alpha
     after = before - weight
@@ -176,7 +174,7 @@ def _blend(transmittance, at, alpha):
 
 @kernel
 def composite_tiles(tiles, plan, maps, trace, keep):
-    """Composite some tiles of a `Plan` into the maps; with `keep` for a backward pass."""
+    """Composite some tiles of a `Plan` into the maps. `keep` also fills the trace for a backward pass."""
     channels, features_from = plan.table.shape[1], plan.attached
     transmittance, sums = _aligned(PIXELS, plan.splats), _aligned(channels * PIXELS, plan.splats)
     across, down, lines = _pixel_centers(plan.splats)
@@ -227,11 +225,12 @@ def composite_tiles(tiles, plan, maps, trace, keep):
 
 @kernel
 def backward_tiles(tiles, plan, maps, trace, absolutes, sums):
-    """Sum the gradients of some tiles per visible Gaussian; `maps` are the gradients of the composited.
+    """Sum the gradients of some tiles per visible Gaussian. `maps` has the gradients of the output maps.
 
-    Wave by wave from the back: alpha and weight are recomputed front to back, then used in reverse.
-    With v = Σ channel × upstream, and B the same for everything behind, composited over black, the gradient
-    with respect to ln(alpha) is weight·(v − B), and B in front of the Gaussian is B + alpha·(v − B).
+    Waves are processed from the back. In each, alpha and weight are recomputed front to back, then used in
+    reverse. With v = Σ channel × upstream, and B the same sum for everything behind, composited over black,
+    the gradient with respect to ln(alpha) is weight·(v − B), and B in front of the Gaussian is B + alpha·(v −
+    B).
     """
     channels, like = plan.table.shape[1], plan.splats
     sums[:] = 0
@@ -287,7 +286,7 @@ def backward_tiles(tiles, plan, maps, trace, absolutes, sums):
 
 @numba.njit(forceinline=True)
 def _read_upstream(plan, maps, corner_x, corner_y, upstream):
-    """A tile of the maps' gradients, channel by channel in each block; 0 outside the image."""
+    """Read a tile of the maps' gradients, channel by channel in each block; they are 0 outside the image."""
     channels, colors = plan.table.shape[1], maps.image.shape[2]
     for pixel in range(PIXELS):
         column, row = _place(pixel)
@@ -303,7 +302,7 @@ def _read_upstream(plan, maps, corner_x, corner_y, upstream):
 
 @numba.njit(forceinline=True)
 def _add_values(plan, upstream, rank, first, last, found):
-    """Σ channel × upstream of a row, over the channels that have a gradient to the geometry."""
+    """Compute Σ channel × upstream of a row, over the channels that have a gradient to the geometry."""
     channels = plan.table.shape[1]
     for c in range(0, plan.attached, UNROLL):
         column = rank * channels + c
@@ -320,7 +319,7 @@ def _add_values(plan, upstream, rank, first, last, found):
 
 @numba.njit(forceinline=True)
 def _add_shape(across, down, splat, first, last, found, behind, absolutes, zero, sums):
-    """Gradients of a row's conic, moments and opacity; moves `behind` in front of it."""
+    """Add the gradients of a row's conic, moments and opacity, and move `behind` in front of it."""
     m, mx, my, mxx, mxy, myy, abs_x, abs_y = zero, zero, zero, zero, zero, zero, zero, zero
     for slot in range(first, last):
         at = entry(found.places, slot)
@@ -353,7 +352,7 @@ def _add_shape(across, down, splat, first, last, found, behind, absolutes, zero,
 
 @numba.njit(forceinline=True)
 def _add_channels(upstream, first, last, found, channels, zero, sums):
-    """Gradients of a row's channels."""
+    """Add the gradients of a row's channels."""
     for c in range(0, channels, UNROLL):
         g0, g1, g2, g3 = zero, zero, zero, zero
         for slot in range(first, last):

@@ -1,4 +1,4 @@
-"""Gathering, the adjoint of compositing: pixel values averaged onto the Gaussians that they show."""
+"""Gathering, the adjoint of compositing: pixel values are averaged onto the Gaussians that they show."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from torch import Tensor, nn
 from lang3dxl_ns.common.image import resize
 
 Composite = Callable[[nn.Parameter], Float[Tensor, "h w c"]]
-"""Composites values of Gaussians, [n, c], in one view."""
+"""Function that composites values of Gaussians, [n, c], in one view."""
 
 
 MEMORY = 5e8
-"""Bytes for the channels gathered at a time: of the Gaussians and of the pixels, values and gradients."""
+"""Bytes for the channels gathered at a time: values and gradients of both the Gaussians and the pixels."""
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """A view's values on the foreground, 0 elsewhere, and channels of 1 on the foreground and outside of it.
-
-    They are computed a few channels at a time: all channels of a large photo would take gigabytes.
-    """
+    """A view's values on the foreground (0 elsewhere), then two channels that are 1 on the foreground and
+    outside it. They are computed a few channels at a time, because all channels of a large photo would take
+    gigabytes."""
 
     maps: Sequence[Float[Tensor, "hd wd c"]]
-    """Maps of any size, which are stretched over the view and follow each other."""
+    """Maps of any size, which are stretched over the view and concatenated along their channels."""
     foreground: Float[Tensor, "h w"]
     """1 on the foreground where all values are known, 0 elsewhere."""
     outside: Float[Tensor, "h w"]
@@ -37,8 +36,8 @@ class Pixels:
     def of(
         cls, maps: Sequence[Float[Tensor, "hd wd c"]], size: tuple[int, int], mask: Tensor | None = None
     ) -> Pixels:
-        """A view of this size, rows and columns, whose foreground is the mask [H, W] (None: everything),
-        without the pixels where a map isn't finite."""
+        """Build the pixels of a view of this size (rows, columns) whose foreground is the mask [H, W] (None:
+        everything), without the pixels where a map is not finite."""
         foreground = maps[0].new_ones(size)
         if mask is not None:
             foreground *= resize(mask[..., None].to(foreground), size)[..., 0] >= 0.5
@@ -49,7 +48,7 @@ class Pixels:
         return cls([torch.where(*pair, 0.0) for pair in zip(finite, maps, strict=True)], foreground, outside)
 
     def channels(self, start: int, stop: int) -> Float[Tensor, "h w part"]:
-        """A range of the channels."""
+        """Return a range of the channels."""
         height, width = self.foreground.shape
         inside, outside = self.foreground[..., None], self.outside[..., None]
         found, first = [], 0
@@ -69,19 +68,21 @@ def gather(
     like: Tensor,
     memory: float | None = None,
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
-    """Mean over all pixels p of all views, weighted by a Gaussian's contribution, Σ w(g, p) F(p) / Σ w(g, p),
-    and its mass Σ w(g, p) in pixels. Gaussians never visible have mass and mean 0. So have those with
-    more mass outside the foreground: the sky would take what it has from the edges of towers.
+    """Average the values of all pixels of all views onto the Gaussians; return means and masses.
 
-    Compositing is linear in the values composited, map(p) = Σ_g w(g, p) f(g), so the sums are its derivative
-    in the direction of F: one backward pass per view, exact.
+    The mean is weighted by a Gaussian's contribution w to each pixel p, Σ w(g, p) F(p) / Σ w(g, p). Its mass
+    is Σ w(g, p), in pixels. Gaussians that are never visible have mass and mean 0. So do those with more mass
+    outside the foreground, or else the sky would take on values from the edges of towers.
+
+    Compositing is linear in the composited values, map(p) = Σ_g w(g, p) f(g), so the sums are its derivative
+    in the direction of F. One backward pass per view computes them exactly.
 
     Args:
         count: number of Gaussians, n.
-        views: for each, a function that composites values of the Gaussians, and the pixels' values F.
-        width: channels of the maps of F.
-        like: gives number type and device.
-        memory: bytes to work in (default `MEMORY`), beside the result, which is on the CPU if it is larger.
+        views: for each view, a function that composites values of the Gaussians, and the pixels' values F.
+        width: number of channels of the maps of F.
+        like: tensor whose number type and device are used.
+        memory: bytes to work in (default `MEMORY`), besides the result, which is on the CPU if it is larger.
     """
     memory = memory or MEMORY
     place = like.device if 4 * count * (width + 2) <= memory else torch.device("cpu")
@@ -101,12 +102,12 @@ def gather(
 
 
 def filled_pixels(composite: Composite, weight: Float[Tensor, "h w"], count: int) -> Float[Tensor, " n"]:
-    """Pixels that every Gaussian fills in a view, with a weight per pixel."""
+    """Compute how many pixels every Gaussian fills in a view, with a weight per pixel."""
     return filled_parts(composite, weight[..., None], count)[:, 0]
 
 
 def filled_parts(composite: Composite, weights: Float[Tensor, "h w k"], count: int) -> Float[Tensor, "n k"]:
-    """Pixels that every Gaussian fills in each of several parts of a view, with weights per pixel."""
+    """Compute how many pixels every Gaussian fills in each of several parts of a view, weighted per pixel."""
     with torch.enable_grad():
         probe = nn.Parameter(weights.new_zeros(count, weights.shape[-1]))
         (gradient,) = torch.autograd.grad(composite(probe), probe, weights)

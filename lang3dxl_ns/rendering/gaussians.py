@@ -12,9 +12,10 @@ from torch import Tensor
 from lang3dxl_ns.scene.camera import Camera
 
 MAX_LOG_SCALE = 60.0
-"""Clamp log scales to this before `exp`: an infinite scale has the gradient 0 · ∞ = NaN."""
+"""Upper limit of log scales before `exp`. An infinite scale has the gradient 0 · ∞ = NaN."""
 CLOSEST = 1.5
-"""Gaussians show from this depth on, in standard deviations of their longest axis; from twice that, fully."""
+"""Depth from which Gaussians are visible, in standard deviations of their longest axis. They are fully
+visible from twice this depth."""
 
 
 @dataclass
@@ -31,16 +32,16 @@ class Gaussians:
     """Peak opacity, 0…1."""
 
     def detach(self) -> Gaussians:
-        """The same Gaussians, without gradient."""
+        """Return the same Gaussians without gradient."""
         return Gaussians(
             self.means.detach(), self.quats.detach(), self.scales.detach(), self.opacities.detach()
         )
 
     def seen_from(self, camera: Camera) -> Gaussians:
-        """The same Gaussians, transparent where the camera is hardly farther from them than they are long.
+        """Return the same Gaussians, but transparent where their depth is small relative to their length.
 
-        A splat is affine, right only where a Gaussian is small for its depth: at a camera that stands at
-        a wall, one of a finger's breadth beside the picture would cover it.
+        A splat's affine approximation holds only where a Gaussian is small for its depth. Without this, a
+        Gaussian as small as a finger beside the picture would cover it when the camera is close to a wall.
         """
         with torch.no_grad():
             moved, place = camera.at_origin(self.means)
@@ -49,18 +50,18 @@ class Gaussians:
         return replace(self, opacities=self.opacities * shown)
 
     def moved(self, by: Float[Tensor, "3"]) -> Gaussians:
-        """The same Gaussians with shifted centers."""
+        """Return the same Gaussians with shifted centers."""
         return Gaussians(self.means + by, self.quats, self.scales, self.opacities)
 
 
 @dataclass
 class Raster:
-    """The maps of one rasterization, as training needs them."""
+    """Maps of one rasterization, as training needs them."""
 
     image: Float[Tensor, "h w c"]
-    """The channels over the background."""
+    """Channels composited over the background."""
     features: Float[Tensor, "h w d"] | None
-    """The features over black, not divided by alpha."""
+    """Features composited over black, not divided by alpha."""
     alpha: Float[Tensor, "h w 1"]
     """Accumulated opacity, 0…1."""
     depth: Float[Tensor, "h w 1"] | None

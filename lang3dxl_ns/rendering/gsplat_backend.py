@@ -29,7 +29,7 @@ def rasterize_with_gsplat(
     near: float,
     eps2d: float,
 ) -> Raster:
-    """See `rasterize`. Computes in float32; detached features cost a second pass, if there is a gradient."""
+    """Render as `rasterize` does, in float32. Detached features cost a second pass if there is a gradient."""
     detach_features &= torch.is_grad_enabled()
     settings = {
         "near_plane": near,
@@ -63,7 +63,7 @@ def _render(
     background: Float[Tensor, " c"],
     **settings: Any,
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w 1"], dict[str, Any]]:
-    """One call of gsplat for one camera."""
+    """Call gsplat for one camera."""
     from gsplat import rasterization
 
     device = gaussians.means.device

@@ -1,8 +1,8 @@
-"""Build of gsplat's CUDA kernels on this machine, before any work, and loading them.
+"""Building and loading of gsplat's CUDA kernels on this machine, before any work starts.
 
-gsplat's own build starts when the first frame is rendered, takes ten compilers at a time whatever the
-memory, and deletes its folder when it is interrupted. This one keeps what is compiled, and needs no system
-CUDA toolkit: `pip install 'lang3dxl-ns[cuda]'` brings the compilers of torch's CUDA.
+gsplat's own build starts when the first frame is rendered, runs ten compilers at a time whatever the memory,
+and deletes its folder when it is interrupted. This build keeps what is compiled, and needs no system CUDA
+toolkit: `pip install 'lang3dxl-ns[cuda]'` brings the compilers of torch's CUDA.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 
 JOB_BYTES = 3.5e9
-"""Memory that one compiler takes at most."""
+"""Most memory that one compiler takes."""
 BUILD_BYTES = 0.5e9
-"""Disk space of a build."""
+"""Disk space that a build takes."""
 UNITS = 6
-"""Files that the CUDA sources are united to: torch's headers alone take a compiler more than a minute."""
+"""Number of translation units for the CUDA sources. Each one pays over a minute for torch's headers."""
 _COMPILE = "import json, sys; from torch.utils.cpp_extension import load; load(**json.loads(sys.argv[1]))"
 
 
@@ -48,16 +48,16 @@ class Extension(NamedTuple):
 
 
 class Need(NamedTuple):
-    """One thing that the build needs."""
+    """A prerequisite of the build."""
 
     what: str
     found: str | None
-    """None: missing."""
+    """Description of what was found; None if it is missing."""
     remedy: str
 
 
 def gsplat_extension() -> Extension:
-    """gsplat's kernels."""
+    """Describe gsplat's kernels."""
     source = _package("gsplat")[0] / "cuda" / "csrc"
     sources = sorted([*source.glob("*.cu"), *source.glob("*.cpp")])
     return Extension("gsplat_cuda", sources, [source, source / "third_party" / "glm"])
@@ -69,7 +69,7 @@ def _package(name: str) -> list[Path]:
 
 
 def find_toolkit(cuda: str) -> Path | None:
-    """The environment's toolkit, else the system's, of the same major version as torch's CUDA ("13.2")."""
+    """Find a toolkit of the major version of torch's CUDA ("13.2"): the environment's, else the system's."""
     major = cuda.partition(".")[0]
     for home in _toolkit_places(major):
         with contextlib.suppress(OSError, subprocess.SubprocessError):
@@ -81,7 +81,7 @@ def find_toolkit(cuda: str) -> Path | None:
 
 
 def _toolkit_places(major: str) -> list[Path]:
-    """The environment's packages, then where torch looks, and other versions beside the system's default."""
+    """List the environment's packages, then where torch looks, then versions beside the system's default."""
     nvcc = shutil.which("nvcc")
     named = os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH"), nvcc and Path(nvcc).resolve().parents[1]
     others = sorted(Path("/usr/local").glob(f"cuda-{major}*"), reverse=True)
@@ -90,14 +90,14 @@ def _toolkit_places(major: str) -> list[Path]:
 
 
 def _headers(home: Path) -> list[Path]:
-    """Folders with cub's headers; without them a toolkit is of no use."""
+    """Return the folders with cub's headers. A toolkit without them cannot be used."""
     include = home / "include"
     folders = (include / "cccl", include) if (include / "cuda_runtime.h").is_file() else ()
     return [folder for folder in folders if (folder / "cub" / "cub.cuh").is_file()]
 
 
 def needs(folder: Path) -> list[Need]:
-    """Everything that a build in a folder needs, found or not."""
+    """Return everything that a build in a folder needs, found or not."""
     import torch
 
     cuda = torch.version.cuda or ""
@@ -127,16 +127,17 @@ def needs(folder: Path) -> list[Need]:
 
 
 def search_path(*first: Path) -> str:
-    """PATH with the environment's programs first, whether it is activated or not."""
+    """Return PATH with the environment's programs first, whether it is activated or not."""
     return os.pathsep.join(
         [*map(str, first), str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)]
     )
 
 
 def device_arch() -> str:
-    """Compute capabilities of the visible GPUs, as nvcc and torch know them: "8.6", "7.5;8.6". One that
-    torch is too old for gets the newest it knows, compiled by the driver (+PTX). TORCH_CUDA_ARCH_LIST counts
-    only where there is no GPU: container images set it to five architectures, five times the work."""
+    """Return the compute capabilities of the visible GPUs, as nvcc and torch know them: "8.6", "7.5;8.6". A
+    GPU that is too new for torch gets the newest one that torch knows, compiled by the driver (+PTX).
+    TORCH_CUDA_ARCH_LIST is used only if there is no GPU, because container images set it to five
+    architectures, which is five times the work."""
     import torch
 
     gpus = {torch.cuda.get_device_capability(index) for index in range(torch.cuda.device_count())}
@@ -149,7 +150,8 @@ def device_arch() -> str:
 
 
 def build_folder(arch: str) -> Path:
-    """Folder of gsplat's build for these versions of gsplat, torch, CUDA and Python, and these GPUs."""
+    """Return the folder of gsplat's build for these versions of gsplat, torch, CUDA, Python, and these
+    GPUs."""
     import torch
 
     cache = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or Path.home() / ".cache" / "lang3dxl").expanduser()
@@ -160,15 +162,15 @@ def build_folder(arch: str) -> Path:
 
 
 def built(folder: Path, name: str = "gsplat_cuda") -> Path | None:
-    """The library, if it was built completely."""
+    """Return the library if it was built completely."""
     library = folder / f"{name}.so"
     return library if (folder / "done").is_file() and library.is_file() else None
 
 
 def build(extension: Extension, folder: Path, arch: str) -> Path:
-    """Compile into a folder, and go on where an earlier build there was interrupted; returns the library.
+    """Compile into a folder, continuing an earlier build there that was interrupted, and return the library.
 
-    Another process that builds there is waited for. Output goes to `folder`/build.log.
+    If another process is building there, wait for it. Output goes to `folder`/build.log.
 
     Raises:
         UserError: something is missing, or the compiler failed.
@@ -209,7 +211,7 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
         "build_directory": str(folder),
         "verbose": True,
     }
-    (folder / "lock").unlink(missing_ok=True)  # older versions of torch would wait for ever for its holder
+    (folder / "lock").unlink(missing_ok=True)  # older versions of torch would wait forever for its holder
     log, start, library = folder / "build.log", time.monotonic(), folder / f"{extension.name}.so"
     say(
         f"Building {extension.name} for compute capability {arch} with {environment['MAX_JOBS']} jobs: once, "
@@ -225,15 +227,15 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
         if status < 0:
             reason = f"signal {-status} stopped it, perhaps for lack of memory (MAX_JOBS=1 takes less)"
         raise UserError(f"building {extension.name} failed: {reason} (the whole output: {log})")
-    # Also the mark of a complete build.
+    # This file also marks a complete build.
     (folder / "done").write_text(f"{time.monotonic() - start:.0f} s with {environment['MAX_JOBS']} job(s)\n")
     return library
 
 
 def _link_tree(toolkit: Path, folder: Path) -> Path:
-    """The toolkit, or links to it laid out like a system's: the linker looks for lib64/libcudart.so, which
-    pip's packages lack."""
-    runtimes = sorted((toolkit / "lib").glob("libcudart.so.*"))  # several are links to one
+    """Return the toolkit, or links to it laid out like a system's. The linker looks for lib64/libcudart.so,
+    which pip's packages lack."""
+    runtimes = sorted((toolkit / "lib").glob("libcudart.so.*"))  # several are links to one file
     if (toolkit / "lib64").is_dir() or not runtimes:
         return toolkit
     shutil.rmtree(folder, ignore_errors=True)
@@ -247,8 +249,8 @@ def _link_tree(toolkit: Path, folder: Path) -> Path:
 
 
 def _united(sources: Sequence[Path], folder: Path) -> list[Path]:
-    """The sources, with the CUDA ones dealt to a few files that include them; written only if they change,
-    so that what is compiled stays valid."""
+    """Return the sources, with the CUDA ones merged into a few files that include them. A file is written
+    only if it changes, so that compiled objects stay valid."""
     cuda = sorted((path for path in sources if path.suffix == ".cu"), key=lambda p: p.stat().st_size)
     units = [folder / f"unit_{number}.cu" for number in range(min(UNITS, len(cuda)))]
     for number, unit in enumerate(units):
@@ -268,10 +270,10 @@ def load(library: Path, name: str = "gsplat_cuda") -> ModuleType:
 
 
 def make_ready() -> None:
-    """Load gsplat's kernels for this machine's GPUs, building them first if need be.
+    """Load gsplat's kernels for this machine's GPUs, building them first if necessary.
 
     Raises:
-        UserError: they are not available; says what is missing and how to get it.
+        UserError: the kernels are not available. The message says what is missing and how to get it.
     """
     import gsplat
     import torch
@@ -287,7 +289,7 @@ def make_ready() -> None:
     library = built(folder) or build(gsplat_extension(), folder, arch)
     try:
         kernels = load(library)
-    except ImportError:  # damaged
+    except ImportError:  # the library is damaged
         library.unlink()
         kernels = load(build(gsplat_extension(), folder, arch))
     gsplat.csrc = sys.modules["gsplat.csrc"] = kernels
@@ -295,7 +297,7 @@ def make_ready() -> None:
 
 @functools.cache
 def ready() -> bool:
-    """Whether gsplat can render, built first if need be; if not, says so, and that torch renders instead."""
+    """Return whether gsplat can render, building it if necessary. If not, say why, and that torch renders."""
     try:
         make_ready()
     except UserError as error:

@@ -17,8 +17,8 @@ def project(
 ) -> Ellipses:
     """Project Gaussians to the screen (EWA splatting, Zwicker et al. 2001, with gsplat's conventions).
 
-    `near`: world units. `eps2d`: variance added to both screen axes, pixels². `antialiased`: scale the
-    opacity by the square root of the ratio of the determinants without and with `eps2d`
+    `near` is in world units. `eps2d` is the variance added to both screen axes, in pixels². `antialiased`
+    scales the opacity by the square root of the ratio of the determinants without and with `eps2d`
     (Mip-Splatting, Yu et al. 2024).
     """
     view = camera.view_matrix.to(gaussians.means)
@@ -40,8 +40,8 @@ def project(
         dim=1,
     )
     axes_x, axes_y = torch.bmm(jacobian, rotations(gaussians.quats) * scales[:, None]).unbind(1)
-    # The determinant as the squared area of the parallelogram of the two rows (Cauchy-Binet), and that
-    # of the blurred covariance as a sum of positive terms: nothing cancels, so float32 is enough for
+    # The determinant is the squared area of the parallelogram of the two rows (Cauchy-Binet), and the
+    # determinant of the blurred covariance a sum of positive terms. Nothing cancels, so float32 is enough for
     # needles, where xx·yy − xy² would lose all digits.
     area = torch.linalg.vector_norm(torch.linalg.cross(axes_x, axes_y), dim=1)
     xx, yy, xy = axes_x.square().sum(1), axes_y.square().sum(1), (axes_x * axes_y).sum(1)
@@ -64,7 +64,7 @@ def _drawable(
     intrinsics: Float[Tensor, "3 3"],
     near: float,
 ) -> Bool[Tensor, " n"]:
-    """In front of the near plane, and not so large on screen that numbers overflow."""
+    """Return which Gaussians are beyond the near plane and not so large on screen that numbers overflow."""
     z = points[:, 2]
     sigma = scales.amax(1) * torch.maximum(intrinsics[0, 0], intrinsics[1, 1])
     return (z > near) & (sigma < MAX_SIGMA_PIXELS * z)
@@ -79,14 +79,14 @@ def _jacobian_row(
     center: Tensor,
     size: int,
 ) -> Float[Tensor, "n 3"]:
-    """Derivative of a pixel coordinate by the world position; `axis`, `forward`: camera axes in the world."""
+    """Compute a pixel coordinate's derivative by the world position, from camera axes in the world frame."""
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     slope = slope.clamp(-center / focal - margin, (size - center) / focal + margin)
     return (focal / z)[:, None] * (axis - slope[:, None] * forward)
 
 
 def rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length; the identity for length zero."""
+    """Compute rotation matrices of quaternions (w, x, y, z) of any length; length zero gives the identity."""
     w, x, y, z = F.normalize(quats, dim=1).unbind(1)
     xx, yy, zz = x * x, y * y, z * z
     entries = [
@@ -104,7 +104,7 @@ def _radii(
     xy: Float[Tensor, " n"],
     camera: Camera,
 ) -> Int[Tensor, " n"]:
-    """gsplat's radius: three standard deviations along the long axis, 0 where that misses the image."""
+    """Compute gsplat's radius: three standard deviations along the long axis, 0 where it misses the image."""
     spread = (0.25 * (xx - yy).square() + xy.square()).clamp_min(0.01).sqrt()
     radii = (3 * (0.5 * (xx + yy) + spread).sqrt()).ceil()
     x, y = means2d.unbind(1)

@@ -41,28 +41,29 @@ def rasterize(
 ) -> Raster:
     """Render Gaussians by alpha compositing (3D Gaussian Splatting, Kerbl et al. 2023; gsplat's rules).
 
-    Differentiable in the Gaussians, channels, features, background and the camera's view matrix.
+    The result is differentiable in the Gaussians, channels, features, background and the camera's view
+    matrix. Gaussians with a NaN or infinite value, also in their channels or features, are not rendered and
+    get no gradient, because one would spoil every pixel of its tiles.
 
     Args:
+        gaussians: the Gaussians, world frame.
+        camera: where to render them from.
         channels: values to composite over the background, such as activated colors.
         background: one value per channel; black by default.
-        features: composited likewise over black, not divided by alpha.
+        features: values composited over black, not divided by alpha.
         detach_features: the features' gradient reaches only `features`, not geometry or opacity.
         render_depth: also render the expected depth, world units.
         antialiased: dim small Gaussians by what the screen-space blur adds to their area.
         absgrad: the backward pass sets `info["means2d"].absgrad` for gsplat's densification.
         near: Gaussians with centers nearer than this are left out, world units.
         eps2d: variance added on screen, pixels².
-        backend: "auto" uses gsplat for tensors on a GPU, or torch if gsplat is not available; on the CPU it
-            uses numba, if it is installed and the environment variable LANG3DXL_CPU_KERNELS is not torch;
+        backend: "auto" uses gsplat for tensors on a GPU, or torch if gsplat is not available. On the CPU it
+            uses numba if it is installed and the environment variable LANG3DXL_CPU_KERNELS is not torch,
             otherwise torch (which works on any device).
 
-    Gaussians with a NaN or infinite value, in their channels and features too, are not rendered and get no
-    gradient: one would spoil every pixel of its tiles.
-
     Raises:
-        ValueError: sizes that don't fit together, a camera with a NaN or infinite value (checked on the CPU
-            only; on a GPU the check would force a synchronization).
+        ValueError: sizes do not match, or the camera has a NaN or infinite value (checked on the CPU only; on
+            a GPU the check would force a synchronization).
         UserError: gsplat was requested but is not available.
     """
     _check_sizes(gaussians, channels, background, features)
@@ -75,7 +76,7 @@ def rasterize(
         backend = _best_backend(gaussians.means)
     elif backend == "gsplat" and gaussians.means.is_cuda:
         gsplat_build.make_ready()
-    # gsplat's kernels can't be launched on empty input.
+    # gsplat's kernels cannot be launched on empty input.
     render: Callable[..., Raster] = functools.partial(_rasterize, backend)
     if backend == "gsplat" and len(channels):
         render = rasterize_with_gsplat
@@ -97,7 +98,7 @@ def _best_backend(means: Tensor) -> Backend:
 def _without_broken(
     gaussians: Gaussians, channels: Float[Tensor, "n c"], features: Float[Tensor, "n d"] | None
 ) -> tuple[Gaussians, Float[Tensor, "n c"], Float[Tensor, "n d"] | None]:
-    """Gaussians with a NaN or infinite value become transparent, black and get no gradient; the rest stay."""
+    """Make Gaussians with a NaN or infinite value transparent and black, without gradient."""
     g = gaussians
     with torch.no_grad():
         total = g.means.sum(1) + g.quats.sum(1) + g.scales.sum(1) + g.opacities + channels.sum(1)
@@ -119,7 +120,7 @@ def _without_broken(
 
 
 def _kernels(backend: Backend) -> tuple[Callable[..., Ellipses], type[torch.autograd.Function]]:
-    """Projection and compositing."""
+    """Return the functions that project and composite."""
     if backend == "numba":
         from lang3dxl_ns.rendering.fused_compositing import FusedCompositing
         from lang3dxl_ns.rendering.fused_projection import project as fused_project
@@ -157,7 +158,7 @@ def _rasterize(
     near: float,
     eps2d: float,
 ) -> Raster:
-    """One pass for everything: depth and features are extra channels of the image."""
+    """Render everything in one pass: depth and features are extra channels of the image."""
     to_screen, compositing = _kernels(backend)
     ellipses = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
     attached = [channels]

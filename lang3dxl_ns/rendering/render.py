@@ -1,4 +1,4 @@
-"""`render`: a picture of a finished scene from a camera, as a pure function."""
+"""`render`: a pure function that renders a finished scene from a camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lang3dxl_ns.scene.camera import Camera
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rendering:
-    """The maps of one view, without gradients."""
+    """Maps of one view, without gradients."""
 
     camera: Camera
     rgb: Float[Tensor, "h w 3"]
@@ -25,7 +25,7 @@ class Rendering:
     depth: Float[Tensor, "h w"]
     """Expected distance along the camera's axis, world units; 0 where nothing is rendered."""
     channels: Float[Tensor, "h w d"] | None = None
-    """Further values of the Gaussians composited over black, not divided by alpha."""
+    """Further values of the Gaussians, composited over black and not divided by alpha."""
 
 
 @torch.no_grad()
@@ -37,17 +37,17 @@ def render(
     background: Float[Tensor, "3"] | None = None,
     backend: Backend = "auto",
 ) -> Rendering:
-    """Render Gaussians in their own colors; safe to call from any thread.
+    """Render Gaussians in their own colors. This is safe to call from any thread.
 
     Args:
         splats: the Gaussians, world frame.
         camera: where to render them from.
         channels: further values to composite, one row per Gaussian.
         background: color behind the scene, 0…1; black by default.
-        backend: see `rasterize`.
+        backend: one of the backends of `rasterize`.
 
     Raises:
-        ValueError: as `rasterize` does.
+        ValueError: for the reasons that `rasterize` has.
     """
     raster = rasterize(
         splats.gaussians.seen_from(camera), camera, splats.colors(camera.position),
@@ -63,6 +63,6 @@ def render(
 def composite(
     splats: Splats, camera: Camera, channels: Float[Tensor, "n d"], backend: Backend = "auto"
 ) -> Float[Tensor, "h w d"]:
-    """Values of the Gaussians composited over black, without their colors; differentiable in the values."""
+    """Composite values of the Gaussians over black, differentiable in the values, without their colors."""
     gaussians = splats.gaussians.seen_from(camera)
     return rasterize(gaussians, camera, channels, antialiased=splats.antialiased, backend=backend).image

@@ -1,8 +1,7 @@
 """Vectors of 16 numbers for numba kernels: explicit SIMD through LLVM, on AVX-512, AVX2 and NEON alike.
 
-LLVM vectorizes loops over pixels only if it can prove that no arrays overlap, anew for every inner loop; with
-a vector type there is nothing to prove. The kernels are tuned for float32; float64 uses
-the same code.
+LLVM vectorizes loops over pixels only if it can prove, anew for every inner loop, that no arrays overlap. A
+vector type needs no such proof. The kernels are tuned for float32; float64 uses the same code.
 """
 
 from __future__ import annotations
@@ -20,7 +19,8 @@ from numba.extending import intrinsic, models, register_model
 
 LANES = 16
 
-# 2^x on [-0.5, 0.5]; degrees for a relative error near the type's rounding (1.7e-7 and 1e-16).
+# Polynomials for 2^x on [-0.5, 0.5], whose degrees give a relative error near the type's rounding (1.7e-7 and
+# 1e-16).
 _EXP2 = {
     bits: np.polynomial.Chebyshev.interpolate(np.exp2, degree, domain=[-0.5, 0.5])
     .convert(kind=np.polynomial.Polynomial)
@@ -30,7 +30,7 @@ _EXP2 = {
 
 
 class VectorType(types.Type):
-    """16 numbers of one type, or the booleans of a comparison."""
+    """Vector of 16 numbers of one type, or of the booleans of a comparison."""
 
     def __init__(self, dtype: types.Type):
         self.dtype = dtype
@@ -47,7 +47,7 @@ class _VectorModel(models.PrimitiveModel):
 
 
 def _spread(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-    """A scalar in every lane; vectors unchanged."""
+    """Copy a scalar to every lane. Vectors are returned unchanged."""
     if isinstance(value.type, ir.VectorType):
         return value
     vector = ir.VectorType(value.type, LANES)
@@ -61,7 +61,7 @@ def _constant(like: ir.Value, value: float) -> ir.Value:
 
 
 def _call(builder: ir.IRBuilder, name: str, *arguments: ir.Value) -> ir.Value:
-    """An LLVM intrinsic, lane by lane."""
+    """Call an LLVM intrinsic lane by lane."""
     kind = arguments[0].type
     size = 32 if isinstance(kind.element, ir.FloatType) else 64
     signature = ir.FunctionType(kind, [argument.type for argument in arguments])
@@ -93,7 +93,7 @@ def _register(symbol: Any, comparison: bool, emit: Any) -> None:
         lower_builtin(symbol, *kinds)(lower)
 
 
-_FUSE = ("contract",)  # a·b + c may be one instruction
+_FUSE = ("contract",)  # a·b + c may become one instruction
 
 for _symbols, _emit in (
     ((operator.add, operator.iadd), lambda b, x, y: b.fadd(x, y, flags=_FUSE)),
@@ -118,7 +118,7 @@ def _pointer(context: Any, builder: ir.IRBuilder, kind: Any, array: ir.Value, in
 
 @intrinsic
 def load(typing_context, array, index):
-    """16 consecutive entries of a one-dimensional contiguous array."""
+    """Load 16 consecutive entries of a one-dimensional contiguous array."""
     kind = VectorType(array.dtype)
 
     def emit(context, builder, sig, args):
@@ -146,7 +146,7 @@ def store(typing_context, array, index, value):
 
 @intrinsic
 def entry(typing_context, array, place):
-    """The entry of a contiguous array at an index without negative wrap-around."""
+    """Load the entry of a contiguous array at an index, without negative wrap-around."""
 
     def emit(context, builder, sig, args):
         return builder.load(_pointer(context, builder, array, *args))
@@ -156,7 +156,7 @@ def entry(typing_context, array, place):
 
 @intrinsic
 def load_column(typing_context, matrix, row, column):
-    """`matrix[row : row + 16, column]` of a contiguous matrix."""
+    """Load `matrix[row : row + 16, column]` of a contiguous matrix."""
     kind = VectorType(matrix.dtype)
 
     def emit(context, builder, sig, args):
@@ -175,7 +175,7 @@ def load_column(typing_context, matrix, row, column):
 
 @intrinsic
 def store_column(typing_context, matrix, row, column, value):
-    """`matrix[row : row + 16, column] = value` in a contiguous matrix."""
+    """Store `matrix[row : row + 16, column] = value` in a contiguous matrix."""
 
     def emit(context, builder, sig, args):
         target = cgutils.create_struct_proxy(matrix)(context, builder, value=args[0])
@@ -192,7 +192,7 @@ def store_column(typing_context, matrix, row, column, value):
 
 @intrinsic
 def spread(typing_context, value):
-    """A scalar in every lane."""
+    """Copy a scalar to every lane."""
     return VectorType(value)(value), lambda context, builder, sig, args: _spread(builder, args[0])
 
 
@@ -235,7 +235,7 @@ maximum = _choice(">", "The larger of two, lane by lane; the second where one is
 
 @intrinsic
 def where(typing_context, condition, x, y):
-    """Lane by lane `x` where the condition holds, else `y`; scalars are broadcast."""
+    """Choose `x` in the lanes where the condition holds, else `y`. Scalars are broadcast."""
     kind = x if isinstance(x, VectorType) else y
     operands = [arg if isinstance(arg, VectorType) else kind.dtype for arg in (x, y)]
 
@@ -248,7 +248,7 @@ def where(typing_context, condition, x, y):
 
 @intrinsic
 def exp2(typing_context, x):
-    """2 to the power of every lane, for lanes of -100 to 100; relative error near the type's rounding."""
+    """Raise 2 to the power of every lane (-100 to 100), with a relative error near the type's rounding."""
 
     def emit(context, builder, sig, args):
         bits = x.dtype.bitwidth
@@ -269,7 +269,7 @@ def exp2(typing_context, x):
 
 @intrinsic
 def total(typing_context, x):
-    """Sum of all lanes."""
+    """Sum all lanes."""
 
     def emit(context, builder, sig, args):
         element = args[0].type.element
@@ -283,7 +283,7 @@ def total(typing_context, x):
 
 @intrinsic
 def bits(typing_context, condition):
-    """The lanes in which a comparison holds, as bits of an integer; lane 0 is the lowest bit."""
+    """Pack the lanes in which a comparison holds into the bits of an integer; lane 0 is the lowest bit."""
 
     def emit(context, builder, sig, args):
         packed = builder.bitcast(args[0], ir.IntType(LANES))
@@ -294,7 +294,7 @@ def bits(typing_context, condition):
 
 @intrinsic
 def lowest_bit(typing_context, mask):
-    """Index of the lowest set bit; the mask must not be 0."""
+    """Return the index of the lowest set bit. The mask must not be 0."""
 
     def emit(context, builder, sig, args):
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))

@@ -12,7 +12,7 @@ from torch import Tensor
 from lang3dxl_ns.common.precision import in_full_precision
 
 BAND_0 = math.sqrt(1 / (4 * math.pi))
-"""The constant harmonic: color = 0.5 + this × coefficient."""
+"""Value of the constant harmonic: color = 0.5 + this × coefficient."""
 _BAND_1 = math.sqrt(3 / (4 * math.pi))
 _BAND_2 = math.sqrt(15 / (4 * math.pi))
 _BAND_2_ZONAL = math.sqrt(5 / (16 * math.pi))
@@ -23,7 +23,7 @@ _BAND_3_ZONAL = math.sqrt(7 / (16 * math.pi))
 
 
 def _basis(degree: int, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
-    """The basis functions at unit directions, with the signs used in Gaussian splatting files."""
+    """Evaluate the basis functions at unit directions, with the signs used in Gaussian splatting files."""
     x, y, z = directions.unbind(1)
     columns = [torch.full_like(x, BAND_0)]
     if degree >= 1:
@@ -58,11 +58,11 @@ def spherical_harmonics(
 ) -> Float[Tensor, "n 3"]:
     """Evaluate one color per Gaussian from its coefficients; the caller adds 0.5 and clamps.
 
-    Directions (camera center to Gaussian, world frame) may have any length. Bands above `degree` (0…3)
-    are ignored. Signs and order are those of Kerbl et al. 2023 (3D Gaussian Splatting).
+    Directions (camera center to Gaussian, world frame) may have any length. Bands above `degree` (0…3) are
+    ignored. Signs and order are those of Kerbl et al. 2023 (3D Gaussian Splatting).
 
     Raises:
-        ValueError: the degree is not 0…3 or has more bands than there are coefficients.
+        ValueError: the degree is not 0…3, or it needs more coefficients than there are.
     """
     count = (degree + 1) ** 2
     if not 0 <= degree <= 3 or count > coefficients.shape[1]:
@@ -77,11 +77,9 @@ def spherical_harmonics(
 def rotated_harmonics(
     coefficients: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n k 3"]:
-    """Coefficients of the same colors after the world has been turned by a rotation.
-
-    Harmonics of one degree mix only with each other, so the turned function is solved for from its values at
-    a few directions, degree by degree.
-    """
+    """Compute the coefficients of the same colors after the world has been turned by a rotation. Harmonics of
+    one degree mix only with each other. The turned function is therefore solved for, degree by degree, from
+    its values at a few directions."""
     degree = math.isqrt(coefficients.shape[1]) - 1
     generator = torch.Generator().manual_seed(0)
     directions = F.normalize(torch.randn(32, 3, generator=generator, dtype=torch.float64), dim=1)

@@ -1,4 +1,4 @@
-"""`Splats`: the Gaussians of a finished scene, as a value that never changes."""
+"""`Splats`: the Gaussians of a finished scene, as an immutable value."""
 
 from __future__ import annotations
 
@@ -19,10 +19,8 @@ from lang3dxl_ns.rendering.spherical_harmonics import BAND_0, rotated_harmonics,
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Splats:
-    """Gaussians with activated values (no logarithms, no logits) and colors, without gradients.
-
-    Tensors share a device. They must not be written to: renderings in other threads may be reading them.
-    """
+    """Gaussians with activated values (no logarithms, no logits) and colors, without gradients. All tensors
+    are on one device. They must not be written to: renderings in other threads may be reading them."""
 
     means: Float[Tensor, "n 3"]
     """Centers, world units."""
@@ -45,38 +43,38 @@ class Splats:
 
     @property
     def degree(self) -> int:
-        """Degree of the harmonics; 0 for colors that don't depend on the viewing direction."""
+        """Degree of the harmonics; 0 for colors that do not depend on the viewing direction."""
         return isqrt(self.harmonics.shape[1]) - 1
 
     @property
     def gaussians(self) -> Gaussians:
-        """The shapes, as `rasterize` takes them."""
+        """Shapes of the Gaussians, as `rasterize` takes them."""
         return Gaussians(self.means, self.quats, self.scales, self.opacities)
 
     def colors(self, center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-        """Red, green and blue, 0 and above, as seen from a point in the world frame."""
+        """Compute red, green and blue, 0 and above, as seen from a point in the world frame."""
         directions = self.means - to_device(center.to(self.means.dtype), self.means.device)
         return (spherical_harmonics(self.degree, directions, self.harmonics) + 0.5).clamp_min(0.0)
 
     def with_colors(self, colors: Float[Tensor, "n 3"]) -> Splats:
-        """The same Gaussians in colors (0 and above) that don't depend on the viewing direction."""
+        """Return the same Gaussians in colors (0 and above) that do not depend on the viewing direction."""
         return replace(self, harmonics=harmonics_of(colors))
 
     def to(self, device: torch.device | str) -> Splats:
-        """The same Gaussians on a device."""
+        """Return the same Gaussians on a device."""
         return self._mapped(lambda tensor: tensor.to(device))
 
     def copied(self) -> Splats:
-        """The same Gaussians in memory of their own."""
+        """Copy the Gaussians to new memory."""
         return self._mapped(torch.clone)
 
     def select(self, which: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> Splats:
-        """Some of the Gaussians, by a mask or by their indices (tensors or NumPy arrays)."""
+        """Return some of the Gaussians, chosen by a mask or by their indices (tensors or NumPy arrays)."""
         rows = torch.as_tensor(which, device=self.means.device)
         return self._mapped(lambda tensor: tensor[rows])
 
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Splats:
-        """The same Gaussians in another frame.
+        """Transform the Gaussians to another frame.
 
         Args:
             similarity: [[s·R, t], [0, 1]] from this frame to the other one, with a rotation R, a scale s > 0
@@ -103,7 +101,7 @@ class Splats:
         )
 
     def sound(self) -> Bool[Tensor, " n"]:
-        """Which Gaussians have no NaN or infinite value."""
+        """Return which Gaussians have no NaN or infinite value."""
         parts = (self.means, self.quats, self.scales, self.opacities, self.harmonics)
         return torch.stack([part.reshape(len(self), -1).isfinite().all(1) for part in parts]).all(0)
 
@@ -114,12 +112,12 @@ class Splats:
 
 
 def harmonics_of(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
-    """Harmonics of degree 0 for colors that don't depend on the viewing direction."""
+    """Compute harmonics of degree 0 for colors that do not depend on the viewing direction."""
     return (colors[:, None] - 0.5) / BAND_0
 
 
 def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
-    """A rotation matrix as a unit quaternion (w, x, y, z)."""
+    """Convert a rotation matrix to a unit quaternion (w, x, y, z)."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat()
@@ -127,7 +125,7 @@ def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
 
 
 def _product(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """Quaternion product: the rotation b, then a."""
+    """Multiply quaternions: the result rotates by b, then by a."""
     aw, ax, ay, az = a.unbind()
     w, x, y, z = F.normalize(b, dim=1).unbind(1)
     return torch.stack(

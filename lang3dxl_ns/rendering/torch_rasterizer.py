@@ -1,8 +1,8 @@
 """Compositing in plain torch, for machines without compiled kernels: any device, float32 or float64.
 
-A *row* is a pair of tile and Gaussian, and a *chunk* the next rows of some tiles, few enough for all their
-pixels to be computed at once. Autograd differentiates one chunk at a time, computed again in the backward
-pass, so memory is bounded by a chunk and the list of rows.
+A *row* is a pair of tile and Gaussian. A *chunk* holds the next rows of some tiles, few enough to compute all
+their pixels at once. Autograd differentiates one chunk at a time, computed again in the backward pass, so
+memory is bounded by a chunk and the list of rows.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from lang3dxl_ns.rendering.ellipses import ALPHA_MAX, ALPHA_MIN, REACH_SLACK, TR
 TILE = 8
 """Pixels per side of a tile."""
 ROWS_AT_A_TIME = 1 << 20
-"""Rows made at a time: Gaussians close to the camera cover every tile."""
+"""Rows made at a time. The limit is needed because Gaussians close to the camera cover every tile."""
 DEPTH = 32
-"""Rows per tile and chunk. Tiles whose pixels have all stopped are left out of the next one."""
+"""Rows per tile and chunk. Tiles whose pixels have all stopped are left out of the next chunk."""
 TILES = {"cpu": 64}
-"""Tiles per chunk: 512 kB for an array of all their pixels, which fits a processor's cache …"""
+"""Tiles per chunk by device: on the CPU, an array of all their pixels takes 512 kB, which fits its cache."""
 MOST_TILES = 4096
-"""… and 32 MB on other devices, which want large chunks."""
+"""Tiles per chunk on other devices, which need large chunks: an array of all their pixels takes 32 MB."""
 
 
 class Compositing(torch.autograd.Function):
-    """Composites screen ellipses front to back over black: image, detached image and alpha, each [h, w, …].
+    """Compositing of screen ellipses front to back over black, to image, detached image and alpha.
 
-    gsplat's rules: alpha at most 0.999, skipped below 1/255; a pixel stops before its transmittance reaches
-    1e-4. The gradient of the detached image reaches only `detached`. `absgrad`: the backward pass sets
-    `means2d.absgrad`, the sums over pixels of the absolute gradients (AbsGS, Ye et al. 2024).
+    The maps are [h, w, …] each. The rules are gsplat's: alpha is at most 0.999 and skipped below 1/255, and a
+    pixel stops before its transmittance reaches 1e-4. The gradient of the detached image reaches only
+    `detached`. With `absgrad`, the backward pass sets `means2d.absgrad`, the sums over pixels of the absolute
+    gradients (AbsGS, Ye et al. 2024).
     """
 
     @staticmethod
@@ -55,7 +56,7 @@ class Compositing(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         parts = (means2d[0], conics[:, :2], variances[:, 1:], opacities[:, None], detached, channels)
         boxes, order = _visible(means2d[0], variances, depths, opacities, width, height)
-        # In depth order, with a transparent Gaussian at the end, which fills up tiles with fewer rows.
+        # In depth order, with a transparent Gaussian at the end, which pads tiles with fewer rows.
         table = F.pad(torch.cat([part[order] for part in parts], dim=1), (0, 1, 0, 1))
         table[:-1, -1] = 1  # accumulates alpha
         table[-1, 2:5] = 1
@@ -107,7 +108,7 @@ class Compositing(torch.autograd.Function):
             means2d.absgrad = scattered(absolute)[None]
         gradients = (scattered(part) for part in g_table[:, :-1].split(ctx.widths, dim=1))
         means, conics, variances, opacities, detached, channels = gradients
-        conics, variances = F.pad(conics, (0, 1)), F.pad(variances, (1, 0))  # the rest follows from these
+        conics, variances = F.pad(conics, (0, 1)), F.pad(variances, (1, 0))  # unused by `forward`
         return means[None], conics, opacities[:, 0], channels, detached, variances, *[None] * 4
 
 
@@ -116,19 +117,20 @@ class _Chunk(NamedTuple):
 
     tiles: Int[Tensor, " b"]
     ranks: Int[Tensor, "b k"]
-    """Rows of the table, front to back."""
+    """Rows of the table that each tile composites, front to back."""
     before: Float[Tensor, "b pixels"]
-    """Transmittance in front of them; 0 where the pixel has stopped."""
+    """Transmittance in front of the rows; 0 where the pixel has stopped."""
 
 
 def _composite(
     rows: Float[Tensor, "b k columns"], chunk: _Chunk, columns: int, detached: int
 ) -> tuple[Float[Tensor, "b pixels c"], Float[Tensor, "b pixels"], tuple[Tensor, Tensor]]:
-    """What a chunk adds to its tiles' maps, the transmittance behind it, and the pixels' offsets from the
-    Gaussians, [b, k, pixels] each. The first `detached` maps have no gradient but that of their channels.
+    """Composite a chunk onto its tiles' maps.
 
-    The quadratic form is steepness·(dx + shear·dy)² + dy²/variance: unlike the conic itself this stays
-    accurate in float32 far from the center of a needle.
+    Returns what it adds, the transmittance behind it, and the pixels' offsets from the Gaussians, [b, k,
+    pixels] each. In the first `detached` maps, only the channels have a gradient. The quadratic form is
+    steepness·(dx + shear·dy)² + dy²/variance. Unlike the conic itself, it stays accurate in float32 far from
+    the center of a needle.
     """
     x, y, a, b, variance, opacity = rows[..., :6, None].unbind(2)
     pixel = torch.arange(TILE * TILE, device=rows.device)
@@ -154,8 +156,8 @@ def _visible(
     width: int,
     height: int,
 ) -> tuple[Int[Tensor, "v 4"], Int[Tensor, " v"]]:
-    """The tiles that each visible Gaussian may reach (first column and row, last column and row), and the
-    indices of these Gaussians, front to back."""
+    """Find the tiles that each visible Gaussian may reach (first column and row, last column and row), and
+    the indices of these Gaussians, front to back."""
     # Alpha falls to 1/255 where the quadratic form equals this; −inf at opacity 0 and NaN both fail the test.
     bound = 2 * torch.log(opacities / ALPHA_MIN)
     reach = (bound.clamp_min(0)[:, None] * variances).sqrt() + REACH_SLACK
@@ -170,7 +172,7 @@ def _visible(
 def _chunks(
     boxes: Int[Tensor, "v 4"], passing: Float[Tensor, "tiles pixels"], columns: int
 ) -> Iterator[_Chunk]:
-    """All rows, front to back; the caller writes the transmittance behind each chunk to `passing`."""
+    """Yield all rows front to back. The caller writes the transmittance behind each chunk to `passing`."""
     ends = torch.cumsum((boxes[:, 2:] - boxes[:, :2] + 1).prod(1), 0).tolist()
     first = 0
     while first < len(ends):
@@ -184,7 +186,7 @@ def _chunks(
 def _rows(
     boxes: Int[Tensor, "v 4"], live: Bool[Tensor, " tiles"], columns: int
 ) -> tuple[Int[Tensor, " r"], Int[Tensor, " tiles"]]:
-    """The Gaussians in each live tile, tile by tile and front to back, and their numbers."""
+    """List the Gaussians in each live tile, tile by tile and front to back, and count them per tile."""
     wide, high = (boxes[:, 2:] - boxes[:, :2] + 1).unbind(1)
     area = wide * high
     ranks = torch.repeat_interleave(area)
@@ -199,7 +201,7 @@ def _rows(
 def _cut(
     ranks: Int[Tensor, " r+1"], count: Int[Tensor, " tiles"], passing: Float[Tensor, "tiles pixels"]
 ) -> Iterator[_Chunk]:
-    """Chunks of tiles with similar numbers of rows; the last of `ranks` fills up the shorter ones."""
+    """Yield chunks of tiles with similar numbers of rows. The last of `ranks` pads the shorter ones."""
     start = torch.cumsum(count, 0) - count
     count, tiles = torch.sort(count, descending=True)
     start, at_a_time = start[tiles], TILES.get(ranks.device.type, MOST_TILES)
@@ -214,7 +216,7 @@ def _cut(
 def _in_tiles(
     maps: tuple[Tensor | None, ...], sizes: tuple[int, ...], like: Tensor, columns: int, size: tuple[int, int]
 ) -> Float[Tensor, "tiles pixels c"]:
-    """Maps as tiles, 0 outside the image and for a missing one."""
+    """Arrange maps as tiles, with 0 outside the image and for a missing map."""
     height, width = size
     found = like.new_zeros(-(-height // TILE) * TILE, columns * TILE, sum(sizes))
     for part, given in zip(found.split(sizes, dim=2), maps, strict=True):

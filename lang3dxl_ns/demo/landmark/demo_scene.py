@@ -1,4 +1,4 @@
-"""Settings of a demo scene, separate from the work so that the help of `lang3dxl demo-scene` starts fast."""
+"""Settings of a demo scene, apart from the generator so that `lang3dxl demo-scene --help` starts fast."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ class DemoScene:
     """Generate a demo scene: photos of a procedural landmark."""
 
     out: Path
-    """Folder to write; must be empty or missing."""
+    """Folder to write to. It must be empty or missing."""
     seed: int = 0
-    """The same seed gives the same bytes."""
+    """Seed of the random choices. The same seed gives the same bytes."""
     family: Literal["cathedral", "mosque", "hall", "auto"] = "auto"
-    """Kind of building; auto: chosen by the seed."""
+    """Kind of building. With auto, the seed chooses it."""
     photos: int = 48
     """Number of photos, 4 to 9999."""
     wild: bool = True
-    """Like photos from the Internet: sizes, lenses, weather, exposures and passers-by vary. --no-wild:
-    one camera, one sun, no people."""
+    """Vary sizes, lenses, weather, exposures and passers-by as in photos from the Internet. --no-wild uses
+    one camera, one sun and no people."""
     width: int = 480
-    """Pixels of a landscape photo; wild photos are smaller."""
+    """Width of a landscape photo, pixels. Wild photos are smaller."""
     height: int = 360
-    """Pixels of a landscape photo."""
+    """Height of a landscape photo, pixels."""
     test_views: int = 24
-    """Novel views for scoring (test_views/): cameras like the photos', plain light, no people. 0: none."""
+    """Number of novel views for scoring (test_views/), with cameras like the photos', plain lighting and no
+    people. 0 makes none."""
     workers: int | None = None
-    """Number of processes; by default one per CPU core."""
+    """Number of processes. The default is one per CPU core."""

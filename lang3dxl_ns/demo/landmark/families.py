@@ -1,4 +1,4 @@
-"""Three families of landmarks, each a grammar over the vocabulary's parts. Façades look along +x."""
+"""Three families of landmarks, each a grammar over the vocabulary's parts. Façades face +x."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ SIDES = ((LEFT, 1), (RIGHT, -1))
 
 
 def cathedral(b: Builder) -> None:
-    """A nave with aisles, optional transept and apse, and no, one or two towers."""
+    """Build a nave with aisles, an optional transept and apse, and up to two towers."""
     width, length, height = b.between(10, 14), b.between(30, 46), b.between(14, 22)
     ridge = width * b.between(0.5, 0.95)
     aisle, aisle_height = width * b.between(0.4, 0.55), height * b.between(0.45, 0.58)
     tower_width, tower_height = width * b.between(0.55, 0.75), height * b.between(1.35, 2.0)
-    b.facade_height = tower_height * 1.3  # including what is on the towers
+    b.facade_height = tower_height * 1.3  # with what stands on the towers
 
     b.box("wall", "wall", (-length / 2, 0, 0), (length, width, height))
     b.gable("roof", "roof", (-length / 2, 0, height), width * 1.07, length, ridge, yaw=math.pi / 2)
@@ -133,10 +133,10 @@ def _west_front(b: Builder, width, height, aisle, tower_width, tower_height) -> 
 
 
 def mosque(b: Builder) -> None:
-    """A domed prayer hall with one to six minarets, sometimes with a court in front."""
+    """Build a domed prayer hall with one to six minarets, sometimes with a court in front."""
     width = b.between(20, 31)
     depth, height, radius = width * b.between(0.8, 1.1), b.between(9, 13), width * b.between(0.22, 0.31)
-    b.facade_height = height * 2.8  # including its minarets
+    b.facade_height = height * 2.8  # with its minarets
     b.box("wall", "wall", (0, 0, 0), (depth, width, height))
     b.box("wall", "trim", (0, 0, height - 0.5), (depth * 1.02, width * 1.02, 0.9))
     shoulder = height * b.between(0.25, 0.5)
@@ -167,7 +167,7 @@ def mosque(b: Builder) -> None:
 
 
 def _court(b: Builder, width, depth, height) -> float:
-    """An arcaded court in front of the hall; returns x of its front."""
+    """Build an arcaded court in front of the hall, and return x of its front."""
     reach, wall = depth * b.between(0.6, 0.9), height * 0.55
     window_row(b, "wall", (depth / 2, 0, height * 0.6), FRONT, width * 0.9, height * 0.3)
     for facing, side in SIDES:
@@ -217,10 +217,10 @@ def _minarets(b: Builder, width, depth, height, front, court) -> None:
 
 
 def hall(b: Builder) -> None:
-    """A synagogue-like hall: a large cube under one dome, or a house between two towers."""
+    """Build a synagogue-like hall: a large cube under one dome, or a house between two towers."""
     width, height = b.between(14, 20), b.between(11, 15)
     depth = width * b.between(0.9, 1.4)
-    b.facade_height = height * 2.1  # including its dome or towers
+    b.facade_height = height * 2.1  # with its dome or towers
     b.box("wall", "wall", (0, 0, 0), (depth, width, height))
     b.box("wall", "trim", (0, 0, height - 0.5), (depth * 1.03, width * 1.03, 0.8))
     if b.chance(0.55):

@@ -36,11 +36,11 @@ class Landmark:
     height: float
     """Height of the building, meters."""
     obstacles: Float[Array, "n 2 3"]
-    """Bounds (lower and upper corner) of everything but the ground, to keep cameras and people out."""
+    """Bounds (lower and upper corner) of everything but the ground, which keep cameras and people out."""
 
     @classmethod
     def from_seed(cls, seed: int, family: str | None = None) -> Landmark:
-        """The landmark of this seed; without a family (or with "auto") the seed chooses it too.
+        """Build the landmark of this seed, which also chooses the family if it is None or "auto".
 
         Raises UserError for an unknown family.
         """
@@ -61,7 +61,7 @@ class Landmark:
         )  # fmt: skip
 
     def is_free(self, point, margin: float) -> bool:
-        """Whether nothing is within `margin` meters of a point (by bounding boxes)."""
+        """Return whether nothing is within `margin` meters of a point (by bounding boxes)."""
         low, high = self.obstacles[:, 0], self.obstacles[:, 1]
         point = np.asarray(point)
         return not ((point > low - margin) & (point < high + margin)).all(axis=1).any()

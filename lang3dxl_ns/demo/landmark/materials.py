@@ -42,7 +42,7 @@ _KINDS: dict[str, tuple[tuple[float, float, float], str, float]] = {
 }
 
 MATERIALS = ("sky", *_KINDS)
-"""Index order of `Shot.materials`."""
+"""Names in the index order of `Shot.materials`."""
 MASONRY = (
     *("limestone", "sandstone", "granite", "marble"),
     *("red brick", "yellow brick", "plaster", "banded stone"),
@@ -52,7 +52,7 @@ COVERING = ("slate", "clay tile", "glazed tile", "lead", "copper", "gold")
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A material of one landmark: `name` in MATERIALS, its color, texture scale and texture seed."""
+    """Material of one landmark: `name` in MATERIALS, its color, texture scale and texture seed."""
 
     name: str
     color: tuple[float, float, float]
@@ -62,7 +62,7 @@ class Material:
     gloss: float
 
     def reflectance(self, s: np.ndarray, t: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """Colors [n, 3] at texture coordinates; details finer than the footprint (meters) fade out."""
+        """Compute colors [n, 3] at texture coordinates. Details below the footprint (meters) fade out."""
         gray = _PATTERNS[self.pattern](s / self.scale, t / self.scale, footprint / self.scale, self.seed)
         weather = 1 + 0.25 * (_noise(s * 0.11, t * 0.05, self.seed + 7) - 0.5)
         colors = floats(self.color) * (gray * weather)[:, None]
@@ -74,7 +74,7 @@ class Material:
 
 
 def make_material(name: str, rng: np.random.Generator, tint: float = 0.04) -> Material:
-    """A landmark's version of a material: brighter or darker, and warmer or colder by up to `tint`."""
+    """Make a landmark's version of a material, brighter or darker, and warmer or colder by up to `tint`."""
     color, pattern, gloss = _KINDS[name]
     if name == "glazed tile" and rng.random() < 0.4:
         color = [(0.08, 0.18, 0.45), (0.12, 0.38, 0.22), (0.45, 0.42, 0.36)][rng.integers(3)]
@@ -85,14 +85,14 @@ def make_material(name: str, rng: np.random.Generator, tint: float = 0.04) -> Ma
 
 
 def colored(name: str, rng: np.random.Generator) -> Material:
-    """Cloth or paint of a random color."""
+    """Make cloth or paint of a random color."""
     material = make_material(name, rng)
     r, g, b = rng.uniform(0.03, 0.75, 3).tolist()
     return replace(material, color=(r, g, b))
 
 
 def _random_tables() -> tuple[np.ndarray, np.ndarray]:
-    """White noise per cell [128, 128], and smooth periodic noise, 16 samples a period [512, 512]."""
+    """Make white noise per cell [128, 128], and smooth periodic noise, 16 samples per period [512, 512]."""
     rng = np.random.default_rng(20)
     white = rng.random((128, 128), dtype=np.float32)
     lattice = rng.random((32, 32), dtype=np.float32)
@@ -107,33 +107,33 @@ _WHITE, _SMOOTH = _random_tables()
 
 
 def _cell(i, j, seed: int) -> np.ndarray:
-    """A random number in [0, 1) for every cell (i, j)."""
+    """Look up a random number in [0, 1) for every cell (i, j)."""
     row, column = (j.astype(np.int32) + 17 * seed) & 127, (i.astype(np.int32) + 31 * seed) & 127
-    return _WHITE.take(row * 128 + column)  # faster than two indices
+    return _WHITE.take(row * 128 + column)  # faster than indexing with two arrays
 
 
 def _noise(x, y, seed: int = 0) -> np.ndarray:
-    """Smooth noise in [0, 1] with features one unit in size."""
+    """Compute smooth noise in [0, 1] with features one unit in size."""
     row = ((y * 16).astype(np.int32) + 91 * seed) & 511
     column = ((x * 16).astype(np.int32) + 37 * seed) & 511
     return _SMOOTH.take(row * 512 + column)
 
 
 def fractal_noise(x, y, seed: int, octaves: int = 4) -> np.ndarray:
-    """Sum of noise octaves of halving size and weight, in [0, 1]."""
+    """Sum noise octaves of halving size and weight, scaled to [0, 1]."""
     total = sum(_noise(x * 2**i, y * 2**i, seed + i) / 2**i for i in range(octaves))
     return total / (2 - 2 ** (1 - octaves))
 
 
 def _fade(size: float, footprint) -> np.ndarray:
-    """1 if a detail of this size is resolved, 0 if it is finer than two footprints."""
+    """Return 1 if a detail of this size is resolved, falling to 0 if it is finer than one footprint."""
     return np.clip(size / (2 * footprint) - 0.5, 0, 1)
 
 
 def _courses(
     s, t, footprint, seed: int, width: float, height: float, joint: float, contrast: float
 ) -> np.ndarray:
-    """Masonry: courses of slightly different gray stones with dark joints."""
+    """Render masonry: courses of stones in slightly different grays, with dark joints."""
     row = np.floor(t / height)
     x = s / width + 0.5 * np.mod(row, 2)
     column = np.floor(x)

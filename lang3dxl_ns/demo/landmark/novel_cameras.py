@@ -11,18 +11,18 @@ from lang3dxl_ns.demo.landmark.raycast import Camera
 from lang3dxl_ns.demo.landmark.shading import trace
 
 EACH = 5
-"""Minimum number of views that show a category (a third of the views if there are fewer than 15)."""
+"""Minimum number of views that show each category, or a third of the views if there are fewer than 15."""
 _THUMBNAIL = 4
-"""Cameras are chosen on pictures smaller by this factor, requiring twice the share that counts as shown."""
+"""Factor by which the pictures for choosing cameras are smaller. They require twice the share that counts as
+shown."""
 _MOST_DRAWN = 50
-"""Cameras sampled per wanted one, before any is accepted."""
+"""Number of cameras sampled per requested one before any camera is accepted."""
 
 
 def choose_cameras(landmark: Landmark, count: int, wild: bool, size: tuple[int, int]) -> list[Camera]:
-    """`count` cameras of the landmark, the same at every call.
+    """Choose `count` cameras of the landmark, the same in every call. `size` is (width, height) in pixels.
 
-    A camera is accepted if all categories can still get their views from the remaining ones. size: width
-    and height in pixels.
+    A camera is accepted if all categories can still get their views from the remaining ones.
     """
     rng = np.random.default_rng([landmark.seed, 5])
     lacking = dict.fromkeys(_categories(landmark), min(EACH, count // 3))
@@ -41,14 +41,14 @@ def choose_cameras(landmark: Landmark, count: int, wild: bool, size: tuple[int, 
 
 
 def _categories(landmark: Landmark) -> list[str]:
-    """Categories that the landmark contains."""
+    """List the categories that the landmark contains."""
     parts = np.array([shape.part for shape in landmark.shapes])
     elements = np.array([shape.element for shape in landmark.shapes])
     return [category for category, found in category_masks(parts, elements).items() if found.any()]
 
 
 def _shown(landmark: Landmark, camera: Camera, size: tuple[int, int]) -> set[str]:
-    """Categories visible from a camera."""
+    """Find the categories visible from a camera."""
     width, height = (max(length // _THUMBNAIL, 1) for length in size)
     seen = trace(landmark.shapes, camera, plain_view(camera).weather, width, height)
     masks = category_masks(seen.spread(seen.part), seen.spread(seen.element))

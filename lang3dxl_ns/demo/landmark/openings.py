@@ -15,11 +15,11 @@ DOORS = ("leaves", "panels", "tympanum", "open")
 
 @dataclass(frozen=True, eq=False)
 class Openings(Shape):
-    """Columns × rows of equal openings on the plane x = 0, facing +x; y across, z up from 0.
+    """Columns × rows of equal openings on the plane x = 0, facing +x, with y across and z up from 0.
 
-    Each is `width` × `height` meters in the middle of a tile of the `field` (meters). The reveal steps inward
-    in `orders`, each `step` meters narrower and depth / orders deeper, as in portals. A band of the trim,
-    `surround` meters wide, runs around the opening; it belongs to the wall.
+    Each opening is `width` × `height` meters, in the middle of a tile of the `field` (meters). The reveal
+    steps inward in `orders`, each `step` meters narrower and depth / orders deeper, as in portals. A band of
+    the trim, `surround` meters wide, runs around the opening and belongs to the wall.
     """
 
     trim_material: int
@@ -29,9 +29,9 @@ class Openings(Shape):
     width: float
     height: float
     outline: str
-    """round, pointed or (flat) segment: arches; rectangle: a lintel; circle: an oculus."""
+    """Outline: a round, pointed or (flat) segment arch, a rectangle (lintel), or a circle (oculus)."""
     filling: str
-    """How the innermost surface looks: see _filling."""
+    """Look of the innermost surface, one of the cases of `_filling`."""
     depth: float
     orders: int
     step: float
@@ -53,7 +53,7 @@ class Openings(Shape):
         y, z = origin[1] + t * direction[1], origin[2] + t * direction[2]
         w, h = self.field
         hit = (direction[0] < 0) & (t > NEAREST) & (np.abs(y) < w / 2) & (z >= 0) & (z < h)
-        # The outline costs more than the plane: compute it only where the plane is hit.
+        # The outline costs more than the plane, so it is computed only where the plane is hit.
         inside = np.flatnonzero(hit)
         if len(inside):
             u, v = self._tile(y.ravel()[inside], z.ravel()[inside])
@@ -90,14 +90,14 @@ class Openings(Shape):
         )  # fmt: skip
 
     def _tile(self, y, z):
-        """Coordinates in the opening's own tile: u from its center line, v from its sill."""
+        """Return coordinates in the opening's own tile: u from its center line, v from its sill."""
         w, h = self.field[0] / self.columns, self.field[1] / self.rows
         u = np.mod(y + self.field[0] / 2, w) - w / 2
         sill = 0.0 if self.rows == 1 else (h - self.height) / 2
         return u, np.mod(z, h) - sill
 
     def _inside(self, u, v):
-        """Signed distance to the outline, meters, positive inside the opening."""
+        """Compute the signed distance to the outline, meters, positive inside the opening."""
         half, height = self.width / 2, self.height
         au = np.abs(u)
         if self.outline == "circle":
@@ -117,18 +117,18 @@ class Openings(Shape):
             arch = np.minimum(radius - np.hypot(u, v - height + radius), half - au)
         else:
             arch = half - np.hypot(u, v - spring)
-        # Portals reach the ground: no band below them.
+        # Portals reach the ground, so there is no band below them.
         foot = v if self.filling not in DOORS else np.maximum(v, 1e-3)
         return np.where(v < spring, np.minimum(half - au, foot), arch)
 
     def _normal(self, u, v, jamb):
-        """Outward on the wall and the filling; towards the opening's axis on the reveal."""
+        """Return normals: outward on the wall and the filling, towards the opening's axis on the reveal."""
         rise = np.maximum(v - (self.height - self.width / 2), 0) if self.outline != "rectangle" else 0 * v
         length = np.maximum(np.hypot(u, rise), 1e-6)
         return np.where(jamb, 0.0, 1.0), np.where(jamb, -u / length, 0.0), np.where(jamb, -rise / length, 0.0)
 
     def _sunlit(self, s, t, depth, sun):
-        """Whether the sun reaches a point at `depth` through the outline."""
+        """Return 1 where the sun reaches a point at `depth` through the outline, else 0."""
         if sun[0] <= 0.02:
             return np.zeros_like(s)
         through = depth / sun[0]
@@ -136,7 +136,7 @@ class Openings(Shape):
         return np.where(lit | (depth == 0), 1.0, 0.0)
 
     def _filling(self, u, v, inset):
-        """Where bars (of the trim) and dark lines cross the innermost surface."""
+        """Find where bars (of the trim) and dark lines cross the innermost surface."""
         half, height = self.width / 2, self.height
         none = np.zeros(np.shape(u), bool)
         bar = max(0.045 * self.width, 0.05)

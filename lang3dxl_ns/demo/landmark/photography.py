@@ -1,4 +1,4 @@
-"""Photos of a landmark, wild as by many strangers or calm as by one careful photographer."""
+"""Photos of a landmark: wild, as if by many strangers, or calm, as if by one careful photographer."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from lang3dxl_ns.demo.landmark.shapes import MISS, Shape, floats
 from lang3dxl_ns.demo.landmark.surroundings import passers_by
 
 SMALLEST_SHARE = 0.18
-"""Share of the picture: photos with less of the building are not taken."""
+"""Least share of a picture that the building must fill. Photos with less are not taken."""
 NARROWEST = 0.38
-"""Least width that a picture shows, in radii of the landmark."""
+"""Least width that a picture must show, in radii of the landmark."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Camera and development settings."""
+    """Settings of the camera and of the development."""
 
     exposure: float
     white_balance: tuple[float, float, float]
     gamma: float
     noise: float
-    """Standard deviation, for values from 0 to 1."""
+    """Standard deviation of the noise, for values from 0 to 1."""
     noise_seed: int
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One photo to take: camera, weather, lens, and passers-by."""
+    """A photo to take: camera, weather, lens, and passers-by."""
 
     camera: Camera
     weather: Weather
@@ -45,12 +45,12 @@ class View:
     passers_by: tuple[Shape, ...]
     """People and cars that appear in no other photo."""
     passers_by_materials: tuple[Material, ...]
-    """Their materials, numbered after the landmark's."""
+    """Materials of the passers-by, numbered after the landmark's."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A photo and its exact per-pixel truth."""
+    """Photo with its exact ground truth per pixel."""
 
     image: UInt8[Array, "h w 3"]
     parts: UInt8[Array, "h w"]
@@ -64,10 +64,10 @@ class Shot:
 
 
 def random_view(landmark: Landmark, rng: np.random.Generator, wild: bool = True) -> View:
-    """A view that shows a good part of the building.
+    """Choose a view that shows a good part of the building.
 
-    Wild: distances vary 6×, focal lengths 4×, any weather and exposure, passers-by. Calm: one focal length,
-    one weather, one exposure, no people, a smaller range of distances.
+    In wild views, distances vary 6× and focal lengths 4×, with any weather and exposure, and with passers-by.
+    Calm views have one focal length, one weather, one exposure, no people, and a smaller range of distances.
     """
     camera = random_camera(landmark, rng, wild)
     if not wild:
@@ -79,15 +79,13 @@ def random_view(landmark: Landmark, rng: np.random.Generator, wild: bool = True)
 
 
 def plain_view(camera: Camera) -> View:
-    """A camera's view in plain daylight without people."""
+    """Return a camera's view in plain daylight without people."""
     return View(camera, _CALM_WEATHER, _CALM_LENS, (), ())
 
 
 def take_photo(landmark: Landmark, view: View, width: int, height: int, oversampling: int = 1) -> Shot:
-    """The photo and its labels, at the given size in pixels.
-
-    Colors are means of oversampling² rays per pixel; labels and depth are those of the pixel's central ray.
-    """
+    """Take the photo and its labels at the given size in pixels. Colors are means of oversampling² rays per
+    pixel; labels and depth are those of the pixel's central ray."""
     first = len(landmark.materials)
     crowd = tuple(replace(shape, material=shape.material + first) for shape in view.passers_by)
     shapes = landmark.shapes + crowd
@@ -110,7 +108,7 @@ def take_photo(landmark: Landmark, view: View, width: int, height: int, oversamp
 
 
 def random_photo_size(rng: np.random.Generator, width: int, height: int) -> tuple[int, int]:
-    """Width and height of a wild photo: other sizes and aspect ratios than given, sometimes portrait."""
+    """Choose width and height of a wild photo: varied in size and aspect ratio, and sometimes portrait."""
     shape = float(rng.choice([width / height, 4 / 3, 3 / 2, 16 / 9, 1.0], p=[0.4, 0.2, 0.2, 0.1, 0.1]))
     area = width * height * float(rng.choice([1.0, 0.8, 0.64]))
     long, short = round(math.sqrt(area * shape) / 2) * 2, round(math.sqrt(area / shape) / 2) * 2
@@ -125,7 +123,7 @@ _CALM_LENS = Lens(exposure=1.4, white_balance=(1.0, 1.0, 1.0), gamma=1.0, noise=
 
 
 def random_camera(landmark: Landmark, rng: np.random.Generator, wild: bool) -> Camera:
-    """A camera for a photo: not inside an obstacle, and with enough of the building in view."""
+    """Choose a camera that is not inside an obstacle and has enough of the building in view."""
     seen: list[tuple[float, Camera]] = []
     for _ in range(60):
         camera = _propose_camera(landmark, rng, wild)
@@ -148,7 +146,7 @@ def _propose_camera(landmark: Landmark, rng: np.random.Generator, wild: bool) ->
     if rng.random() < 0.35:
         eye = landmark.height * rng.uniform(0.1, 1.1)  # balconies, hills, drones
         distance = max(distance, landmark.radius * 1.2)
-    if distance - 0.6 * landmark.radius < NARROWEST * landmark.radius * focal:  # about its walls' distance
+    if distance - 0.6 * landmark.radius < NARROWEST * landmark.radius * focal:  # about to its walls
         return None
     x, y, _ = landmark.center
     position = np.array([x + math.cos(azimuth) * distance, y + math.sin(azimuth) * distance, eye])
@@ -163,7 +161,7 @@ def _propose_camera(landmark: Landmark, rng: np.random.Generator, wild: bool) ->
 
 
 def _building_share(landmark: Landmark, camera: Camera) -> float:
-    """Share of the picture that the building fills, from a thumbnail."""
+    """Estimate the share of the picture that the building fills, from a thumbnail."""
     solids = [shape for shape in landmark.shapes if shape.casts_shadow]  # windows lie on these
     _, index = cast(solids, camera, 32, 24)
     parts = np.array([*(shape.part for shape in solids), PART["sky"]], dtype=np.uint8)[index]
@@ -171,7 +169,7 @@ def _building_share(landmark: Landmark, camera: Camera) -> float:
 
 
 def _spot_in_front(landmark: Landmark, camera: Camera, rng: np.random.Generator):
-    """A free place on the ground within the view."""
+    """Find a free place on the ground within the view."""
     for _ in range(8):
         away = math.exp(rng.uniform(math.log(9.0), math.log(60.0)))
         aside = rng.uniform(-0.5, 0.5) / camera.focal * away
@@ -224,7 +222,7 @@ _TONE = np.linspace(0, 1, 4096, dtype=np.float32)
 
 
 def _develop(color: Float[Array, "h w 3"], lens: Lens) -> UInt8[Array, "h w 3"]:
-    """Exposure, white balance, film-like shoulder, gamma and noise."""
+    """Apply exposure, white balance, a film-like shoulder, gamma and noise."""
     linear = color * (lens.exposure * floats(lens.white_balance))
     shoulder = np.minimum(_TONE * 2.0, 1.6)
     curve = (shoulder * (1 + shoulder / 2.56) / (1 + shoulder)) ** (1 / 2.1 * lens.gamma)

@@ -15,20 +15,18 @@ from lang3dxl_ns.demo.landmark.shapes import MISS, NEAREST, Shape, Vector
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera with its principal point at the photo's center.
-
-    World in meters, z up; camera frame x right, y down, z forward (COLMAP's).
-    """
+    """Pinhole camera with its principal point at the photo's center. The world is in meters, z up; the camera
+    frame is x right, y down, z forward (COLMAP's)."""
 
     position: Float[Array, "3"]
     rotation: Float[Array, "3 3"]
-    """World to camera: the rows are right, down and forward."""
+    """Rotation from world to camera. The rows are right, down and forward."""
     focal: float
-    """In units of the photo's longer side, so independent of resolution."""
+    """Focal length in units of the photo's longer side, so independent of resolution."""
 
     @classmethod
     def looking_at(cls, position, target, focal: float, roll: float = 0.0) -> Camera:
-        """A camera at `position` looking at `target`, upright but for the roll (radians)."""
+        """Build a camera at `position` that looks at `target`, upright except for the roll (radians)."""
         position = np.asarray(position, dtype=np.float64)
         forward = np.asarray(target, dtype=np.float64) - position
         forward /= np.linalg.norm(forward)
@@ -39,14 +37,14 @@ class Camera:
         return cls(position, np.stack([c * right + s * down, c * down - s * right, forward]), focal)
 
     def project(self, points: Float[Array, "n 3"], width: int, height: int) -> Float[Array, "n 3"]:
-        """Pixels x, y (origin at the corner of the top-left pixel) and depth of world points."""
+        """Project world points to pixels x, y (origin at the corner of the top-left pixel) and depth."""
         x, y, z = self.rotation @ (points - self.position).T
         f = self.focal * max(width, height)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.stack([f * x / z + width / 2, f * y / z + height / 2, z], axis=1)
 
     def rays(self, width: int, height: int) -> tuple[Vector, Vector]:
-        """Origin and directions through the pixel centers; one unit along a ray is one meter of depth."""
+        """Return origin and directions through pixel centers. A unit along a ray is one meter of depth."""
         f = self.focal * max(width, height)
         right, down, forward = self.rotation.astype(np.float32)
         x = ((np.arange(width, dtype=np.float32) + 0.5 - width / 2) / f)[None, :]
@@ -56,7 +54,7 @@ class Camera:
         return (origin[0], origin[1], origin[2]), (direction[0], direction[1], direction[2])
 
     def screen_boxes(self, corners: Float[Array, "n 8 3"], width: int, height: int) -> tuple[Array, Array]:
-        """Pixels x0, y0, x1, y1 [n, 4] that the convex hulls may cover, and their smallest depths [n]."""
+        """Return pixels x0, y0, x1, y1 [n, 4] that the hulls may cover, and their smallest depths [n]."""
         x, y, z = self.project(corners.reshape(-1, 3), width, height).T.reshape(3, -1, 8)
         boxes, nearest = _pixel_boxes(x, y, width, height), z.min(axis=1)
         boxes[nearest < NEAREST] = 0, 0, width, height  # partly behind the camera: the whole picture
@@ -73,7 +71,7 @@ class SunCamera:
     extent: float
 
     def project(self, points: Float[Array, "n 3"], width: int, height: int) -> Float[Array, "n 3"]:
-        """Shadow map coordinates and distance from the sun's plane in meters."""
+        """Project world points to shadow map coordinates and the distance from the sun's plane in meters."""
         x, y, z = self.rotation.astype(np.float32) @ (points - self.center).astype(np.float32).T
         f = width / self.extent
         return np.stack([f * x + width / 2, f * y + height / 2, z + 2 * self.extent], axis=1)
@@ -87,7 +85,7 @@ class SunCamera:
         return (origin[0], origin[1], origin[2]), (forward[0], forward[1], forward[2])
 
     def screen_boxes(self, corners: Float[Array, "n 8 3"], width: int, height: int) -> tuple[Array, Array]:
-        """As for a pinhole camera."""
+        """Return pixel boxes and smallest depths, as `Camera.screen_boxes` does."""
         x, y, z = self.project(corners.reshape(-1, 3), width, height).T.reshape(3, -1, 8)
         return _pixel_boxes(x, y, width, height), z.min(axis=1)
 
@@ -95,7 +93,7 @@ class SunCamera:
 def cast(
     shapes: Sequence[Shape], camera: Camera | SunCamera, width: int, height: int
 ) -> tuple[Float[Array, "h w"], Int16[Array, "h w"]]:
-    """Depth (meters, MISS without a hit) and index of the nearest shape (-1 without a hit)."""
+    """Find depth (meters, MISS without a hit) and index of the nearest shape (-1 without a hit)."""
     origin, direction = camera.rays(width, height)
     depth = np.full((height, width), MISS, dtype=np.float32)
     index = np.full((height, width), -1, dtype=np.int16)
@@ -124,6 +122,6 @@ def _crop(vector: Vector, part: tuple[slice, slice]) -> Vector:
 
 
 def _pixel_boxes(x: Float[Array, "n 8"], y: Float[Array, "n 8"], width: int, height: int) -> Array:
-    """x0, y0, x1, y1 around projected corners, with a pixel of margin, clipped to the picture."""
+    """Return x0, y0, x1, y1 around projected corners, with a pixel of margin, clipped to the picture."""
     box = np.stack([x.min(axis=1) - 1, y.min(axis=1) - 1, x.max(axis=1) + 2, y.max(axis=1) + 2], axis=1)
     return np.clip(np.nan_to_num(box), 0, [width, height, width, height]).astype(np.int64)

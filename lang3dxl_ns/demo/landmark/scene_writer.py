@@ -1,4 +1,4 @@
-"""Demo scene generator: a procedural landmark as photos, COLMAP model, masks and ground truth."""
+"""Generator of demo scenes: a procedural landmark as photos, COLMAP model, masks and ground truth."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ from lang3dxl_ns.scene.colmap import TrackedPhoto
 from lang3dxl_ns.scene.novel_views import FOLDER, write_novel_cameras
 
 HELD_OUT_EVERY = 8
-"""nerfstudio's interval split: of the photos sorted by name, 0, 8, 16 … are held out."""
+"""Interval of nerfstudio's split: of the photos sorted by name, 0, 8, 16 … are held out."""
 TRUTH_EVERY = 2
-"""Every second photo has ground truth, including the held-out ones."""
+"""Interval of the photos that have ground truth. They include the held-out ones."""
 OVERSAMPLING = 2
-"""Rays per pixel along each axis."""
+"""Number of rays per pixel along each axis."""
 TEST_POINTS = 100
-"""Surface points per test view, for the distance of what it shows."""
+"""Number of surface points per test view, which give the distance of what it shows."""
 
 
 @dataclass(frozen=True)
 class _Order:
-    """One photo or test view for a worker to render."""
+    """Job of a worker: one photo or test view to render."""
 
     number: int
     seed: int
@@ -65,7 +65,7 @@ class _Order:
     points: int
     folder: Path
     test_camera: Camera | None = None
-    """For a test view; photos choose their own."""
+    """Camera of a test view; None for photos, which choose their own."""
 
     @property
     def name(self) -> str:
@@ -73,7 +73,7 @@ class _Order:
 
 
 def write_scene(scene: DemoScene) -> Path:
-    """Write images/, masks/, sparse/0/, ground_truth/, test_views/ and scene.json; returns the folder.
+    """Write images/, masks/, sparse/0/, ground_truth/, test_views/ and scene.json, and return the folder.
 
     The folder appears once everything is written. Raises UserError for a folder that is not empty, and for
     invalid numbers.
@@ -106,7 +106,7 @@ def write_scene(scene: DemoScene) -> Path:
         write_novel_cameras(unfinished, geometries, same_light=not scene.wild)
     _write_description(unfinished, landmark, scene, similarity)
     if out.exists():
-        out.rmdir()  # it is empty: checked above
+        out.rmdir()  # `_check` found it empty
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished.rename(out)
     return out
@@ -115,7 +115,7 @@ def write_scene(scene: DemoScene) -> Path:
 def photo_view(
     landmark: Landmark, seed: int, number: int, wild: bool, size: tuple[int, int]
 ) -> tuple[View, int, int]:
-    """The view of photo `number` of a scene, and its width and height in pixels."""
+    """Return the view of photo `number` of a scene, and its width and height in pixels."""
     rng = np.random.default_rng([seed, 2, number])
     width, height = random_photo_size(rng, *size) if wild else size
     return random_view(landmark, rng, wild), width, height
@@ -137,9 +137,9 @@ def _check(scene: DemoScene, out: Path) -> None:
 
 
 def _taken(orders: list[_Order], workers: int | None) -> Iterator[TakenPhoto]:
-    """Photos in their order, taken by a process pool, with a progress bar."""
+    """Yield photos in order, taken by a process pool, with a progress bar."""
     workers = min(workers or os.cpu_count() or 1, len(orders))
-    # Spawned processes: forked ones would inherit this one's threads and loaded libraries.
+    # Processes are spawned, because forked ones would inherit this one's threads and loaded libraries.
     context = multiprocessing.get_context("spawn")
     with progress("taking photos", len(orders)) as advance, ProcessPoolExecutor(workers, context) as pool:
         for photo in pool.map(_take, orders):
@@ -153,7 +153,7 @@ def _landmark(seed: int, family: str) -> Landmark:
 
 
 def _take(order: _Order) -> TakenPhoto:
-    """In a worker: take one photo and write its files."""
+    """Take one photo and write its files, in a worker."""
     landmark = _landmark(order.seed, order.family)
     if order.test_camera is not None:
         return _take_test_view(landmark, order.test_camera, order)
@@ -173,7 +173,7 @@ def _take(order: _Order) -> TakenPhoto:
 
 
 def _take_test_view(landmark: Landmark, camera: Camera, order: _Order) -> TakenPhoto:
-    """In a worker: take a test view and write its picture, mask and labels (white on black)."""
+    """Take a test view and write its picture, mask and labels (white on black), in a worker."""
     shot, name = take_photo(landmark, plain_view(camera), *order.size, OVERSAMPLING), f"{order.name}.png"
     masks = {f"ground_truth/{c}": mask for c, mask in category_masks(shot.parts, shot.elements).items()}
     masks = {place: mask for place, mask in masks.items() if mask.mean() >= SMALLEST_POSITIVE}
@@ -188,7 +188,7 @@ def _take_test_view(landmark: Landmark, camera: Camera, order: _Order) -> TakenP
 
 
 def _tracked(view: TakenPhoto, similarity: Similarity) -> TrackedPhoto:
-    """A test view's camera in the COLMAP model's world."""
+    """Convert a test view's camera to the COLMAP model's world."""
     focal, points = view.camera.focal * max(view.width, view.height), similarity.apply(view.points)
     return TrackedPhoto(
         name=f"{view.number:04d}.jpg",
@@ -200,7 +200,8 @@ def _tracked(view: TakenPhoto, similarity: Similarity) -> TrackedPhoto:
 
 
 def _write_truth(shot: Shot, save_photo, order: _Order) -> None:
-    """HolyScenes' layout: for each category in the photo, object black on white, and a copy of the photo."""
+    """Write HolyScenes' layout: for each category in the photo, object black on white, and the photo's
+    copy."""
     for category, mask in category_masks(shot.parts, shot.elements).items():
         if mask.mean() < SMALLEST_POSITIVE:
             continue

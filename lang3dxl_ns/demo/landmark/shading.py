@@ -1,4 +1,4 @@
-"""Shading: from ray hits to a linear picture, with sun, sky and haze."""
+"""Shading: a linear picture from ray hits, with sun, sky and haze."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from lang3dxl_ns.demo.landmark.raycast import Camera, SunCamera, cast
 from lang3dxl_ns.demo.landmark.shapes import Shape, floats
 
 SHADOW_MAP = 256
-"""Pixels per side; about 0.3 m each on a landmark of 40 m radius."""
+"""Pixels per side of the shadow map, about 0.3 m each on a landmark of 40 m radius."""
 
 
 @dataclass(frozen=True)
 class Weather:
-    """Sun, sky and air at one moment; colors are linear."""
+    """Sun, sky and air at one moment. Colors are linear."""
 
     sun_azimuth: float
-    """Radians; 0 is in front of the façade."""
+    """Direction of the sun, radians; 0 is in front of the façade."""
     sun_elevation: float
     sun_color: tuple[float, float, float]
     sky_light: tuple[float, float, float]
@@ -30,7 +30,7 @@ class Weather:
     horizon: tuple[float, float, float]
     zenith: tuple[float, float, float]
     clouds: float
-    """0 clear … 1 overcast."""
+    """Cloud cover, from 0 (clear) to 1 (overcast)."""
     cloud_seed: int
     haze: float
     """Distance in meters at which 63 % of the color is haze."""
@@ -43,7 +43,7 @@ class Weather:
 
 @dataclass(frozen=True, eq=False)
 class ShadowMap:
-    """Distance the sun's rays travel before they hit something."""
+    """Distance that the sun's rays travel before they hit something."""
 
     sun: SunCamera
     depth: Float[Array, "n n"]
@@ -52,14 +52,14 @@ class ShadowMap:
     def of(
         cls, shapes: Sequence[Shape], weather: Weather, center: Float[Array, "3"], radius: float
     ) -> ShadowMap:
-        """Shadows within `radius` meters of the center, and a little beyond."""
+        """Compute shadows within `radius` meters of the center, and a little beyond."""
         rotation = Camera.looking_at(center + weather.to_sun, center, 1.0).rotation
         sun = SunCamera(center, rotation, 2.6 * radius)
         casting = [shape for shape in shapes if shape.casts_shadow]
         return cls(sun, cast(casting, sun, SHADOW_MAP, SHADOW_MAP)[0])
 
     def sunlit(self, at: Float[Array, "n 3"], normal: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Share of sunlight that reaches points: the mean of four neighbors in the map, 1 outside it."""
+        """Compute the share of sunlight at points: the mean of four neighbors in the map, 1 outside it."""
         n, texel = SHADOW_MAP, self.sun.extent / SHADOW_MAP
         lit = np.ones(len(at), np.float32)
         x, y, z = self.sun.project(at + normal * texel, n, n).T
@@ -75,10 +75,8 @@ class ShadowMap:
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """Hits of a camera's rays: the truth of every pixel, and the inputs of the lighting.
-
-    Fields of [n] cover the pixels that hit something, ordered by shape.
-    """
+    """Hits of a camera's rays: the ground truth of every pixel, and the inputs of the lighting. Fields of [n]
+    cover the pixels that hit something, ordered by shape."""
 
     depth: Float[Array, "h w"]
     """Meters along the camera's axis; MISS in the sky."""
@@ -93,7 +91,7 @@ class Traced:
     sunlit: Float[Array, " n"]
 
     def spread(self, values: UInt8[Array, " n"]) -> UInt8[Array, "h w"]:
-        """Values of the hit pixels as a picture, 0 in the sky."""
+        """Spread values of the hit pixels over a picture that is 0 in the sky."""
         picture = np.zeros(self.depth.size, dtype=np.uint8)
         picture[self.pixel] = values
         return picture.reshape(self.depth.shape)
@@ -102,7 +100,7 @@ class Traced:
 def trace(shapes: Sequence[Shape], camera: Camera, weather: Weather, width: int, height: int) -> Traced:
     """Cast a ray through every pixel's center. The sun decides which recesses are lit."""
     depth, index = cast(shapes, camera, width, height)
-    order = np.argsort(index.ravel(), kind="stable")  # radix sort, for int16
+    order = np.argsort(index.ravel(), kind="stable")  # radix sort for int16
     pixel = order[np.searchsorted(index.ravel()[order], 0) :]
     shape, n = index.ravel()[pixel], len(pixel)
     traced = Traced(
@@ -130,7 +128,7 @@ def trace(shapes: Sequence[Shape], camera: Camera, weather: Weather, width: int,
 def light(
     traced: Traced, materials: Sequence[Material], camera: Camera, weather: Weather, shadows: ShadowMap
 ) -> Float[Array, "h w 3"]:
-    """Linear colors of the hits."""
+    """Compute the linear colors of all pixels: lit hits, and sky elsewhere."""
     height, width = traced.depth.shape
     rays = _flat(camera, width, height)
     color = _sky(rays, weather)
@@ -178,7 +176,7 @@ def _lit(
 
 
 def _glint(view, normal, gloss, color, sunlight, weather: Weather):
-    """Highlight of the sun and reflection of the sky on glossy materials."""
+    """Compute the highlight of the sun and the reflection of the sky on glossy materials."""
     facing = (view * normal).sum(axis=1, keepdims=True)
     mirror = view - 2 * facing * normal
     highlight = np.clip(mirror @ weather.to_sun, 0, 1) ** 24 * (sunlight > 0)

@@ -15,7 +15,7 @@ Point = tuple[float, float, float]
 
 @dataclass
 class ShapeList:
-    """Collects shapes and their materials."""
+    """Collection of shapes and their materials."""
 
     rng: np.random.Generator
     shapes: list[Shape] = field(default_factory=list)
@@ -36,7 +36,7 @@ class ShapeList:
     def pick(self, *choices: str) -> str:
         return choices[int(self.rng.integers(len(choices)))]
 
-    # Solids. `material` is a role, `foot` the centre of the base.
+    # Solids: `material` is a role, `foot` the center of the base.
 
     def box(self, part: str, material: str, foot: Point, size: Point, yaw: float = 0.0) -> None:
         self.shapes.append(Box(PART[part], self.role[material], foot, yaw, 0, size))
@@ -50,7 +50,7 @@ class ShapeList:
     def gable(
         self, part: str, material: str, foot: Point, width: float, length: float, height: float, yaw=0.0
     ) -> None:
-        """A gabled roof with its ridge along y (turned by yaw)."""
+        """Add a gabled roof with its ridge along y (turned by yaw)."""
         fields = gable(width, length, height)
         self.shapes.append(Polytope(PART[part], self.role[material], foot, yaw, 0, **fields))
 

@@ -1,7 +1,8 @@
 """Ray-cast solids: boxes, convex polytopes, frusta and ellipsoids.
 
-Meters, z up. A vector is a tuple (x, y, z) of arrays that broadcast: the rays of a pinhole camera share an
-origin, those of the sun a direction. A shape's `position` is its foot; `yaw` turns it about z.
+Lengths are in meters, and z is up. A vector is a tuple (x, y, z) of arrays that broadcast: the rays of a
+pinhole camera share an origin, and those of the sun share a direction. A shape's `position` is its foot.
+`yaw` turns it about z.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from typing import Any
 import numpy as np
 
 Vector = tuple[Any, Any, Any]
-"""Three float32 arrays of one shape, or floats."""
+"""Vector as three float32 arrays of one shape, or as floats."""
 
 NEAREST = 0.05
-"""Meters: hits nearer than this along the ray are ignored."""
+"""Distance in meters below which hits along the ray are ignored."""
 MISS = np.float32(1e9)
 
 
@@ -32,18 +33,18 @@ class Surface:
     t: np.ndarray
     """Texture coordinate up the surface; meters."""
     shade: Any = 1.0
-    """Factor on all light, for dim corners."""
+    """Factor on all light, which darkens corners."""
     sunlit: Any = 1.0
     """Factor on sunlight, for recesses in their own shadow."""
     trim: Any = False
     """True where the surface has the shape's `trim` material instead of its `material`."""
     element: Any = True
-    """True where the shape's element applies; the stone surround of a window is not window."""
+    """True where the shape's element applies. The stone surround of a window is not a window."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shape(ABC):
-    """A solid with its labels and its material (an index into the landmark's materials)."""
+    """Solid with its labels and its material (an index into the landmark's materials)."""
 
     part: int
     """Index into PARTS."""
@@ -57,46 +58,46 @@ class Shape(ABC):
 
     @property
     def trim(self) -> int:
-        """A second material, if a surface has one."""
+        """Second material, if a surface has one."""
         return self.material
 
     @property
     @abstractmethod
     def bounds(self) -> tuple[float, float, float, float, float, float]:
-        """x0, y0, z0, x1, y1, z1 in the shape's frame."""
+        """Bounds x0, y0, z0, x1, y1, z1 in the shape's frame."""
 
     @abstractmethod
     def distance(self, origin: Vector, direction: Vector) -> np.ndarray:
-        """Ray parameter of the first hit, in direction lengths; MISS without a hit; local frame."""
+        """Return the ray parameter of the first hit, in direction lengths, or MISS, in the local frame."""
 
     @abstractmethod
     def surface(self, point: Vector, direction: Vector, sun: Vector) -> Surface:
-        """Normal and texture at points on the surface, seen along `direction`; local frame."""
+        """Return normal and texture at surface points, seen along `direction`, in the local frame."""
 
     @cached_property
     def corners(self) -> np.ndarray:
-        """The eight corners of the bounds in world coordinates, [8, 3] float64."""
+        """Eight corners of the bounds in world coordinates, [8, 3] float64."""
         bounds = self.bounds
         local = np.array([[bounds[x], bounds[y], bounds[z]] for x in (0, 3) for y in (1, 4) for z in (2, 5)])
         return np.stack(self.to_world(tuple(local.T)), axis=1) + self.position
 
     def to_local(self, vector: Vector) -> Vector:
-        """A world direction in the shape's frame."""
+        """Rotate a world direction to the shape's frame."""
         return _turn(vector, -self.yaw)
 
     def to_world(self, vector: Vector) -> Vector:
-        """A local direction in the world."""
+        """Rotate a local direction to the world's frame."""
         return _turn(vector, self.yaw)
 
     def point_to_local(self, point: Vector) -> Vector:
-        """A world point in the shape's frame."""
+        """Transform a world point to the shape's frame."""
         x, y, z = self.position
         return self.to_local((point[0] - x, point[1] - y, point[2] - z))
 
 
 @dataclass(frozen=True, eq=False)
 class Box(Shape):
-    """A box of `size` (x, y, z), positioned at the center of its base."""
+    """Box of `size` (x, y, z), positioned at the center of its base."""
 
     size: tuple[float, float, float]
 
@@ -130,7 +131,7 @@ class Box(Shape):
 
 @dataclass(frozen=True, eq=False)
 class Polytope(Shape):
-    """The points with normals · p ≤ offsets, a convex solid."""
+    """Convex solid of the points with normals · p ≤ offsets."""
 
     normals: np.ndarray
     offsets: np.ndarray
@@ -163,7 +164,7 @@ class Polytope(Shape):
 
 @dataclass(frozen=True, eq=False)
 class Frustum(Shape):
-    """A closed cone or cylinder about z: radius `bottom` at the foot, `top` at `height`."""
+    """Closed cone or cylinder about z, with radius `bottom` at the foot and `top` at `height`."""
 
     bottom: float
     top: float
@@ -181,7 +182,7 @@ class Frustum(Shape):
         a = dx * dx + dy * dy - shrink * shrink
         b = ox * dx + oy * dy - shrink * radius
         c = ox * ox + oy * oy - radius * radius
-        root = np.sqrt(b * b - a * c)  # NaN without a hit: every comparison below is then false
+        root = np.sqrt(b * b - a * c)  # NaN without a hit, which makes every comparison below false
         best = np.full(np.shape(root), MISS)
         for t in ((-b - root) / a, (-b + root) / a):
             z = oz + t * dz
@@ -212,7 +213,7 @@ class Frustum(Shape):
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid(Shape):
-    """An ellipsoid centered on its position, open: without the part below z = `cut` and above z = `end`."""
+    """Open ellipsoid centered on its position, without the parts below z = `cut` and above z = `end`."""
 
     radii: tuple[float, float, float]
     cut: float
@@ -246,12 +247,12 @@ class Ellipsoid(Shape):
 
 
 def floats(values: Any) -> np.ndarray:
-    """A float32 array."""
+    """Convert values to a float32 array."""
     return np.asarray(values, dtype=np.float32)
 
 
 def gable(width: float, length: float, height: float) -> dict[str, Any]:
-    """Polytope fields of a gabled roof: ridge along y, `width` along x."""
+    """Compute the polytope fields of a gabled roof with its ridge along y and `width` along x."""
     tilt = math.hypot(height, width / 2)
     up, out = width / 2 / tilt, height / tilt
     normals = floats([[out, 0, up], [-out, 0, up], [0, 1, 0], [0, -1, 0], [0, 0, -1]])
@@ -264,7 +265,7 @@ def gable(width: float, length: float, height: float) -> dict[str, Any]:
 
 
 def prism(radius: float, height: float, sides: int, taper: float = 0.0) -> dict[str, Any]:
-    """Polytope fields of an upright prism of inner `radius`; taper 1 makes it a pyramid."""
+    """Compute the polytope fields of an upright prism of inner `radius`. A taper of 1 makes it a pyramid."""
     angles = np.arange(sides) * 2 * math.pi / sides
     slope = radius * taper / height
     length = math.hypot(1, slope)

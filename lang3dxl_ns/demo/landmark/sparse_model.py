@@ -16,34 +16,34 @@ from lang3dxl_ns.demo.landmark.raycast import Camera
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 
 POINTS = 24_000
-"""Candidate points over the whole collection; those found in too few photos are dropped."""
+"""Number of candidate points over the whole collection. Those found in too few photos are dropped."""
 SHORTEST_TRACK = 3
 KEYPOINTS = 2000
-"""Most visible points found in a photo."""
+"""Upper limit on the visible points found in a photo."""
 FOUND = 0.5
-"""Largest share of them found."""
+"""Largest share of the visible points that is found."""
 NOISE = (0.3, 0.7)
-"""Pixels: range of the standard deviation of each photo's keypoint error."""
+"""Range of the standard deviation of each photo's keypoint error, pixels."""
 FALSE_MATCHES = 0.015
-"""Share of mismatched points: tracked in two photos, at a wrong position."""
+"""Share of mismatched points, which are tracked in two photos at a wrong position."""
 
 
 @dataclass(frozen=True, eq=False)
 class TakenPhoto:
-    """The parts of a photo that the model needs."""
+    """Parts of a photo that the model needs."""
 
     number: int
     width: int
     height: int
     camera: Camera
     points: Float[Array, "n 3"]
-    """Candidate points, meters."""
+    """Candidate points in the landmark's world, meters."""
     colors: UInt8[Array, "n 3"]
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Landmark world to COLMAP world: scale · rotation · x + translation."""
+    """Similarity from the landmark's world to COLMAP's: scale · rotation · x + translation."""
 
     scale: float
     rotation: Float[Array, "3 3"]
@@ -51,7 +51,7 @@ class Similarity:
 
     @classmethod
     def random(cls, rng: np.random.Generator) -> Similarity:
-        """Any orientation, any position, a world unit of 3 to 50 m."""
+        """Draw any orientation and position, and a world unit of 3 to 50 m."""
         rotation, triangle = np.linalg.qr(rng.normal(size=(3, 3)))
         rotation = rotation * np.sign(np.diag(triangle))
         rotation[:, 0] *= np.linalg.det(rotation)
@@ -61,7 +61,7 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.translation
 
     def camera_from_world(self, camera: Camera) -> Float[Array, "3 4"]:
-        """The camera's pose in COLMAP's world."""
+        """Compute the camera's pose in COLMAP's world."""
         rotation = camera.rotation @ self.rotation.T
         center = self.apply(camera.position[None])[0]
         return np.column_stack([rotation, -rotation @ center])
@@ -72,7 +72,7 @@ class Tracks:
     """Points with their keypoints, one row per observation."""
 
     points: Float[Array, "n 3"]
-    """Meters, the landmark's world."""
+    """Points in the landmark's world, meters."""
     colors: UInt8[Array, "n 3"]
     point: Int[Array, " m"]
     photo: Int[Array, " m"]
@@ -81,10 +81,10 @@ class Tracks:
 
 
 def sample_points(shot: Shot, camera: Camera, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """World points [n, 3] and colors [n, 3] at random pixels of permanent surfaces, at most `count`.
+    """Sample world points [n, 3] and colors [n, 3] at random pixels of permanent surfaces, at most `count`.
 
-    More where the picture has contrast, fewer on the ground. Pixels at silhouettes are excluded: their
-    keypoints would slide along the edge.
+    More are sampled where the picture has contrast, and fewer on the ground. Pixels at silhouettes are
+    excluded, because their keypoints would slide along the edge.
     """
     height, width = shot.parts.shape
     lasting = ~np.isin(shot.parts, [PART["sky"], PART["person"], PART["car"]]) & _smooth(shot.depth)
@@ -105,7 +105,7 @@ def sample_points(shot: Shot, camera: Camera, count: int, rng: np.random.Generat
 
 
 def find_tracks(photos: Sequence[TakenPhoto], depths: Sequence[Path], rng: np.random.Generator) -> Tracks:
-    """Match every candidate in every photo that sees it; `depths` are the photos' depth maps (.npy)."""
+    """Match every candidate in every photo that sees it. `depths` are the photos' depth maps (.npy)."""
     points = np.concatenate([photo.points for photo in photos])
     colors = np.concatenate([photo.colors for photo in photos])
     origin = np.repeat(np.arange(len(photos)), [len(photo.points) for photo in photos])
@@ -113,7 +113,7 @@ def find_tracks(photos: Sequence[TakenPhoto], depths: Sequence[Path], rng: np.ra
     for i, (photo, path) in enumerate(zip(photos, depths, strict=True)):
         projected = photo.camera.project(points, photo.width, photo.height)
         seen = np.flatnonzero(_visible(projected, np.load(path)))
-        luck = rng.random(len(seen)) + (origin[seen] == i)  # always found where it was sampled
+        luck = rng.random(len(seen)) + (origin[seen] == i)  # points are always found where they were sampled
         found = min(KEYPOINTS, int(FOUND * len(seen)) + len(photo.points))
         seen = np.sort(seen[np.argsort(-luck, kind="stable")[:found]])
         noise = rng.normal(0, rng.uniform(*NOISE), (len(seen), 2))
@@ -127,7 +127,7 @@ def find_tracks(photos: Sequence[TakenPhoto], depths: Sequence[Path], rng: np.ra
 
 
 def _smooth(depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
-    """Where depth changes little to all four neighbors; false at the border."""
+    """Return where depth changes little to all four neighbors; false at the border."""
     smooth = np.zeros(depth.shape, bool)
     finite = np.where(np.isfinite(depth), depth, 1e6)
     middle = finite[1:-1, 1:-1]
@@ -137,7 +137,7 @@ def _smooth(depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
 
 
 def _visible(projected: Float[Array, "n 3"], depth: Float[Array, "h w"]) -> Bool[Array, " n"]:
-    """Whether points are inside the photo and not occluded."""
+    """Return which points are inside the photo and not occluded."""
     height, width = depth.shape
     x, y, z = projected.T
     visible = (z > 0) & (x >= 1) & (y >= 1) & (x < width - 1) & (y < height - 1)
@@ -148,7 +148,7 @@ def _visible(projected: Float[Array, "n 3"], depth: Float[Array, "h w"]) -> Bool
 
 
 def _with_mistakes(tracks: Tracks, photos: Sequence[TakenPhoto], rng: np.random.Generator) -> Tracks:
-    """Points displaced as if triangulated from noisy keypoints, and some false matches."""
+    """Displace points as if they were triangulated from noisy keypoints, and add some false matches."""
     order = np.lexsort((tracks.photo, tracks.point))
     point, photo, pixel = tracks.point[order], tracks.photo[order], tracks.pixel[order].copy()
     lengths = np.bincount(point, minlength=len(tracks.points))
@@ -172,7 +172,7 @@ def _with_mistakes(tracks: Tracks, photos: Sequence[TakenPhoto], rng: np.random.
         keep[second + 1 : first[i] + lengths[i]] = False
         if z > 0 and 0 < x < other.width and 0 < y < other.height:
             pixel[second] = x, y
-        else:  # no photo agrees: the point keeps its true position
+        else:  # no photo agrees, so the point keeps its true position
             points[i] = tracks.points[i]
     return Tracks(points, tracks.colors, point[keep], photo[keep], pixel[keep])
 
@@ -180,10 +180,9 @@ def _with_mistakes(tracks: Tracks, photos: Sequence[TakenPhoto], rng: np.random.
 def write_model(
     folder: Path, photos: Sequence[TakenPhoto], tracks: Tracks, similarity: Similarity, one_camera: bool
 ) -> None:
-    """Write cameras.bin, images.bin and points3D.bin (and COLMAP's rigs.bin, frames.bin) to `folder`.
-
-    Photos are NNNN.jpg, with NNNN as COLMAP image number. With `one_camera` they share the first one's.
-    """
+    """Write cameras.bin, images.bin and points3D.bin (and COLMAP's rigs.bin, frames.bin) to `folder`. Photos
+    are named NNNN.jpg, with NNNN as COLMAP image number. With `one_camera`, all share the first photo's
+    camera."""
     pycolmap = load_pycolmap()
     model = pycolmap.Reconstruction()
     elements: list[list[tuple[int, int]]] = [[] for _ in tracks.points]

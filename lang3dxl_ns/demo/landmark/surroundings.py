@@ -42,7 +42,7 @@ def place_surroundings(b: Builder, center, radius: float) -> None:
 def passers_by(
     rng: np.random.Generator, spots: Callable[[], Point | None], people: int, cars: int
 ) -> ShapeList:
-    """People and cars at the given spots, with their own materials."""
+    """Place people and cars at the given spots, with their own materials."""
     crowd = ShapeList(rng)
     for add, count in ((_person, people), (_car, cars)):
         for _ in range(count):
@@ -56,7 +56,7 @@ def _tree(b: Builder, foot: Point) -> None:
     height, leaves = b.between(4, 11), "foliage" if b.chance(0.6) else "darker foliage"
     x, y, _ = foot
     b.cone("tree", "bark", foot, height * 0.035, height * 0.02, height * 0.6)
-    if b.chance(0.3):  # a cypress or fir: pointed like a spire
+    if b.chance(0.3):  # cypress or fir, pointed like a spire
         if b.chance(0.5):
             b.cone("tree", leaves, (x, y, height * 0.12), height * b.between(0.1, 0.2), 0.0, height)
         else:

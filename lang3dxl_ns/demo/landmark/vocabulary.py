@@ -13,15 +13,15 @@ from lang3dxl_ns.demo.landmark.openings import Openings
 from lang3dxl_ns.demo.landmark.shape_list import Point, ShapeList
 
 FRONT, LEFT, BACK, RIGHT = 0.0, math.pi / 2, math.pi, -math.pi / 2
-"""Facings: the façade looks along +x."""
+"""Facings of walls, as angles from +x, which the façade faces."""
 
 
 @dataclass
 class Builder(ShapeList):
-    """Builds one landmark; chooses the style shared by all its parts."""
+    """Builder of one landmark, which chooses the style shared by all its parts."""
 
     facade_height: float = 30.0
-    """Metres; windows are 1/60 to 1/8 of it high."""
+    """Height of the façade, meters. Windows are 1/60 to 1/8 of it high."""
 
     def __post_init__(self) -> None:
         self._choose_materials()
@@ -35,7 +35,7 @@ class Builder(ShapeList):
         self.round_spires = self.chance(0.4)
 
     def _choose_materials(self) -> None:
-        """All parts draw from the same two palettes, so that colour doesn't reveal a category."""
+        """Choose materials from the same two palettes, so that color does not reveal a category."""
         rng = self.rng
 
         def palette(names: tuple[str, ...]) -> list[int]:
@@ -56,13 +56,13 @@ class Builder(ShapeList):
 
 
 def ahead(point: Point, facing: float, distance: float, aside: float = 0.0) -> Point:
-    """A point `distance` in front of a wall that faces `facing`, and `aside` to its left."""
+    """Return a point `distance` in front of a wall that faces `facing`, and `aside` to its left."""
     c, s = math.cos(facing), math.sin(facing)
     return point[0] + c * distance - s * aside, point[1] + s * distance + c * aside, point[2]
 
 
 def above(point: Point, height: float) -> Point:
-    """A point `height` meters above another."""
+    """Return a point `height` meters above another."""
     return point[0], point[1], point[2] + height
 
 
@@ -77,10 +77,9 @@ def window_row(
     rows: int = 1,
     filling: str | None = None,
 ) -> None:
-    """Windows on a field of wall whose lower edge is centred at `foot`.
-
-    Without `columns`, as many as fit well. Their height stays within 1/60 … 1/8 of the façade's.
-    """
+    """Add windows on a field of wall whose lower edge is centered at `foot`. Without `columns`, their number
+    follows from the width. Windows that cannot be between 1/60 and 1/8 of the façade's height are left
+    out."""
     smallest, largest = b.facade_height / 60, b.facade_height / 8
     tall = float(np.clip(b.between(0.6, 0.9) * height / rows, smallest, largest))
     wide = tall * b.between(0.32, 0.55)
@@ -100,7 +99,7 @@ def rose_window(b: Builder, part: str, foot: Point, facing: float, diameter: flo
 
 
 def portal(b: Builder, part: str, foot: Point, facing: float, width: float, height: float) -> None:
-    """A door with a stepped reveal, sometimes under a gable or behind steps."""
+    """Add a door with a stepped reveal, sometimes behind steps."""
     orders = int(b.rng.integers(1, 5))
     step = 0.26 * width / 2 / orders
     field_, style = (width * 1.5, height * 1.12), (b.portal_outline, b.doors)
@@ -112,7 +111,7 @@ def portal(b: Builder, part: str, foot: Point, facing: float, width: float, heig
 
 
 def niche_row(b: Builder, foot: Point, facing: float, width: float, height: float, columns: int) -> None:
-    """Blind arches: like windows, but walled up."""
+    """Add blind arches, which look like windows but are walled up."""
     tall = min(0.86 * height, b.facade_height / 8)
     wide = min(tall * 0.5, 0.7 * width / columns)
     style = ("round", "plain")
@@ -137,7 +136,7 @@ def _opening(b, part, element, foot, facing, field_, size, style, tiles=(1, 1), 
 def dome(
     b: Builder, foot: Point, radius: float, drum: float, windows: bool = True, onion: bool | None = None
 ) -> None:
-    """A dome on a drum of the given height, with windows around the drum."""
+    """Add a dome on a drum of the given height, with windows around the drum."""
     if drum > 0:
         b.cone("wall", "drum", foot, radius * 1.02, radius * 1.02, drum)
         b.cone("wall", "trim", above(foot, drum * 0.92), radius * 1.08, radius * 1.08, drum * 0.1)
@@ -145,7 +144,7 @@ def dome(
         sides = int(b.rng.choice([8, 12, 16]))
         for i in range(sides):
             facing = 2 * math.pi * i / sides
-            # A flat field on a round drum: place it in front of the curve's middle.
+            # The field is flat and the drum round, so the field is placed in front of the curve's middle.
             side = 2 * math.pi * radius / sides
             place = ahead(above(foot, drum * 0.12), facing, radius * 1.02)
             window_row(b, "wall", place, facing, side * 0.6, drum * 0.74, columns=1)
@@ -166,7 +165,7 @@ def dome(
 
 
 def _onion(b: Builder, foot: Point, radius: float) -> float:
-    """A bulb continued smoothly by a cone; returns its height."""
+    """Add a bulb continued smoothly by a cone, and return its height."""
     x, y, z = foot
     bulge, tall, angle = radius * 1.15, radius * 1.0, math.radians(48)
     lower = tall * math.sqrt(1 - (radius / bulge) ** 2)  # where the bulb is as wide as the drum
@@ -178,7 +177,7 @@ def _onion(b: Builder, foot: Point, radius: float) -> float:
 
 
 def spire(b: Builder, foot: Point, radius: float, height: float) -> None:
-    """A steep pointed roof, round or with four or eight sides, with a cross or ball on top."""
+    """Add a steep pointed roof, round or with four or eight sides, with a cross on top."""
     if b.round_spires:
         b.cone("spire", "spire", foot, radius, 0.0, height)
     else:
@@ -192,7 +191,7 @@ def spire(b: Builder, foot: Point, radius: float, height: float) -> None:
 
 
 def pinnacle(b: Builder, foot: Point, radius: float, height: float) -> None:
-    """A small spire on a square shaft."""
+    """Add a small spire on a square shaft."""
     b.box("spire", "trim", foot, (radius * 1.7, radius * 1.7, height * 0.35))
     b.prism("spire", "spire", above(foot, height * 0.35), radius, height * 0.65, 4, taper=1.0)
 
@@ -200,10 +199,8 @@ def pinnacle(b: Builder, foot: Point, radius: float, height: float) -> None:
 def tower(
     b: Builder, foot: Point, width: float, height: float, top: str, sides=4, bare: tuple[float, ...] = ()
 ) -> None:
-    """A tower in storeys with belfry openings; top: spire, flat, pyramid, dome or onion.
-
-    `bare`: facings whose lowest storey has no windows, for a portal.
-    """
+    """Add a tower in stories with belfry openings. `top` is spire, flat, pyramid, dome or onion; `bare` lists
+    facings whose lowest story has no windows, for a portal."""
     x, y, z = foot
     if sides == 4:
         b.box("tower", "tower", foot, (width, width, height))
@@ -265,7 +262,7 @@ def battlements(b: Builder, foot: Point, width: float, count: int = 5) -> None:
 def minaret(
     b: Builder, foot: Point, radius: float, height: float, balconies: int, octagonal: bool, cap: str
 ) -> None:
-    """A slender shaft with balconies; cap: cone, dome or lantern."""
+    """Add a slender shaft with balconies. `cap` is cone, dome or lantern."""
     x, y, z = foot
     base = height * 0.14
     b.box("minaret", "wall", foot, (radius * 2.6, radius * 2.6, base))
@@ -300,7 +297,7 @@ def minaret(
 
 
 def colonnade(b: Builder, start: Point, end: Point, count: int, height: float, radius: float) -> None:
-    """A row of equal columns between two points, with bases and capitals."""
+    """Add a row of equal columns between two points, with bases and capitals."""
     for i in range(count):
         share = i / (count - 1)
         x, y = (s + (e - s) * share for s, e in zip(start[:2], end[:2], strict=True))
@@ -311,7 +308,7 @@ def colonnade(b: Builder, start: Point, end: Point, count: int, height: float, r
 
 
 def chimney(b: Builder, foot: Point, height: float) -> None:
-    """A smokestack: slender and round like a minaret."""
+    """Add a smokestack, slender and round like a minaret."""
     radius = height * b.between(0.05, 0.08)
     x, y, z = foot
     b.cone("clutter", "wall", foot, radius * 1.15, radius, height)
