@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.common import jit
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.kernels import numba_works, takes_kernels
 
 
@@ -48,3 +49,9 @@ def test_a_numba_that_loads_but_does_not_compile_is_told_of(monkeypatch, capsys)
     assert "numba does not work (LLVM ERROR: unsupported processor)" in " ".join(
         capsys.readouterr().out.split()
     )
+
+
+def test_an_unknown_name_of_kernels_is_an_error(monkeypatch):
+    monkeypatch.setenv("LANG3DXL_CPU_KERNELS", "nubma")
+    with pytest.raises(UserError, match="LANG3DXL_CPU_KERNELS is 'nubma'"):
+        takes_kernels(torch.zeros(3))
