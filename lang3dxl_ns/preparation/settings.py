@@ -46,7 +46,7 @@ class PreparationConfig:
     clip_features: ClipFeatures = "auto"
     """What it reads photos as. crops: one vector for each of thousands of crops. dense: a map of patch
     features in about ten passes. auto: dense if its patches were trained to fit texts (TIPSv2), otherwise
-    crops."""
+    crops, in training photos with the mean of the patches if it has a head for them, as the built-in one."""
     dense: str = "auto"
     """Vision transformer whose patch tokens sharpen what crops blur: a name, a folder, or "none" to do
     without. auto: facebook/dinov2-small, or the built-in one with the built-in CLIP."""
