@@ -196,7 +196,8 @@ def resized(camera: Camera, longer_side: int) -> Camera:
 def with_longer_side(camera: Camera, pixels: int) -> Camera:
     """Return the view at another resolution.
 
-    Raises UserError for a side below 1 or above `LONGEST_SIDE`, and for more pixels than fit in memory."""
+    Raises UserError for a side below 1 or above `LONGEST_SIDE`, and if over half of the memory is needed.
+    """
     if not (isinstance(pixels, int) and 1 <= pixels <= LONGEST_SIDE):
         raise UserError(f"a picture of {pixels} pixels can't be rendered: give 1 to {LONGEST_SIDE}")
     factor = pixels / max(camera.width, camera.height)

@@ -246,7 +246,9 @@ def _match(database: Path, names: Sequence[str]) -> None:
 
 
 def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pycolmap.Reconstruction]:
-    """Models, largest first. If the usual thresholds find none, lower ones are tried."""
+    """Run the mapper and return the models, largest first.
+
+    If the incremental mapper finds none with the usual thresholds, lower ones are tried."""
     pycolmap = load_pycolmap()
     folder = work / "mapping"
     for relaxed in (False, True):
