@@ -40,7 +40,7 @@ def crop_centers(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]
 
     They are the middles of equal cells, like a target's, about `side` / `steps` apart. A crop covers
     `side // 2` pixels to either side of its center and may extend beyond the photo. Method: Lang3D-XL, crop
-    grid. Its centers are exactly half a crop apart, and up to half a cell away from their cells' middles.
+    grid; there the centers are exactly half a crop apart, and up to half a cell off their cells' middles.
     """
     count = crop_count(length, side, steps)
     return ((2 * torch.arange(count) + 1) * length + count - 1) // (2 * count)  # rounded
@@ -56,7 +56,7 @@ def iterate_crops(
 ) -> Iterator[Float[Tensor, "n 3 s s"]]:
     """Yield the photo's crops, row by row from the top left, at `size` pixels, `batch_size` at a time.
 
-    They are black outside the photo. The resize is CLIP's, antialiased bicubic, clamped to 0..1.
+    They are black outside the photo. CLIP's own antialiased bicubic resize is used, then clamped to 0..1.
     """
     windows, tops, lefts = _windows(photo, side, steps)
     columns = len(lefts)

@@ -54,7 +54,7 @@ class PreparationConfig:
     """Sides of the smallest and largest crop, in COLMAP units ("physical") or in photo widths ("relative").
     Default: proposed from the scene."""
     scale_preset: str | None = None
-    """Scene whose published range to use instead, such as "holyscenes/milano"."""
+    """Scene whose published crop range is used instead of `scale_range`, such as "holyscenes/milano"."""
     scale_mode: Literal["auto", "physical", "relative"] = "auto"
     """Whether crops have one size in the world (physical) or in the photo (relative). A physical size that
     matches a window does so in near and far photos. auto: physical, unless the scene has no 3D points or its
