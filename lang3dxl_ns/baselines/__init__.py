@@ -1,1 +1,1 @@
-"""Baselines from the literature, behind the semantic field's interface."""
+"""Baselines from the literature, which implement the semantic field's interface."""

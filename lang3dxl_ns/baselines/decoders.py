@@ -27,19 +27,21 @@ NAMES: tuple[str, ...] = get_args(DecoderName)
 @showing("name")
 @dataclass
 class DecoderConfig:
-    """The model's feature decoder. Targets, losses and schedules are the same for all, so that a comparison
-    isolates the decoder."""
+    """Settings of the model's feature decoder.
+
+    Targets, losses and schedules are the same for all decoders, so that a comparison isolates the decoder."""
 
     name: DecoderName = "gathered"
-    """gathered: targets are averaged onto the Gaussians after training and compressed to three numbers
-    each, which the semantic field decodes Gaussian by Gaussian. paper: Lang3D-XL as published, codes trained
-    with the scene and decoded pixel by pixel. feature3dgs: codes of half the CLIP width and one linear layer
-    after rendering. fmgs: a hash grid over positions, decoded before rendering; whole features are rendered.
-    langsplat: a per-scene autoencoder's three numbers. direct: the whole feature on every Gaussian. lifting:
-    targets averaged onto the Gaussians, rendered uncompressed."""
+    """How features are stored on Gaussians and decoded. gathered: targets are averaged onto the Gaussians
+    after training and compressed to three numbers each, which the semantic field decodes Gaussian by
+    Gaussian. paper: Lang3D-XL as published, with codes trained with the scene and decoded pixel by pixel.
+    feature3dgs: codes of half the CLIP width and one linear layer after rendering. fmgs: a hash grid over
+    positions, decoded before rendering; whole features are rendered. langsplat: a per-scene autoencoder's
+    three numbers. direct: the whole feature on every Gaussian. lifting: targets averaged onto the Gaussians
+    and rendered uncompressed."""
 
     compression: CompressionConfig = field(default_factory=CompressionConfig)
-    """gathered: compression of gathered features to codes."""
+    """gathered: how gathered features are compressed to codes."""
 
     @property
     def learns_from_renderings(self) -> bool:
@@ -49,7 +51,7 @@ class DecoderConfig:
     alignment_weight: float = 0.01
     """fmgs: weight of the loss that aligns CLIP with dense features (published: 0.01 to 0.03)."""
     autoencoder_steps: int = 2_000
-    """langsplat: iterations of 1,024 features each, before the run."""
+    """langsplat: iterations of the autoencoder before the run, of 1,024 features each."""
 
 
 def make_decoder(
@@ -60,9 +62,9 @@ def make_decoder(
     center: Float[Tensor, "3"],
     radius: float,
 ) -> Decoder:
-    """The feature decoder of this name; `settings`: of those that have a hash grid.
+    """Build the feature decoder that `config` names.
 
-    center, radius: of the scene, world units.
+    `settings` applies to decoders with a hash grid; `center` and `radius` are the scene's, in world units.
     """
     if config.name == "feature3dgs":
         decoder: Decoder = Feature3DGS(clip_dim, dense_dim)

@@ -10,8 +10,10 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 
 
 class DirectFeatures(Decoder):
-    """Gaussians carry whitened CLIP and dense features. A map is mean + deviation × rendering, so that
-    training starts at the mean feature, as for the semantic field."""
+    """Decoder without compression: Gaussians carry whitened CLIP and dense features.
+
+    A map is mean + deviation × rendering, so training starts at the mean feature, as for the semantic field.
+    """
 
     def initial_codes(
         self, count: int, generator: torch.Generator | None = None

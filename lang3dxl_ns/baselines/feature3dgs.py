@@ -10,8 +10,10 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 
 
 class Feature3DGS(Decoder):
-    """Codes half as wide as CLIP's features (256 for ViT-B/32), expanded by its "speed-up" layer, a 1×1
-    convolution, to CLIP and dense features. Whitened like the semantic field, which can only help it."""
+    """Decoder of codes half as wide as CLIP's features (256 for ViT-B/32) by the method's "speed-up" layer.
+
+    This 1×1 convolution outputs CLIP and dense features. They are whitened as in the semantic field, which
+    can only help this baseline."""
 
     def __init__(self, clip_dim: int, dense_dim: int) -> None:
         super().__init__(clip_dim, dense_dim)

@@ -14,16 +14,18 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
 _STRETCH = 2.0
-"""Positions within the scene radius fill 0.12 … 0.88 of the grid almost evenly; all others share the rest."""
+"""Scale of positions before the grid's sigmoid: those within the scene radius fill 0.12 … 0.88 of the grid
+almost evenly, and all others share the rest."""
 
 
 class PlaceField(Decoder):
-    """The semantic field evaluated at a Gaussian's position instead of a pixel's code: every Gaussian is
-    decoded, and whole features are rendered. Gaussians have no learned codes.
+    """Semantic field evaluated at a Gaussian's position instead of a pixel's code.
+
+    Every Gaussian is decoded, and whole features are rendered. Gaussians have no learned codes.
 
     Args:
-        center, radius: of the scene, world units.
-        alignment_weight: of the pixel alignment loss.
+        center, radius: center and radius of the scene, world units.
+        alignment_weight: weight of the pixel alignment loss.
     """
 
     def __init__(
@@ -48,7 +50,7 @@ class PlaceField(Decoder):
         return None
 
     def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"]:
-        """Features at the Gaussians' positions; positions get no gradient."""
+        """Decode the features at the Gaussians' positions; positions get no gradient."""
         places = _STRETCH * (gaussians["means"].detach() - self.center) / self.radius
         clip, dense = self.field(places)
         return clip if dense is None else torch.cat([clip, dense], dim=-1)
@@ -76,12 +78,12 @@ class PlaceField(Decoder):
 
 
 def pixel_alignment_loss(clip: Float[Tensor, "h w c"], dense: Float[Tensor, "h w d"]) -> Float[Tensor, ""]:
-    """Mean difference of neighbor similarity between CLIP and dense features; these get no gradient."""
+    """Average how far CLIP and dense features differ in neighbor similarity; dense ones get no gradient."""
     return (neighbor_similarity(clip) - neighbor_similarity(dense.detach())).abs().mean()
 
 
 def neighbor_similarity(features: Float[Tensor, "h w c"]) -> Float[Tensor, "h w 8"]:
-    """Cosine of every pixel with its eight neighbors; mirrored at the border."""
+    """Compute the cosine of every pixel with its eight neighbors; the map is mirrored at the border."""
     height, width, _ = features.shape
     unit = F.normalize(features, dim=-1)
     padded = F.pad(unit.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="reflect")[0].permute(1, 2, 0)

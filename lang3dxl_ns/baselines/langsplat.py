@@ -16,13 +16,13 @@ _ENCODER = (256, 128, 64, 32, 3)
 _DECODER = (16, 32, 64, 128, 256, 256)
 _BATCH = 1024
 _RATE = 2e-3
-"""Higher than the published 7e-4, which is for batches of 64."""
+"""Learning rate of the autoencoder. It is higher than the published 7e-4, which is for batches of 64."""
 _MOST_FEATURES = 400_000
 """Most features the autoencoder is trained on."""
 
 
 class LangSplat(Decoder):
-    """Unit-length codes, decoded after rendering by the autoencoder's frozen decoder.
+    """Decoder of unit-length codes after rendering: the frozen second half of an autoencoder.
 
     The autoencoder learns the scene's CLIP targets before the run, as unit vectors; decoded features are
     scaled back to the targets' typical length. There are no dense features. The published system trains a
@@ -43,7 +43,7 @@ class LangSplat(Decoder):
         self.register_buffer("norm", torch.ones(()))
 
     def initial_codes(self, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "count 3"]:
-        """All near the code of the mean target."""
+        """Return codes that all lie near the code of the mean target."""
         device = generator.device if generator else None
         noise = torch.randn(count, 3, generator=generator, device=device)
         return self.first_code + 0.1 * noise.to(self.first_code)
@@ -58,7 +58,7 @@ class LangSplat(Decoder):
         return {}
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
-        """Uses only the typical length of the CLIP targets."""
+        """Set the typical length of the CLIP targets; the dense statistics are ignored."""
         mean, std = mean[: self.clip_dim], std[: self.clip_dim]
         super().set_output_statistics(mean, std)
         self.norm.copy_((mean.square() + std.square()).sum().sqrt())
@@ -90,7 +90,7 @@ class LangSplat(Decoder):
 
 
 def _sample(targets: Iterable[Tensor], generator: torch.Generator) -> Float[Tensor, "n c"]:
-    """Unit vectors of the targets, subsampled if there are too many."""
+    """Collect the targets' pixels as unit vectors, subsampled if there are too many."""
     rows: list[Tensor] = []
     for target in targets:
         flat = F.normalize(target.flatten(0, 1).float(), dim=-1)
@@ -101,7 +101,7 @@ def _sample(targets: Iterable[Tensor], generator: torch.Generator) -> Float[Tens
 
 
 def _layers(widths: tuple[int, ...], normalize: bool = False) -> nn.Sequential:
-    """Linear layers with ReLU between, preceded by batch normalization if requested."""
+    """Build linear layers with ReLU between, preceded by batch normalization if requested."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         if layers:

@@ -15,9 +15,11 @@ _LEAST_COVERAGE = 1e-4
 
 
 class LiftedFeatures(Decoder):
-    """Gaussians carry nothing in training. Afterwards they carry the lifted features and a 1, whose rendering
-    is the coverage: a map is the mean feature of the visible Gaussians, however little of a pixel they
-    cover."""
+    """Decoder of features that are averaged onto the Gaussians after training, without compression.
+
+    Gaussians carry nothing in training. Afterwards they carry the lifted features and a 1, whose rendering is
+    the coverage. So a map is the mean feature of the visible Gaussians, however little of a pixel they cover.
+    """
 
     needs_lifting = True
 

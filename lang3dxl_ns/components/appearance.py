@@ -1,8 +1,8 @@
-"""Appearance field: photo-dependent color shifts of the Gaussians, steered by a vector per photo.
+"""Appearance field: photo-dependent color shifts of the Gaussians, controlled by a vector per photo.
 
 One photo is taken at noon, the next at dusk. A small network takes a Gaussian's position, its base color and
 the photo's vector, and predicts its color shift in that photo (SWAG, Dahmani et al. 2024, as used in
-Lang3D-XL). Only colors, and optionally opacities, depend on the photo: semantics never do.
+Lang3D-XL). Only colors, and optionally opacities, depend on the photo; semantics never do.
 """
 
 from __future__ import annotations
@@ -31,10 +31,11 @@ FIRST_DEVIATION = 0.1
 differ in exposure and white balance, the error after 300 steps is twice that with 0.1."""
 FIRST_LOGIT = -4.0
 """Log odds that an untrained opacity shift removes a Gaussian from a training step: about 2 %."""
-# Light changes smoothly over a building, from wall to wall. Finer grids take longer, and learn a photo's
-# patches instead of its light.
+# Lighting changes smoothly over a building, from wall to wall. Finer grids take longer, and learn a photo's
+# patches instead of its lighting.
 GRIDS = {"coarse": (2, 4, 14, 6, 12), "paper": (12, 2, 19, 16, 2048)}
-"""Levels, features per level, log2 of the table's size, and lowest and highest resolution: see `HashGrid`."""
+"""`HashGrid` settings by preset: levels, features per level, log2 of the table's size, and lowest and highest
+resolution."""
 
 
 @showing("use", "preset")
@@ -43,30 +44,30 @@ class AppearanceConfig:
     """Settings of the appearance field."""
 
     use: Literal["auto", "on", "off"] = "auto"
-    """`auto`: on, unless the scene's measured needs show that its photos share one lighting. If off, the
-    component is not built and has no parameters or cost."""
+    """Whether to model the lighting of each photo. `auto`: on, unless the scene's measured needs show that
+    its photos share one lighting. If off, the component is not built and has no parameters or cost."""
     preset: Literal["auto", "coarse", "paper"] = "coarse"
-    """Hash grid over positions: `coarse`, or as published; `auto`: the latter in runs of 5,000 iterations and
-    more."""
+    """Hash grid over positions: `coarse`, or as published (`paper`). `auto`: as published in runs of 5,000
+    iterations and more, otherwise coarse."""
     vector_dim: int = 24
     """Size of a photo's vector."""
     unseen: Literal["nearest", "mean"] = "nearest"
-    """Look of a view that is not a training photo: that of the `nearest` training camera, by position (in
-    units of the cameras' spread) and direction, or the `mean` vector."""
+    """Look of a view that is not a training photo. `nearest`: the look of the nearest training camera, by
+    position (in units of the cameras' spread) and direction. `mean`: the mean vector."""
     opacity_shift: bool = False
-    """Let photos remove Gaussians, for what appears in one photo only. Costs a second rendering."""
+    """Let photos hide Gaussians, for things that appear in one photo only. It costs a second rendering."""
 
 
 class AppearanceField(nn.Module):
-    """Colors of Gaussians under one photo's look.
+    """Network that computes the colors of Gaussians under one photo's look.
 
-    Untrained, it changes nothing. Vectors belong to photos by name: a checkpoint's vectors stay with their
-    photos whichever photos the present run has, and new photos get fresh vectors.
+    Before training it changes nothing. Vectors belong to photos by name: a checkpoint's vectors stay with
+    their photos whichever photos the present run has, and new photos get fresh vectors.
 
     Args:
         config: the settings.
-        names: of the training photos.
-        center: of the scene, world units.
+        names: names of the training photos.
+        center: center of the scene, world units.
         radius: distance from the center that contains most of the scene, world units.
         generator: source of the initial weights and vectors.
     """
@@ -88,7 +89,7 @@ class AppearanceField(nn.Module):
         self.from_gaussian = linear(inputs - config.vector_dim, HIDDEN, generator, fan_in=inputs)
         self.from_photo = linear(config.vector_dim, HIDDEN, generator, bias=False, fan_in=inputs)
         self.hidden = linear(HIDDEN, HIDDEN, generator)
-        # Its own generator, so that the one given draws the same numbers as without it.
+        # This layer has its own generator, so that the given one draws the same numbers as without it.
         self.output = linear(HIDDEN, 4 if config.opacity_shift else 3, torch.Generator().manual_seed(0))
         for parameter in self.output.parameters():
             nn.init.zeros_(parameter)
@@ -116,16 +117,16 @@ class AppearanceField(nn.Module):
         visible: Int[Tensor, " m"],
         seed: int | None = None,
     ) -> tuple[Float[Tensor, "n 3"], Gaussians]:
-        """Colors, and with `opacity_shift` the Gaussians' opacities, under a photo's vector.
+        """Compute colors, and with `opacity_shift` also opacities, under a photo's vector.
 
         The Gaussians' positions get no gradient from it. Colors are at least 0, opacities in 0…1.
 
         Args:
-            gaussians: in the world frame; returned unchanged without `opacity_shift`.
-            colors: before the shift, at least 0.
-            vector: of the photo.
+            gaussians: Gaussians in the world frame, which are returned unchanged without `opacity_shift`.
+            colors: colors before the shift, at least 0.
+            vector: the photo's vector.
             visible: rows of the Gaussians to change; the others stay as they are.
-            seed: of the opacity shift's noise in training; None for no noise.
+            seed: seed of the opacity shift's noise in training; None for no noise.
         """
         base = colors[visible]
         features = torch.cat((self.grid(self._unit_cube(gaussians.means[visible])), base), 1)
@@ -140,11 +141,11 @@ class AppearanceField(nn.Module):
         return colors, gaussians
 
     def network_parameters(self) -> list[nn.Parameter]:
-        """Parameters shared by all photos; `vectors` are per photo."""
+        """Return the parameters that all photos share, which are all but `vectors`."""
         return [parameter for parameter in self.parameters() if parameter is not self.vectors]
 
     def vector(self, name: str) -> Float[Tensor, " v"]:
-        """The vector of a training photo.
+        """Return the vector of a training photo.
 
         Raises:
             UserError: no training photo has this name.
@@ -161,12 +162,14 @@ class AppearanceField(nn.Module):
         """Record that a photo is used in training, and its camera's position and unit viewing direction."""
         row = self._rows[name]
         self.positions[row], self.directions[row] = position, direction
-        self.learned[row].fill_(True)  # assigned, some versions of torch copy it from the CPU, and wait
+        self.learned[row].fill_(True)  # with an assignment, some versions of torch copy from the CPU and wait
 
     def vector_of_view(
         self, position: Float[Tensor, "3"], direction: Float[Tensor, "3"]
     ) -> Float[Tensor, " v"]:
-        """Vector for a view that is not a training photo, by the rule `unseen`; zero before any training."""
+        """Return a vector for a view that is not a training photo, by the rule `AppearanceConfig.unseen`.
+
+        It is zero before any training."""
         vectors = self.vectors[self.learned]
         if len(vectors) == 0:
             return self.vectors.new_zeros(self.config.vector_dim)
@@ -179,21 +182,24 @@ class AppearanceField(nn.Module):
         return vectors[(moved.square() + turned.square()).argmin()]
 
     def _unit_cube(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Positions as grid coordinates in [0, 1]: space contracted to a ball (Mip-NeRF 360, Barron et al.
-        2022); the scene fills the inner half, everything out to the sky the rest."""
+        """Convert positions to grid coordinates in [0, 1].
+
+        Space is contracted to a ball (Mip-NeRF 360, Barron et al. 2022): the scene fills the inner half, and
+        everything out to the sky the rest."""
         x = (means.detach() - self.center) / self.radius
         largest = x.abs().amax(1, keepdim=True).clamp_min(1.0)
-        # In units of the largest component: the squares of far positions would overflow.
+        # Lengths are in units of the largest component, since the squares of far positions would overflow.
         distance = largest * (x / largest).norm(dim=1, keepdim=True).clamp_min(1 / largest)
         return 0.5 + 0.25 * (x / distance) * (2 - 1 / distance)
 
     def _binary_concrete(
         self, logits: Float[Tensor, " m"], visible: Int[Tensor, " m"], count: int, seed: int | None
     ) -> Float[Tensor, " m"]:
-        """A sample per Gaussian of a relaxed coin, close to 0 or 1 (Maddison et al. 2017): with noise u,
-        sigmoid((logit + log u − log(1 − u)) / temperature); u = 1/2 without a seed."""
+        """Sample a relaxed coin per Gaussian, which is close to 0 or 1 (Maddison et al. 2017).
+
+        With noise u, it is sigmoid((logit + log u − log(1 − u)) / temperature); without a seed, u is 1/2."""
         if seed is not None:
-            # Sampled for all on the CPU: the same whatever is visible, and on every device.
+            # Noise for all Gaussians is sampled on the CPU, so it depends neither on device nor visibility.
             noise = torch.rand(count, generator=torch.Generator().manual_seed(seed))
             shift = to_device(torch.logit(noise, eps=1e-6).to(logits.dtype), logits.device)
             logits = logits + shift[visible]
@@ -209,10 +215,10 @@ class AppearanceField(nn.Module):
         return self.names
 
     def set_extra_state(self, state: list[str]) -> None:
-        """The names are restored together with their rows, in `_load_from_state_dict`."""
+        """Do nothing, since `_load_from_state_dict` restores the names together with their rows."""
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args) -> None:
-        """Take the checkpoint's photos first, then those of this run that it lacks."""
+        """Load the checkpoint's photos, and append those of this run that it lacks."""
         saved = state_dict.get(f"{prefix}_extra_state")
         if saved is not None:
             known = set(saved)

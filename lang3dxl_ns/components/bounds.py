@@ -1,6 +1,6 @@
-"""Bounds of Gaussians in training: lengths, colors, and the space at the cameras.
+"""Bounds of Gaussians in training: lengths, colors, and empty space around the cameras.
 
-What few photos see may grow into a sheet across the scene, or hang where only a new view looks through it.
+Gaussians that few photos see may grow into sheets across the scene, or float where only new views see them.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from lang3dxl_ns.components.initialization import color_parameters
 LONGEST = 1.0
 """Longest standard deviation, relative to the scene's radius or, outside, to the distance from its center."""
 NEEDLE = 0.25
-"""The same for Gaussians more than twice as long as wide; ground and distant hills are wide."""
+"""Like `LONGEST`, for Gaussians more than twice as long as wide; ground and distant hills are wide."""
 EVERY = 10
-"""Training steps from one correction to the next: with harmonics it takes a fifth of a short step."""
+"""Training steps between two corrections; with harmonics, one takes a fifth of the time of a short step."""
 FREE = 0.02
 """Radius of the space around every training camera that stays empty, relative to the scene's radius."""
 _STEEPEST = 0.5
-"""Norm of a color's harmonics above degree 0, per channel."""
+"""Largest norm of a color's harmonics above degree 0, per channel."""
 _ROWS = 16_384
-"""Gaussians at a time, to bound memory."""
+"""Number of Gaussians processed at a time, to bound memory."""
 
 
 @torch.no_grad()
@@ -33,9 +33,10 @@ def keep_in_bounds(
     """Shorten Gaussians that are too long and bring their colors to 0…1, in place.
 
     Args:
-        gaussians: parameters, as of `initial_gaussians`, with colors of harmonics up to `degree`.
-        center, radius: of the scene, world units.
-        first: Gaussians before this one, the sky's, stay as they are.
+        gaussians: parameters like those of `initial_gaussians`.
+        center, radius: center and radius of the scene, world units.
+        first: row of the first Gaussian to change; those before it are the sky's.
+        degree: degree of the colors' spherical harmonics.
     """
     g = {name: parameter[first:] for name, parameter in gaussians.items()}
     away = (g["means"] - to_device(center, g["means"].device)).norm(dim=1, keepdim=True).clamp_min(radius)
@@ -52,6 +53,6 @@ def keep_in_bounds(
 def near_cameras(
     means: Float[Tensor, "n 3"], cameras: Float[Tensor, "p 3"], distance: float
 ) -> Bool[Tensor, " n"]:
-    """Which positions lie within a distance of one of the cameras, all in world units."""
+    """Return which positions lie within a distance of any of the cameras, all in world units."""
     cameras = cameras.to(means)
     return torch.cat([torch.cdist(some, cameras).amin(1) < distance for some in means.split(_ROWS)])

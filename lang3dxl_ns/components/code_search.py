@@ -1,7 +1,7 @@
-"""Search of codes that a trained field decodes to given features: in a list, then by Gauss-Newton steps.
+"""Search for codes that a trained field decodes to given features: in a list, then by Gauss-Newton steps.
 
 The field's last layer is linear, d = W h + b, so the error |d − f|² = hᵀG h − 2 hᵀy + const with G = WᵀW and
-y = Wᵀ(f − b): beyond y, its cost depends on the hidden width alone, not on that of the features.
+y = Wᵀ(f − b). Once y is known, its cost depends on the hidden width alone, not on the width of the features.
 """
 
 from __future__ import annotations
@@ -18,21 +18,23 @@ Head = tuple[Float[Tensor, "c hidden"], Float[Tensor, " c"]]
 
 _STEPS = 6
 _AXES = 32
-"""Principal components of the decoded features in which the nearest is searched."""
+"""Number of principal components of the decoded features in which the nearest is searched."""
 _LISTED = 8_192
-"""Codes that are searched."""
+"""Largest number of codes that are searched."""
 _DIFFERENCE = 1e-2
-"""Step of the finite differences: a quarter of a cell of the finest level."""
+"""Step of the finite differences, which is of the order of a cell of the finest level."""
 _FARTHEST = 6.0
-"""Largest code, beyond which a sigmoid says nothing new."""
+"""Largest absolute value of a code; beyond it, the sigmoid hardly changes."""
 
 
 @torch.no_grad()
 def nearest(
     field: SemanticField, head: Head, codes: Float[Tensor, "m code"], features: Float[Tensor, "n c"]
 ) -> Float[Tensor, "n code"]:
-    """For each feature one of the codes that decodes to about the nearest one (by the leading principal
-    components of what they decode to; of evenly chosen codes if they are many)."""
+    """Find, for each feature, the code that decodes nearest to it.
+
+    Distances are measured in the leading principal components of the decoded features. Of more than
+    `_LISTED` codes, evenly spaced ones are searched."""
     codes = codes[:: -(-len(codes) // _LISTED)]
     decoded = F.linear(field.hidden(codes), *head)
     mean = decoded.mean(0)
@@ -47,7 +49,9 @@ def nearest(
 def settle(
     field: SemanticField, head: Head, codes: Float[Tensor, "n code"], features: Float[Tensor, "n c"]
 ) -> Float[Tensor, "n code"]:
-    """Codes that decode nearer to the features than these, or as near (Levenberg 1944, Marquardt 1963)."""
+    """Move codes so that they decode nearer to the features (Levenberg 1944, Marquardt 1963).
+
+    A code for which no step is better is returned as it is."""
     weight, bias = head
     gram, wanted = weight.T @ weight, (features - bias) @ weight
 

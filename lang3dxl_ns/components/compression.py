@@ -1,10 +1,10 @@
 """Compression of per-Gaussian features to a few numbers each, decoded by a semantic field.
 
-A direct regression, without rendering. Each Gaussian is decoded before compositing, so codes of neighbors
-never blend into a third one with another meaning.
+The codes are found by direct regression, without rendering. Each Gaussian is decoded before compositing, so
+codes of neighbors never blend into a third one with another meaning.
 
-The field is trained on a sample of the Gaussians; then every Gaussian gets the code that decodes nearest to
-its feature, so that the work beyond the sample is one search per Gaussian.
+The field is trained on a sample of the Gaussians. Then every Gaussian gets the code that decodes nearest to
+its feature, so the work beyond the sample is one search per Gaussian.
 """
 
 from __future__ import annotations
@@ -28,63 +28,64 @@ from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldCo
 GOOD = 0.95
 """Mean centered cosine below which codes get more numbers."""
 CODE_DIMS = (3, 4, 6)
-"""Numbers per code, tried in turn unless the settings say how many."""
+"""Numbers per code that are tried in turn, unless the settings fix one."""
 _LEAST_MASS = 1.0
 """Pixels, over all photos, that a Gaussian needs to take part in choosing the initial axes of the codes."""
 _REACH = 3.0
-"""Initial codes lie within this many standard deviations."""
+"""Largest initial code, in standard deviations."""
 _ROWS = 16_384
-"""Gaussians at a time, to bound memory."""
+"""Number of Gaussians processed at a time, to bound memory."""
 _SECONDS_PER_DRAW, _SECONDS_PER_GAUSSIAN = 1e-5, 1e-4
-"""Of one core, to announce how long it will take."""
+"""Time on one core per Gaussian drawn in a step and per Gaussian searched, for the announced duration."""
 _MOST_GROWTH = 3
-"""Beyond, time grows and the features hardly come nearer (docs/scale.md)."""
+"""Largest factor of steps and sample; more takes longer and hardly improves the features (docs/scale.md)."""
 _SEARCHES = (0.4, 0.6, 0.8)
-"""Fractions of the steps after which the sample's codes are searched anew: descent alone leaves some of them
-in the wrong place for good."""
+"""Fractions of the steps after which the sample's codes are searched anew, because descent alone leaves some
+of them in the wrong place."""
 
 
 @dataclass
 class CompressionConfig:
-    """Settings of the regression."""
+    """Settings of the compression of features to codes."""
 
     steps: int = 1_000
-    """Number of steps, up to three times as many for many Gaussians."""
+    """Number of training steps. Scenes with many Gaussians take up to three times as many."""
     batch: int = 3_072
-    """Gaussians per step."""
+    """Number of Gaussians per step."""
     sample: int = 16_384
-    """Gaussians that the field is trained on, if there are more; up to three times as many."""
+    """Number of Gaussians that the field is trained on. Scenes with many take up to three times as many."""
     code_rate: float = 2e-2
     """Adam's learning rate for the codes."""
     field_rate: float = 1e-2
     """Adam's learning rate for the field."""
 
     def growth(self, count: int) -> int:
-        """Factor of steps and sample for so many Gaussians: the root of their number in samples, at most 3.
-        A field that has seen few of many fits those few, and the others less."""
+        """Compute the factor of steps and sample for `count` Gaussians: √(count / sample), rounded, in 1…3.
+
+        A field that has seen few of many Gaussians matches those few, and the others less."""
         return min(max(round(math.sqrt(count / self.sample)), 1), _MOST_GROWTH)
 
     def grown(self, count: int) -> CompressionConfig:
-        """The settings for so many Gaussians."""
+        """Return the settings for `count` Gaussians."""
         factor = self.growth(count)
         return replace(self, steps=factor * self.steps, sample=factor * self.sample)
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """Features gathered onto Gaussians, all of them with mass."""
+    """Features gathered onto Gaussians, all of which have mass."""
 
     features: Float[Tensor, "n c"]
     mass: Float[Tensor, " n"]
     basis: PrincipalBasis | None
-    """What the features are coordinates in; None: they are features of CLIP themselves."""
+    """Basis in which the features are coordinates; None if they are CLIP features themselves."""
 
     def rows(self, rows: Int[Tensor, " m"], like: Tensor) -> Float[Tensor, "m c"]:
-        """Features of some Gaussians, on a device."""
+        """Return the features of some Gaussians, on the device of `like`."""
         return to_device(self.features[rows.to(self.features.device)], like.device)
 
     def sample(self, size: int, generator: torch.Generator | None) -> Gathered:
-        """Gaussians drawn by √mass, so that small things count beside walls; all if they are no more."""
+        """Draw `size` Gaussians by √mass, so that small things count beside walls; keep all if fewer."""
         if len(self.mass) <= size:
             return self
         # The largest of log(u) / w is drawn with probability ∝ w (Efraimidis & Spirakis 2006).
@@ -96,7 +97,7 @@ class Gathered:
 def seen_by_photos(
     features: Float[Tensor, "n c"], mass: Float[Tensor, " n"], basis: PrincipalBasis | None
 ) -> Gathered:
-    """The Gaussians with mass, which some photo shows."""
+    """Select the Gaussians with mass, which are those that some photo shows."""
     seen = mass > 0
     return Gathered(features, mass, basis) if seen.all() else Gathered(features[seen], mass[seen], basis)
 
@@ -108,13 +109,14 @@ def fit(
     generator: torch.Generator | None = None,
     advance: Callable[[], None] = lambda: None,
 ) -> Float[Tensor, "m code"]:
-    """Train the field and codes of these Gaussians together. The loss is the mean absolute difference over
-    Gaussians drawn with probability √mass."""
+    """Train the field and the codes of these Gaussians together, and return the codes.
+
+    The loss is the mean absolute difference over Gaussians drawn with probability ∝ √mass."""
     place = field.output_mean
     if not len(sample.mass):
         return place.new_empty(0, field.code_dim)
     basis, weight = None if sample.basis is None else sample.basis.to(place), sample.mass.sqrt()
-    if not field.dense_dim:  # otherwise it knows those of its targets, dense features among them
+    if not field.dense_dim:  # otherwise it already has statistics of its CLIP and dense targets
         field.set_output_statistics(*_statistics(sample.features, weight, basis))
     codes = nn.Parameter(_principal_codes(sample.features, sample.mass, field.code_dim).to(place))
     groups = [
@@ -141,7 +143,7 @@ def fit(
             optimizer.step()
             schedule.step()
             advance()
-    optimizer.zero_grad()  # training may go on with this field
+    optimizer.zero_grad()  # training may continue with this field
     return codes.detach()
 
 
@@ -149,7 +151,7 @@ def fit(
 def _search(
     gathered: Gathered, field: SemanticField, codes: Float[Tensor, "m code"], basis: PrincipalBasis | None
 ) -> Float[Tensor, "n code"]:
-    """For every Gaussian the code that decodes nearest to its feature: the best of `codes`, moved on."""
+    """Find the code that decodes nearest to each Gaussian's feature: the best of `codes`, then refined."""
     head = _head(field, basis)
     found = [
         settle(field, head, nearest(field, head, codes, part), part)
@@ -162,7 +164,7 @@ def _search(
 def _head(
     field: SemanticField, basis: PrincipalBasis | None
 ) -> tuple[Float[Tensor, "c hidden"], Float[Tensor, " c"]]:
-    """The field's last layer, into the coordinates of the basis."""
+    """Return the field's last layer, with outputs in the coordinates of the basis."""
     weight, bias = field.clip_head()
     return (weight, bias) if basis is None else (basis.axes.T @ weight, basis.coordinates(bias))
 
@@ -174,7 +176,7 @@ def assign(
     known: Float[Tensor, "m code"],
     basis: PrincipalBasis | None = None,
 ) -> Float[Tensor, "n code"]:
-    """A code for every Gaussian with mass, NaN for the others. known: codes of a sample of the Gaussians."""
+    """Find a code for every Gaussian with mass, starting from the codes of a sample; NaN for the others."""
     codes = known.new_full((len(features), field.code_dim), torch.nan)
     if not len(known):
         return codes
@@ -192,8 +194,9 @@ def centered_cosine(
     codes: Float[Tensor, "n code"],
     basis: PrincipalBasis | None = None,
 ) -> float:
-    """Mean cosine of decoded and given features, both less the mean feature: 1 if nothing is lost. (Without
-    centering even the mean feature alone has a cosine above 0.9 with all others.)"""
+    """Compute the mean cosine of decoded and given features, both less the mean feature.
+
+    It is 1 if nothing is lost. Without centering, even the mean feature has a cosine above 0.9 with all."""
     if not len(features):
         return 1.0
     basis = None if basis is None else basis.to(codes)
@@ -208,7 +211,7 @@ def centered_cosine(
 def _statistics(
     features: Float[Tensor, "n c"], weight: Float[Tensor, " n"], basis: PrincipalBasis | None
 ) -> tuple[Float[Tensor, " clip"], Float[Tensor, " clip"]]:
-    """Weighted mean and standard deviation per channel of CLIP, the latter at least 1 % of their average."""
+    """Compute weighted mean and deviation per CLIP channel; deviations are at least 1 % of their average."""
     share = (weight / weight.sum())[:, None]
     mean = (share * features).sum(0)
     if basis is None:
@@ -224,7 +227,7 @@ def _statistics(
 def _principal_codes(
     features: Float[Tensor, "n c"], mass: Float[Tensor, " n"], code_dim: int
 ) -> Float[Tensor, "n code"]:
-    """The first principal components of the features, each divided by its deviation."""
+    """Compute the first principal components of the features, each divided by its deviation."""
     chosen = mass >= _LEAST_MASS
     sample = features[chosen] if int(chosen.sum()) > code_dim else features
     mean = sample.mean(0)
@@ -236,7 +239,7 @@ def _principal_codes(
 
 
 class _LearningField(SemanticField):
-    """A semantic field that can learn codes of features gathered onto Gaussians."""
+    """Semantic field that can learn codes of features gathered onto Gaussians."""
 
     gathered_channels = 128
 
@@ -259,14 +262,15 @@ class _LearningField(SemanticField):
         return draws * _SECONDS_PER_DRAW + count * _SECONDS_PER_GAUSSIAN
 
     def _step(self, gaussians: int, advance: Callable[[], None]) -> Callable[[], None]:
-        """Called at every step, advances a bar that has as many steps whatever the number of Gaussians."""
+        """Return a callback for every step that advances a bar whose length doesn't depend on `gaussians`."""
         steps, growth = count(1), self.compression.growth(gaussians)
         return lambda: advance() if next(steps) % growth == 0 else None
 
 
 class CompressedField(_LearningField):
-    """The semantic field of a scene whose features are gathered onto its Gaussians after training: it
-    decodes each Gaussian's code, before compositing. Until then there are no codes."""
+    """Semantic field of a scene whose features are gathered onto its Gaussians after training.
+
+    It decodes each Gaussian's code before compositing. During training there are no codes."""
 
     per_gaussian = True
     needs_lifting = True
@@ -287,7 +291,7 @@ class CompressedField(_LearningField):
         advance: Callable[[], None] = lambda: None,
         basis: PrincipalBasis | None = None,
     ) -> Float[Tensor, "n code"]:
-        """Codes of three numbers; of more if those lose too much and the settings leave it open."""
+        """Learn codes of three numbers, or of more if three lose too much and the settings allow it."""
         generator = torch.Generator().manual_seed(0)
         config = self.compression.grown(len(features))
         sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
@@ -315,22 +319,21 @@ class CompressedField(_LearningField):
         return codes
 
     def take(self, other: SemanticField) -> None:
-        """Become another field, of codes of any length."""
+        """Take over the weights and settings of another field, whose codes may have another length."""
         self.settings, self.code_dim = other.settings, other.code_dim
         self.grid, self.layers, self.output = other.grid, other.layers, other.output
         self.level_weights = other.level_weights
         self.set_output_statistics(other.output_mean, other.output_std)
 
     def fit_codes(self, codes: Float[Tensor, "n code"]) -> None:
-        """Make room for the weights of a field of such codes, to be loaded."""
+        """Resize the field to the length of these codes, so that the weights of their field can be loaded."""
         wide = codes.shape[1] if codes.dim() == 2 else 0
         if wide != self.code_dim and 2 <= wide <= MOST_DIMENSIONS:
             self.take(SemanticField(replace(self.config, code_dim=codes.shape[1]), self.clip_dim))
 
 
 class JointField(_LearningField):
-    """The semantic field whose codes are trained with the scene. They may start from features gathered onto
-    the Gaussians."""
+    """Semantic field whose codes are trained with the scene, and may start from gathered features."""
 
     def learn_gaussians(
         self,
@@ -339,7 +342,7 @@ class JointField(_LearningField):
         advance: Callable[[], None] = lambda: None,
         basis: PrincipalBasis | None = None,
     ) -> Float[Tensor, "n code"]:
-        """Codes from which training goes on, and a field that decodes them."""
+        """Learn codes from which training continues, and train the field to decode them."""
         generator = torch.Generator().manual_seed(0)
         config = self.compression.grown(len(features))
         step = self._step(len(features), advance)

@@ -1,12 +1,12 @@
 """Attenuated downsampler: from a decoded feature map to the grid of the CLIP targets.
 
 A CLIP target is a mean over crops of several sizes, so each cell covers a wide neighborhood. The
-downsampler blurs the decoded map likewise before the two are compared: a fixed kernel with the footprint of
-the crops, times learned per-pixel weights that choose what counts inside the window. It is used in training
-only; queries read the decoded map itself.
+downsampler blurs the decoded map likewise before the two are compared. It multiplies a fixed kernel with the
+footprint of the crops by learned per-pixel weights, which choose the pixels that count inside the window. It
+is used in training only; queries read the decoded map itself.
 
-Every kernel here is a sum of boxes, hence separable: sum_j A_j X B_jᵀ, where the small matrices A_j and B_j
-contain window, resize and centering along each axis.
+Every kernel here is a sum of boxes, and therefore separable: sum_j A_j X B_jᵀ, where the small matrices A_j
+and B_j contain window, resize and centering along each axis.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ KernelName = Literal["pyramid", "footprint", "box"]
 
 # exp(-2 * 30) is far above the smallest float32, so one maximum over the whole map serves every window.
 _LARGEST_BOUND_FOR_ONE_MAXIMUM = 30.0
-_ROUND_OFF = 1e-9  # of a window; smaller coverage is rounding error, not a pixel
+_ROUND_OFF = 1e-9  # share of a window; smaller coverage is rounding error, not a pixel
 
 
 @dataclass
 class DownsamplerConfig:
-    """How a decoded map is reduced to the target grid."""
+    """Settings of how a decoded map is reduced to the target grid."""
 
     kernel: KernelName | Literal["auto"] = "auto"
     """Fixed part of the weights. pyramid: nested squares from the smallest crop to the largest, growing by
@@ -44,18 +44,19 @@ class DownsamplerConfig:
     otherwise pyramid."""
     hidden: int | None = None
     """Width of the network that predicts the weights; 0 keeps the fixed kernel and builds no network. None:
-    512, as published, with the semantic field's presets `paper` and `official`; else 16, which is about
+    512, as published, with the semantic field's presets `paper` and `official`, otherwise 16, which is about
     thirty times as fast on a CPU."""
     logit_bound: float | None = 10.0
-    """Logits w become b·tanh(w/b), so that no pixel outweighs another by more than exp(2b). None leaves them
-    unbounded and takes a slower path that is stable for any logits."""
+    """Bound b of the learned weights' logits: w becomes b·tanh(w/b), so that no pixel outweighs another by
+    more than exp(2b). None leaves them unbounded and takes a slower path that is stable for any logits."""
     match: Literal["attenuated", "resize-features", "resize-target"] = "attenuated"
-    """How features and target are brought to one grid. The other choices are the paper's ablations: features
-    resized to the target's grid ("w/o AD (LR)"), or the target to the features' size ("w/o AD (HR)"),
-    bilinear; the settings above then have no effect."""
+    """How features and target are brought to one grid. attenuated: by this downsampler. The others are the
+    paper's ablations, for which the settings above have no effect. resize-features: features are resized
+    bilinearly to the target's grid ("w/o AD (LR)"). resize-target: the target is resized bilinearly to the
+    features' size ("w/o AD (HR)")."""
 
     def resolved(self, preset: str | None = None) -> DownsamplerConfig:
-        """The settings without `auto` and None, for the semantic field's preset."""
+        """Replace `auto` and None by the values for the semantic field's preset."""
         kernel, hidden = self.kernel, self.hidden
         if kernel == "auto":
             kernel = "box" if preset == "paper" else "pyramid"
@@ -65,7 +66,7 @@ class DownsamplerConfig:
 
 
 class SeparableKernel(NamedTuple):
-    """K[i, k, p, q] = sum_j rows[j, i, p] · columns[j, k, q]; sums to 1 over a window inside the map."""
+    """Kernel K[i, k, p, q] = sum_j rows[j, i, p] · columns[j, k, q], with sum 1 over a window in the map."""
 
     rows: Float[Tensor, "j hd h"]
     columns: Float[Tensor, "j wd w"]
@@ -74,9 +75,9 @@ class SeparableKernel(NamedTuple):
 class AttenuatedDownsampler(nn.Module):
     """Kernel- and attention-weighted mean of a feature map around every cell of a target grid (Lang3D-XL §3).
 
-    out(o) = Σ_i K(o, i) m_i exp(w_i) f_i / Σ_i K(o, i) m_i exp(w_i), with the kernel K centered on the cell,
-    the mask m, and logits w from three 3×3 convolutions over f. Parts of a window outside the map are left
-    out of both sums. The last convolution starts at zero: training starts from the plain kernel mean.
+    It is out(o) = Σ_i K(o, i) m_i exp(w_i) f_i / Σ_i K(o, i) m_i exp(w_i), with the kernel K centered on the
+    cell, the mask m, and logits w from three 3×3 convolutions over f. Both sums omit the part of a window
+    outside the map. The last convolution starts at zero, so training starts from the plain kernel mean.
     """
 
     def __init__(
@@ -96,8 +97,9 @@ class AttenuatedDownsampler(nn.Module):
         crop_sides: Sequence[float],
         mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
     ) -> tuple[Float[Tensor, "a b c"], Float[Tensor, "a b c"], Float[Tensor, "a b"]]:
-        """Features and target on one grid (the target's unless configured otherwise), and the cells' weight
-        (see `forward`)."""
+        """Bring features and target to one grid: the target's unless configured otherwise.
+
+        Return both, and the cells' loss weight (the share described in `forward`)."""
         inside = features.new_ones(features.shape[:2]) if mask is None else mask.to(features.dtype)
         if self.config.match == "resize-target":
             return features, _resized(target, (features.shape[0], features.shape[1])), inside
@@ -115,12 +117,13 @@ class AttenuatedDownsampler(nn.Module):
         crop_sides: Sequence[float],
         mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
     ) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
-        """Downsampled features, and the share of each window's kernel inside the map and the mask.
+        """Downsample features, and compute the share of each window's kernel inside the map and the mask.
 
-        grid: (rows, columns) of the target. crop_sides: sides of the crops that the target averages, smallest
-        first, as fractions of the photo's width; the map has the photo's aspect ratio. Where the share is 0,
-        features are 0 and pass no gradient; elsewhere it serves as the loss weight. Features outside the mask
-        have no influence. Raises ValueError for crop sides that are not positive and ascending.
+        `grid` is (rows, columns) of the target. `crop_sides` are the sides of the crops that the target
+        averages, smallest first, as fractions of the photo's width; the map has the photo's aspect ratio.
+        Where the share is 0, features are 0 and pass no gradient; elsewhere it serves as the loss weight.
+        Features outside the mask have no influence. Raises ValueError for crop sides that are not positive
+        and ascending.
         """
         masked = features if mask is None else features * mask.to(features.dtype)[..., None]
         logits = None if self.network is None else self.logits(masked)
@@ -148,7 +151,7 @@ class AttenuatedDownsampler(nn.Module):
         return mean(kernel, features, logits, inside), share
 
     def logits(self, features: Float[Tensor, "h w c"]) -> Float[Tensor, "h w"]:
-        """Log of the learned weight of every pixel, bounded as configured; zero without a network."""
+        """Compute the log of every pixel's learned weight, bounded as configured; zero without a network."""
         if self.network is None:
             return features.new_zeros(features.shape[:2])
         logits = self.network(features.permute(2, 0, 1)[None])[0, 0]
@@ -162,7 +165,7 @@ def mean_with_one_maximum(
     logits: Float[Tensor, "h w"],
     mask: Float[Tensor, "h w"],
 ) -> Float[Tensor, "hd wd c"]:
-    """Weighted mean of every window, with one shift of the logits for the whole map; for bounded logits."""
+    """Compute every window's weighted mean with one shift of the (bounded) logits for the whole map."""
     weights = torch.exp(logits - logits.detach().max()) * mask
     mass = apply_kernel(kernel, weights[..., None]).squeeze(-1)
     return _divide(apply_kernel(kernel, features * weights[..., None]), mass)
@@ -174,11 +177,11 @@ def mean_with_window_maxima(
     logits: Float[Tensor, "h w"],
     mask: Float[Tensor, "h w"],
 ) -> Float[Tensor, "hd wd c"]:
-    """Weighted mean of every window, each with its own shift of the logits; for any logits, −∞ included.
+    """Compute every window's weighted mean with its own shift of the logits; for any logits, −∞ included.
 
-    Axis by axis: along y every window has its own maximum, subtracted before `exp`; along x those maxima are
-    the logits. Only differences of logits are taken, and no logarithm. A shift changes no mean, so the maxima
-    carry no gradient.
+    This works axis by axis. Along y every window has its own maximum, which is subtracted before `exp`; along
+    x those maxima are the logits. Only differences of logits are taken, and no logarithm. A shift changes no
+    mean, so the maxima carry no gradient.
     """
     (boxes, hd, h), (_, wd, w) = kernel.rows.shape, kernel.columns.shape
     rows = kernel.rows.reshape(boxes * hd, h)
@@ -195,14 +198,14 @@ def mean_with_window_maxima(
 def _exp_shifted(
     logits: Float[Tensor, "b one_or_n a"], kernel: Float[Tensor, "n a"]
 ) -> tuple[Float[Tensor, "b n a"], Float[Tensor, "b n"]]:
-    """kernel · exp(logits − their maximum where the kernel is not 0), and that maximum (−∞ for none)."""
+    """Compute kernel · exp(logits − m) and m, the logits' maximum where the kernel is not 0 (−∞ for none)."""
     inside = torch.where(kernel > 0, logits, -torch.inf)
     maxima = inside.detach().amax(-1)
     return kernel * torch.exp(inside - maxima.clamp(min=torch.finfo(maxima.dtype).min)[..., None]), maxima
 
 
 def apply_kernel(kernel: SeparableKernel, values: Float[Tensor, "h w c"]) -> Float[Tensor, "hd wd c"]:
-    """sum_j A_j X B_jᵀ for every channel, by two matrix products in the cheaper order."""
+    """Compute sum_j A_j X B_jᵀ for every channel, by two matrix products in the cheaper order."""
     (boxes, hd, h), (_, wd, w) = kernel.rows.shape, kernel.columns.shape
     c = values.shape[-1]
     if hd * w * (h + wd) <= wd * h * (w + hd):
@@ -224,14 +227,16 @@ def separable_kernel(
     dtype: torch.dtype,
     device: torch.device,
 ) -> SeparableKernel:
-    """The kernel's matrices for a map of this size, a target grid and crop sides (fractions of the width)."""
+    """Build the kernel's matrices for a map size, a target grid and crop sides (fractions of the width).
+
+    Raises ValueError for crop sides that are not positive and ascending."""
     if not sides or sides[0] <= 0 or list(sides) != sorted(sides):
         raise ValueError(f"crop_sides must be positive and ascending, smallest first; got {sides}")
     if name == "footprint":
         rows, columns = _footprint_rows(size, grid, sides, axis=0), _footprint_rows(size, grid, sides, axis=1)
         masses = torch.full((len(sides),), 1 / len(sides), dtype=torch.float64)
     elif name == "pyramid":
-        # The published weights are (2√2)^-j per unit of area; times the area of square j that is √2^-j.
+        # The published weights are (2√2)^-j per unit of area; times the area of square j, they are √2^-j.
         count = 1 + math.floor(2 * math.log2(sides[-1] / sides[0]) + 1e-6)
         squares = [sides[0] * size[1] * math.sqrt(2) ** j for j in range(count)]
         rows, columns = _nested_rows(size[0], grid[0], squares), _nested_rows(size[1], grid[1], squares)
@@ -244,12 +249,12 @@ def separable_kernel(
 
 
 def _resized(values: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:
-    """As the paper's ablations resize: bilinear, from the nearest pixels alone."""
+    """Resize like the paper's ablations: bilinearly, from the nearest pixels alone (no antialiasing)."""
     return F.interpolate(values.permute(2, 0, 1)[None], grid, mode="bilinear")[0].permute(1, 2, 0)
 
 
 def _nested_rows(size: int, cells: int, sides: Sequence[float]) -> Float[Tensor, "j n a"]:
-    """Windows of the given sides (pixels) around the center of every cell of an axis."""
+    """Build windows of the given sides (pixels) around the center of every cell of an axis."""
     centers = (torch.arange(cells, dtype=torch.float64) + 0.5) * (size / cells)
     return torch.stack([_window_means(size, centers, side) for side in sides])
 
@@ -257,7 +262,7 @@ def _nested_rows(size: int, cells: int, sides: Sequence[float]) -> Float[Tensor,
 def _footprint_rows(
     size: tuple[int, int], grid: tuple[int, int], sides: Sequence[float], axis: int
 ) -> Float[Tensor, "j n a"]:
-    """Crops of every scale along an axis, and the bilinear resize of their grid to the target's.
+    """Combine the crops of every scale along an axis with the bilinear resize of their grid to the target's.
 
     Crops of one scale overlap by about half; their centers are the middles of equal cells.
     """
@@ -274,14 +279,14 @@ def _footprint_rows(
 
 
 def _bilinear_rows(source: int, target: int) -> Float[Tensor, "target source"]:
-    """Bilinear resize of an axis, cell centers at (i + 0.5) / n (align_corners=False)."""
+    """Build the bilinear resize of an axis, with cell centers at (i + 0.5) / n (align_corners=False)."""
     position = (torch.arange(target, dtype=torch.float64) + 0.5) * (source / target) - 0.5
     distance = position.clamp(0, source - 1)[:, None] - torch.arange(source, dtype=torch.float64)
     return (1 - distance.abs()).clamp(min=0)
 
 
 def _window_means(size: int, centers: Float[Tensor, " n"], side: float) -> Float[Tensor, "n a"]:
-    """Weights of an axis' pixels in windows of the given side, as shares of the whole window.
+    """Compute the weights of an axis' pixels in windows of the given side, as shares of the whole window.
 
     A pixel counts by the part of it that the window covers, sampled at that part's center by interpolating
     between neighboring pixels. So whole pixels are averaged, a window narrower than a pixel interpolates,
@@ -302,7 +307,7 @@ def _window_means(size: int, centers: Float[Tensor, " n"], side: float) -> Float
 
 
 def _weight_network(channels: int, hidden: int, generator: torch.Generator | None) -> nn.Sequential:
-    """Three 3×3 convolutions to one logit; initialized from the given generator alone."""
+    """Build three 3×3 convolutions to one logit, initialized from the given generator alone."""
     widths = (channels, hidden, hidden, 1)
     first, second, last = (
         nn.utils.skip_init(nn.Conv2d, a, b, kernel_size=3, padding=1) for a, b in pairwise(widths)
@@ -313,10 +318,10 @@ def _weight_network(channels: int, hidden: int, generator: torch.Generator | Non
     for layer in (first, second, last):
         nn.init.zeros_(layer.bias)
     network = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
-    # The map is channels-last; weights in the same layout halve the convolutions' time on a CPU.
+    # The map is channels-last, and weights in the same layout halve the convolutions' time on a CPU.
     return nn.utils.convert_conv2d_weight_memory_format(network, torch.channels_last)
 
 
 def _divide(total: Float[Tensor, "hd wd c"], mass: Float[Tensor, "hd wd"]) -> Float[Tensor, "hd wd c"]:
-    """total / mass, or 0 without gradient where mass (and so total) is 0."""
+    """Return total / mass, or 0 without gradient where mass (and so total) is 0."""
     return total / torch.where(mass > 0, mass, 1.0)[..., None]

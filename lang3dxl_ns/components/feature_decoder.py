@@ -1,4 +1,4 @@
-"""Feature decoder interface: what Gaussians carry, what is rendered, how renderings become features."""
+"""Feature decoder interface: values that Gaussians carry, and how their renderings become features."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from lang3dxl_ns.components.principal_basis import PrincipalBasis
 
 
 class Decoder(nn.Module, ABC):
-    """Interface of the semantic field and of the baselines.
+    """Interface of the semantic field and the baselines.
 
-    The model gives every Gaussian `initial_codes`, renders what is `carried`, and decodes the rendered map.
+    The model gives every Gaussian `initial_codes`, renders `carried` values, and decodes the rendered map.
     Outputs are raw (not unit length) CLIP features and, if configured, dense features.
 
     Args:
@@ -32,7 +32,7 @@ class Decoder(nn.Module, ABC):
         self.register_buffer("output_std", torch.ones(clip_dim + dense_dim))
 
     name = ""
-    """What `baselines.decoders.make_decoder` makes it by."""
+    """Name of the decoder in `baselines.decoders.DecoderConfig`."""
     bounded = False
     """Whether codes are squashed by a sigmoid before they are decoded."""
     per_gaussian = False
@@ -40,34 +40,34 @@ class Decoder(nn.Module, ABC):
     needs_lifting = False
     """Whether the codes are computed from the photos after training instead of learned."""
     gathered_channels: int | None = None
-    """Principal components of CLIP features to gather, if those are wider; None: the features themselves."""
+    """Number of principal components to gather if CLIP features are wider; None gathers the features."""
 
     @abstractmethod
     def initial_codes(
         self, count: int, generator: torch.Generator | None = None
     ) -> Float[Tensor, "count code"] | None:
-        """Initial codes, one per Gaussian; None if Gaussians learn none."""
+        """Return initial codes, one per Gaussian; None if Gaussians learn none."""
 
     def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"] | None:
-        """Values to render, from the Gaussians' raw parameters; None for nothing (yet)."""
+        """Return the values to render, from the Gaussians' raw parameters; None if there are none (yet)."""
         return gaussians["codes"]
 
     @abstractmethod
     def forward(
         self, rendered: Float[Tensor, "*batch d"]
     ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
-        """CLIP and dense features of every pixel; dense is None without a dense head."""
+        """Decode the CLIP and dense features of every pixel; dense is None without a dense head."""
 
     def decode_clip(self, rendered: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch clip"]:
-        """CLIP features of every pixel."""
+        """Decode the CLIP features of every pixel."""
         return self(rendered)[0]
 
     def hidden(self, carried: Float[Tensor, "n d"]) -> Float[Tensor, "n r"]:
-        """Input of the last layer, `clip_head`, which outputs CLIP features."""
+        """Compute the input of the last layer, `clip_head`, which outputs CLIP features."""
         return self.decode_clip(carried)
 
     def clip_head(self) -> tuple[Float[Tensor, "clip r"], Float[Tensor, " clip"]] | None:
-        """The linear last layer of `decode_clip`: weight and bias. None if `hidden` is the feature."""
+        """Return weight and bias of `decode_clip`'s linear last layer; None if `hidden` is the feature."""
         return None
 
     def learn_gaussians(
@@ -77,11 +77,13 @@ class Decoder(nn.Module, ABC):
         advance: Callable[[], None] = lambda: None,
         basis: PrincipalBasis | None = None,
     ) -> Float[Tensor, "n code"]:
-        """Codes for features gathered onto the Gaussians, if the decoder `needs_lifting`.
+        """Learn codes for features gathered onto the Gaussians.
 
-        mass: pixels that each Gaussian fills; 0 for those visible in no photo. advance: called
-        `learning_steps` times during the work. basis: what the features are coordinates in, if they are wider
-        than `gathered_channels`.
+        Args:
+            features: CLIP features, or their coordinates in `basis`.
+            mass: pixels that each Gaussian fills; 0 for those that no photo shows.
+            advance: called `learning_steps` times during the work.
+            basis: basis of the coordinates, if CLIP features are wider than `gathered_channels`.
         """
         raise NotImplementedError
 
@@ -89,33 +91,33 @@ class Decoder(nn.Module, ABC):
     """Number of steps of `learn_gaussians`."""
 
     learned: str | None = None
-    """What `learn_gaussians` has to tell, in a sentence."""
+    """Result of `learn_gaussians` in a sentence, for the log; None if there is nothing to report."""
 
     def learning_seconds(self, count: int) -> float:
-        """About how long `learn_gaussians` takes for so many Gaussians on one core."""
+        """Estimate the seconds that `learn_gaussians` takes for `count` Gaussians on one core."""
         return 0.0
 
     def picture(self, carried: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch 3"]:
-        """The first three channels as colors in [0, 1]."""
+        """Convert the first three channels to colors in [0, 1]."""
         colors = carried[..., :3].sigmoid()
         missing = 3 - colors.shape[-1]
         return torch.cat([colors, *[colors[..., :1]] * missing], dim=-1)
 
     @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Optimizer groups by name."""
+        """Return the parameters by optimizer group."""
 
     def own_losses(
         self, clip: Float[Tensor, "h w clip"], dense: Float[Tensor, "h w dense"] | None
     ) -> dict[str, Float[Tensor, ""]]:
-        """The decoder's own losses on a decoded map, already weighted."""
+        """Compute the decoder's own losses on a decoded map, already weighted."""
         return {}
 
     def learn_targets(self, targets: Callable[[], Iterable[Float[Tensor, "h w clip"]]]) -> None:
-        """Called before training with the photos' CLIP targets."""
+        """Learn from the photos' CLIP targets. The model calls this before training."""
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
-        """Per-channel mean and deviation of the targets, CLIP then dense.
+        """Set the per-channel mean and deviation of the targets, CLIP then dense.
 
         Raises:
             ValueError: wrong number of channels, a non-finite value, or a negative deviation.

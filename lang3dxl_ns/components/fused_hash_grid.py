@@ -19,18 +19,18 @@ from torch.autograd.function import once_differentiable
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
 
 _POINTS = 1024
-"""Fewest points per thread."""
+"""Smallest number of points per thread."""
 
 
 class Lattices(NamedTuple):
-    """Levels of a grid, as the kernels take them."""
+    """Levels of a grid, in the form that the kernels take."""
 
     cells: Int[Array, " levels"]
-    """Cells per unit: two fewer than vertices per axis."""
+    """Cells per unit, which are two fewer than vertices per axis."""
     offsets: Int[Array, " levels"]
     """First table row of each level."""
     dense_levels: int
-    """Levels whose vertices have a row each; finer ones are hashed."""
+    """Number of levels whose vertices have a row each; finer levels are hashed."""
     mask: int
     """Largest row of a hashed level."""
     primes: Int[Array, " d"]
@@ -43,9 +43,9 @@ def interpolate(
     lattices: Lattices,
     level_weights: Float[Tensor, " levels"],
 ) -> Float[Tensor, "n out"]:
-    """Features of points, as `HashGrid.forward` defines them; differentiable in points and table.
+    """Interpolate the features of points like `HashGrid.forward`; differentiable in points and table.
 
-    Points and table: on the CPU, of one number type, float32 or float64.
+    Points and table must be on the CPU and of one number type, float32 or float64.
     """
     return _Interpolate.apply(x, table, lattices, level_weights)
 
@@ -66,7 +66,7 @@ class _Interpolate(torch.autograd.Function):
         x, table, _ = ctx.arrays
         grad, levels = upstream.contiguous().numpy(), len(ctx.lattices.cells)
         grad_table = np.zeros_like(table)
-        # A thread per range of levels: no two of them add to the same rows.
+        # Each thread has a range of levels, so no two of them add to the same rows.
         shared = (*ctx.arrays, ctx.lattices, grad, grad_table, ctx.needs_input_grad[0])
         parts = in_threads(_gradients, [(*part, *shared) for part in ranges(levels)])
         grad_x = sum(parts) if parts else np.zeros_like(x)
@@ -76,13 +76,14 @@ class _Interpolate(torch.autograd.Function):
 
 @numba.njit(forceinline=True)
 def _look_up(point, level, lattices, entries, sides):
-    """Table rows of the corners of a point's cell, and along every axis the weights of its two sides. Bit k
-    of a corner's number is its side along axis k."""
+    """Compute the table rows of a cell's corners, and the weights of its two sides along every axis.
+
+    Bit k of a corner's number is its side along axis k."""
     count, stride, one = lattices.cells[level], 1, sides.dtype.type(1)
     resolution = count + 2
     entries[0] = 0
     for axis in range(len(point)):
-        whole = np.floor(point[axis])  # separately, as in `HashGrid.forward`
+        whole = np.floor(point[axis])  # kept separate, as in `HashGrid.forward`
         position = (point[axis] - whole) * sides.dtype.type(count) + sides.dtype.type(0.5)
         lower = np.floor(position)
         sides[axis, 0], sides[axis, 1] = one - (position - lower), position - lower
@@ -106,7 +107,7 @@ def _look_up(point, level, lattices, entries, sides):
 
 @numba.njit(forceinline=True)
 def _weight(sides, corner, weight):
-    """A corner's weight, beginning with its level's."""
+    """Compute a corner's weight; `weight` is its level's."""
     for axis in range(len(sides)):
         weight *= sides[axis, corner >> axis & 1]
     return weight
@@ -133,8 +134,9 @@ def _features(first, last, x, table, level_weights, lattices, features):
 
 @kernel
 def _gradients(first, last, x, table, level_weights, lattices, grad, grad_table, of_points):
-    """Adds to the table's gradient; returns the points', as far as it comes from these levels (0 unless
-    `of_points`: it is two thirds of the work)."""
+    """Add to the table's gradient, and return the part of the points' gradient that comes from these levels.
+
+    The latter is two thirds of the work, and 0 unless `of_points`."""
     dimensions, width = x.shape[1], table.shape[1]
     entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
     grad_x = np.zeros_like(x)

@@ -1,8 +1,8 @@
-"""Sharpening of gathered CLIP features by dense ones: what looks alike may be called alike.
+"""Sharpening of gathered CLIP features by dense ones, assuming that things that look alike mean the same.
 
-A crop says one thing about all that it shows, so what is gathered from crops is blurred by their side; dense
-features are several times as fine. Gaussians with similar dense features form a group, and each moves part of
-the way to the mean of its group, where the blur of many places cancels.
+A crop yields a single feature for everything in it, so features gathered from crops are blurred at the crop's
+scale; dense features are several times as fine. Gaussians with similar dense features form a group. Each
+moves part of the way to the mean of its group, where the blur of many places cancels.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 DENSE_AXES = 32
-"""Principal components of the dense features that tell groups apart."""
+"""Number of principal components of the dense features by which groups are formed."""
 _GROUPS = 128
 _SHARE = 0.5
-"""Part of the way to the group's mean: the rest keeps what the group does not share."""
+"""Fraction of the way that a feature moves to its group's mean; the rest keeps individual differences."""
 _SAMPLE = 20_000
-"""Gaussians that the groups are found from."""
+"""Largest number of Gaussians from which groups are formed."""
 _ROWS = 65_536
-"""Gaussians at a time, to bound memory."""
+"""Number of Gaussians processed at a time, to bound memory."""
 
 
 def sharpen(
     features: Float[Tensor, "n c"], dense: Float[Tensor, "n r"], mass: Float[Tensor, " n"]
 ) -> Float[Tensor, "n c"]:
-    """Features moved half the way to the mean of their group; the sum of mass · feature stays the same.
+    """Move features half the way to the mean of their group, which keeps the sum of mass · feature.
 
     Args:
         features: gathered CLIP features of each Gaussian.
-        dense: gathered dense features, or coordinates of them in an orthonormal basis.
-        mass: pixels that each Gaussian fills, weighted; one without keeps its features, and affects none.
+        dense: gathered dense features, or their coordinates in an orthonormal basis.
+        mass: pixels that each Gaussian fills, weighted; one without mass keeps its features, affecting none.
     """
     seen = mass > 0
     if not seen.any():
@@ -51,10 +51,10 @@ def sharpen(
 
 
 def _groups(dense: Float[Tensor, "n r"], mass: Float[Tensor, " n"]) -> Int[Tensor, " n"]:
-    """The nearest of k-means centroids; Gaussians count by √mass, so that small things have groups too."""
+    """Find each Gaussian's nearest k-means centroid; weights are √mass, so small things have groups too."""
     from sklearn.cluster import KMeans
 
-    dense = dense - dense.mean(0)  # distances of what is far from 0 would cancel in float32
+    dense = dense - dense.mean(0)  # distances far from 0 would cancel in float32
     chosen = torch.arange(len(dense))
     if len(dense) > _SAMPLE:
         chosen = torch.linspace(0, len(dense) - 1, _SAMPLE, dtype=torch.float64).long()

@@ -1,9 +1,9 @@
 """Multi-resolution hash grid in plain torch, for spaces of two to six dimensions.
 
-Every level lays a regular lattice over the unit cube and keeps one feature vector per lattice vertex, in a
-table of bounded size: levels that fit are stored densely, finer ones share entries through a hash. A point
-reads the 2^d vertices of its cell on every level, interpolates linearly, and concatenates the levels (Müller
-et al., Instant Neural Graphics Primitives, 2022).
+Every level has a regular lattice over the unit cube, with one feature vector per vertex in a table of bounded
+size: levels that fit are stored densely, finer ones share entries through a hash. A point reads the 2^d
+vertices of its cell on every level, interpolates linearly, and concatenates the levels (Müller et al.,
+Instant Neural Graphics Primitives, 2022).
 """
 
 import math
@@ -20,35 +20,36 @@ HASH_PRIMES = (1, 2654435761, 805459861, 3674653429, 2097192037, 1434869437)
 MOST_DIMENSIONS = len(HASH_PRIMES)
 INITIAL_RANGE = 1e-4
 COORDINATE_LIMIT = 1024.0
-"""Coordinates are clamped to ± this, where float32 still resolves an eighth of a cell 1/2048 wide."""
+"""Bound ± to which coordinates are clamped; float32 still resolves an eighth of a cell 1/2048 wide there."""
 
 _WIDEST_ROW_OF_KERNELS = 8
-"""Longer entries are faster to add up in torch, entry by entry in vectors."""
+"""Longest table entry for the kernels; torch adds up longer ones faster, entry by entry in vectors."""
 
 
 class HashGrid(nn.Module):
     """Trainable features over [0, 1]^d, differentiable in the table and in the coordinates (first order).
 
     A level of resolution r has r vertices per axis, and [0, 1] spans r - 2 cells, from half a cell inside the
-    lattice on either side: neither 0 nor 1 reads past the table or lies on a vertex. Outside [0, 1] the
-    lattice continues with entries already in use (dense levels repeat, hashed levels hash), so any
-    coordinate gives finite features, and has a gradient up to ± 1024, where it is clamped. A NaN coordinate
-    makes only its own output row NaN.
+    lattice on either side. So neither 0 nor 1 reads past the table or lies on a vertex. Outside [0, 1] the
+    lattice continues with entries already in use (dense levels repeat, hashed levels hash). Any coordinate
+    gives finite features, and has a gradient up to ± 1024, where it is clamped. A NaN coordinate makes only
+    its own output row NaN.
 
     Keep `max_resolution` as low as the task allows: Adam with a vanishing epsilon moves every touched entry
     equally far, so fine levels, which few samples constrain, grow as large as coarse ones.
 
     Args:
-        input_dim: d, 2 to 6.
+        input_dim: number of dimensions d, 2 to 6.
         levels: number of resolutions, in geometric progression from `min_resolution` to `max_resolution`;
             0 makes a grid without features.
         features_per_level: length of an entry.
-        log2_table_size: log2 of the most entries per level.
+        log2_table_size: log2 of the maximum number of entries per level.
+        min_resolution, max_resolution: vertices per axis of the coarsest and the finest level.
         generator: source of the uniform ± 1e-4 initial values.
     """
 
     kernels: str | None = None
-    """"numba" or "torch": the kernels to take on a CPU; None: those that the environment chooses."""
+    """Kernels to use on a CPU, "numba" or "torch"; None for the environment's choice."""
 
     def __init__(
         self,
@@ -85,7 +86,7 @@ class HashGrid(nn.Module):
         self.offsets: Tensor
         self.dense_resolutions: Tensor
         offsets = [sum(sizes[:level]) for level in range(levels)]
-        # Integers, so that `.half()` and the like don't round them.
+        # They are integers, so that `.half()` and the like don't round them.
         self.register_buffer("cells", torch.tensor([r - 2 for r in resolutions]), persistent=False)
         self.register_buffer("offsets", torch.tensor(offsets), persistent=False)
         dense = torch.tensor(resolutions[: self.dense_levels], dtype=torch.int64)
@@ -94,10 +95,10 @@ class HashGrid(nn.Module):
     def forward(
         self, x: Float[Tensor, "n d"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> Float[Tensor, "n out"]:
-        """Interpolated features of every point; `level_weights` scales each level (see `coarse_to_fine`).
+        """Interpolate the features of every point; `level_weights` scales each level (see `coarse_to_fine`).
 
-        Features have the table's number type. Coordinates are computed in at least float32: in 16 bits a
-        fine level would have no fractions left.
+        Features have the table's number type. Coordinates are computed in at least float32, because in 16
+        bits a fine level would have no fractions left.
         """
         if not self.levels:
             return x.new_zeros(len(x), 0)
@@ -107,7 +108,7 @@ class HashGrid(nn.Module):
         narrow = self.features_per_level <= _WIDEST_ROW_OF_KERNELS
         if narrow and takes_kernels(x, self.kernels) and x.dtype == self.table.dtype:
             return self._interpolated_by_kernels(x, level_weights)
-        # Whole units separately, as integers: far from 0 a float32 product has no digits left for a fraction.
+        # Whole units are separate integers: far from 0, a float32 product has no digits left for a fraction.
         whole = x.detach().floor()
         position = (x.detach() - whole).T[:, None] * self.cells[:, None] + 0.5
         lower = position.floor()
@@ -126,15 +127,15 @@ class HashGrid(nn.Module):
         return interpolate(x.contiguous(), self.table.contiguous(), lattices, weights.contiguous())
 
     def coarse_to_fine(self, fraction: float) -> Float[Tensor, " levels"]:
-        """Level weights: only the coarsest level open at fraction 0, all at 1; the newest one fades in."""
+        """Compute level weights: at fraction 0 the coarsest level is open, at 1 all; the newest fades in."""
         opened = 1 + min(max(fraction, 0.0), 1.0) * (self.levels - 1)
         amount = (opened - torch.arange(self.levels, dtype=torch.float64)).clamp(0, 1)
         return (0.5 - 0.5 * torch.cos(math.pi * amount)).to(self.table)
 
     def _vertex_entries(self, lower: Int[Tensor, "d levels n"]) -> Int[Tensor, "corners levels n"]:
-        """Table rows of the corners of each point's cell; the last axis varies fastest.
+        """Compute the table rows of the corners of each point's cell; the last axis varies fastest.
 
-        Any integer is a valid vertex, even what NaN was converted to.
+        Any integer is a valid vertex, even one that NaN was converted to.
         """
         vertices = torch.stack((lower, lower + 1), 1)
         dense, hashed = vertices[:, :, : self.dense_levels], vertices[:, :, self.dense_levels :]
@@ -152,7 +153,7 @@ class HashGrid(nn.Module):
 
 def _resolutions(levels: int, lowest: int, highest: int) -> list[int]:
     growth = (highest / lowest) ** (1 / max(levels - 1, 1))
-    # Rounding first: otherwise rounding error could make the finest level highest + 1.
+    # Without rounding first, rounding error could make the finest level highest + 1.
     return [math.ceil(round(lowest * growth**level, 6)) for level in range(levels)]
 
 
@@ -163,14 +164,14 @@ def _round_up(value: int, multiple: int) -> int:
 class _Interpolate(torch.autograd.Function):
     """Multilinear interpolation of table rows, all levels at once.
 
-    Written by hand because autograd through `embedding_bag` takes two to three times as long on a CPU. Here
-    the derivative along an axis is the same interpolation with that axis' weights (1 - t, t) replaced by
+    It is written by hand because autograd through `embedding_bag` takes two to three times as long on a CPU.
+    Here the derivative along an axis is the same interpolation with that axis' weights (1 - t, t) replaced by
     (-s, s), where s is the number of cells per unit.
     """
 
     @staticmethod
     def forward(ctx, x, table, index, fraction, cells, level_weights):
-        # Points vary fastest in `index` and `fraction`, which suits elementwise work; in bags, corners do.
+        # Points vary fastest in `index` and `fraction`, which suits elementwise work; corners do in bags.
         rows = _as_bags(index)
         axis_weights = torch.stack((1 - fraction, fraction), 1)
         weights = _as_bags(_corner_weights(list(axis_weights), level_weights)).to(table.dtype)
@@ -205,7 +206,7 @@ class _Interpolate(torch.autograd.Function):
 def _corner_weights(
     factors: list[Float[Tensor, "2 levels n"]], level_weights: Float[Tensor, " levels"] | None
 ) -> Float[Tensor, "corners levels n"]:
-    """Products of the axes' weights over all corners of a cell, in the order of `_vertex_entries`."""
+    """Multiply the axes' weights for all corners of a cell, in the order of `_vertex_entries`."""
     weights = factors[0] if level_weights is None else factors[0] * level_weights[:, None]
     for factor in factors[1:]:
         weights = (weights[:, None] * factor).flatten(0, 1)
@@ -213,14 +214,14 @@ def _corner_weights(
 
 
 def _as_bags(per_corner: Tensor) -> Tensor:
-    """[corners, levels, n] to contiguous [n · levels, corners]."""
+    """Reorder [corners, levels, n] to contiguous [n · levels, corners]."""
     return per_corner.permute(2, 1, 0).reshape(-1, per_corner.shape[0])
 
 
 def _table_gradient_sorted(
     entries: int, rows: Int[Tensor, "b c"], weights: Float[Tensor, "b c"], grad: Float[Tensor, "b f"]
 ) -> Float[Tensor, "entries f"]:
-    """Sort the samples by table row; each row's gradient is then one weighted bag of output gradients."""
+    """Sort the samples by table row, so that each row's gradient is one weighted bag of output gradients."""
     order = rows.flatten().argsort()
     counts = torch.bincount(rows.flatten(), minlength=entries)
     return F.embedding_bag(

@@ -1,4 +1,4 @@
-"""Initial Gaussians of training: from the COLMAP points, and a sky."""
+"""Initial Gaussians of training: one per COLMAP point, and a sky."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from lang3dxl_ns.scene.geometry import sphere_around
 
 FIRST_OPACITY = 0.1
 FEWEST = 4
-"""Fewest positions, so that each has three neighbors."""
+"""Smallest number of positions, so that each has three neighbors."""
 
 
 def seed_positions(
     points: tuple[Tensor, Tensor] | None, count: int, side: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Initial positions of Gaussians and their colors (0…1): those of points with colors in bytes or, without
-    points, `count` random ones in a box of a side, world units.
+    """Choose the initial positions of Gaussians and their colors (0…1).
 
-    Raises UserError if there are too few points.
+    They are those of the points (whose colors are bytes) or, without points, `count` random ones in a box
+    with this side in world units. Raises UserError if there are too few points.
     """
     if points is None:
         return (torch.rand(count, 3) - 0.5) * side, torch.rand(count, 3)
@@ -39,14 +39,15 @@ def seed_positions(
 def initial_gaussians(
     means: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], sky: int, degree: int
 ) -> dict[str, Parameter]:
-    """Parameters of the sky's Gaussians, then of one per position, as wide as the mean distance to its three
-    nearest neighbors.
+    """Create the parameters of the sky's Gaussians, then of one Gaussian per position.
+
+    Gaussians are as wide as the mean distance to their three nearest neighbors.
 
     Args:
         means: at least `FEWEST` positions, world units.
-        colors: at these positions, 0…1.
-        sky: Gaussians on a sphere around them.
-        degree: of the colors' spherical harmonics.
+        colors: colors at these positions, 0…1.
+        sky: number of Gaussians on a sphere around the positions.
+        degree: degree of the colors' spherical harmonics.
     """
     sphere = sphere_around(means, sky)
     means = torch.cat([sphere, means])
@@ -55,7 +56,7 @@ def initial_gaussians(
     return {
         "means": Parameter(means),
         "scales": Parameter(_spacing(means).log().repeat(1, 3)),
-        # Uniform over rotations; with its own generator, so that preparation does not affect it.
+        # Rotations are uniform, and drawn by their own generator, so that preparation does not affect them.
         "quats": Parameter(F.normalize(torch.randn(n, 4, generator=torch.Generator().manual_seed(0)), dim=1)),
         "features_dc": Parameter(color_parameters(colors, degree)),
         "features_rest": Parameter(torch.zeros(n, (degree + 1) ** 2 - 1, 3)),
@@ -64,7 +65,7 @@ def initial_gaussians(
 
 
 def color_parameters(colors: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n 3"]:
-    """Colors (0…1) as the model stores them: harmonics of degree 0, or logits where these are all."""
+    """Convert colors (0…1) to stored parameters: harmonics of degree 0, or logits if `degree` is 0."""
     return harmonics_of(colors)[:, 0] if degree > 0 else torch.logit(colors, eps=1e-4)
 
 

@@ -1,4 +1,4 @@
-"""Codes of finished Gaussians from photos' targets: gather, sharpen, compress."""
+"""Learning codes of finished Gaussians from the photos' targets: gather, sharpen, compress."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ DenseMaps = Callable[[], Iterable[Float[Tensor, "t t d"]]]
 
 @dataclass(frozen=True, eq=False)
 class TargetView:
-    """A photo's camera and its targets."""
+    """Camera and targets of a photo."""
 
     composite: Composite
-    """Composites values of the Gaussians as this camera sees them."""
+    """Function that composites values of the Gaussians as this camera sees them."""
     size: tuple[int, int]
-    """Rows and columns that it composites."""
+    """Rows and columns of the composited map."""
     clip: Float[Tensor, "hd wd c"]
-    """CLIP features, of any resolution."""
+    """CLIP features at any resolution."""
     dense: Float[Tensor, "t t d"] | None = None
     """Dense features of the photo squashed to a square."""
     mask: Bool[Tensor, "h w"] | None = None
-    """The foreground; None for everything."""
+    """Foreground; None if it is the whole photo."""
 
 
 def learn_codes(
@@ -42,16 +42,17 @@ def learn_codes(
     dense_targets: DenseMaps | None = None,
     advance: Callable[[], None] = lambda: None,
 ) -> Float[Tensor, "n code"]:
-    """Average the photos' targets over the Gaussians that they show, and let the decoder make codes of them.
-    NaN for Gaussians that no photo shows.
+    """Average the photos' targets over the Gaussians that they show, and let the decoder learn codes.
+
+    Codes of Gaussians that no photo shows are NaN.
 
     Args:
-        decoder: an encoder that `needs_lifting`; trained in place.
+        decoder: a decoder with `learn_gaussians`, which is trained in place.
         views: the photos, each once.
-        means: centers of the Gaussians; they tell number, type and device.
-        clip_targets: the CLIP targets of the views, to find a basis from.
-        dense_targets: their dense features; None: nothing is sharpened.
-        advance: called as the decoder learns, `decoder.learning_steps` times.
+        means: centers of the Gaussians, which determine number, type and device of the codes.
+        clip_targets: the CLIP targets of the views, from which a basis is computed.
+        dense_targets: the dense features of the views; None if features are not to be sharpened.
+        advance: called `decoder.learning_steps` times while the decoder learns.
     """
     basis = fine_basis = None
     width = channels = decoder.clip_dim
@@ -72,7 +73,7 @@ def learn_codes(
     features, mass = gather(len(means), targets(), channels, means)
     if fine_basis is not None:
         features = sharpen(features[:, :width], features[:, width:], mass)
-    # Features that are many lie on the CPU, and those that are codes themselves come from there.
+    # Many features are kept on the CPU, so codes that are features themselves come from there.
     return decoder.learn_gaussians(features, mass, advance, basis).to(means.device)
 
 

@@ -1,4 +1,4 @@
-"""A linear layer whose initial weights come from a generator of one's own."""
+"""Linear layer with initial weights from a given random generator."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ def linear(
     bias: bool = True,
     fan_in: int | None = None,
 ) -> nn.Linear:
-    """A linear layer with torch's default initial range, drawn from a generator.
+    """Create a linear layer with torch's default initial range, drawn from a generator.
 
     Args:
-        inputs, outputs: channels.
-        generator: source of the weights; None: torch's global one.
+        inputs, outputs: number of channels.
+        generator: source of the weights; None for torch's global generator.
         bias: whether to add a bias.
-        fan_in: inputs by which the range is chosen, for a layer that is part of a wider one.
+        fan_in: number of inputs that determines the range, for a layer that is part of a wider one.
     """
-    # Not torch's `skip_init`, which takes a third of a second to import at its first use.
+    # torch's `skip_init` would take a third of a second to import at its first use.
     with torch.random.fork_rng(devices=[]):
         layer = nn.Linear(1, 1, bias=bias)
     layer.in_features, layer.out_features = inputs, outputs

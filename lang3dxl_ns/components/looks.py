@@ -1,4 +1,4 @@
-"""Looks: what the photos' lighting makes of a scene's colors. Absent where photos share one lighting."""
+"""Looks: a scene's colors under the lighting of its photos. A scene with one lighting has none."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from lang3dxl_ns.scene.camera import Camera, in_view
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """The lighting of one photo."""
+    """Lighting of one photo."""
 
     field: AppearanceField
-    """A trained field, whose weights no longer change."""
+    """Trained field, whose weights no longer change."""
     vector: Float[Tensor, " v"]
-    """The photo's appearance code."""
+    """Appearance code of the photo."""
 
     @torch.no_grad()
     def apply(self, splats: Splats, camera: Camera, everywhere: bool = True) -> Splats:
-        """The Gaussians under this lighting, in colors as one camera sees them.
+        """Return the Gaussians under this lighting, in the colors that one camera sees.
 
         Args:
             splats: the Gaussians in the field's world frame.
-            camera: the view. Its position matters only where colors depend on it: the change of lighting
-                depends on the color that is seen.
-            everywhere: relight all Gaussians; False: only those that the camera may see.
+            camera: the view. Its position matters only if colors depend on it, because the change of lighting
+                depends on the visible color.
+            everywhere: whether to relight all Gaussians, or only those that the camera may see.
         """
         camera = camera.to(splats.means.device)
         rows = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
@@ -45,22 +45,22 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """The looks of a scene's training photos."""
+    """Looks of a scene's training photos."""
 
     field: AppearanceField
-    """A trained field, whose weights no longer change."""
+    """Trained field, whose weights no longer change."""
 
     @property
     def names(self) -> list[str]:
-        """Photos that have a look."""
+        """Names of the photos that have a look."""
         return self.field.names
 
     def of_photo(self, name: str) -> Look:
-        """The look of a training photo. Raises UserError if there is none of this name."""
+        """Return the look of a training photo. Raises UserError if none has this name."""
         return Look(self.field, self.field.vector(name).detach())
 
     def of_view(self, camera: Camera) -> Look:
-        """The look of a view that is no training photo, by the field's rule (`AppearanceConfig.unseen`)."""
+        """Choose a look for a view that is not a training photo, by the rule `AppearanceConfig.unseen`."""
         there = camera.to(self.field.vectors.device)
         return Look(self.field, self.field.vector_of_view(there.position, there.view_matrix[2, :3]).detach())
 
@@ -74,14 +74,14 @@ def render_in_look(
     background: Float[Tensor, "3"] | None = None,
     backend: Backend = "auto",
 ) -> Rendering:
-    """`render` under a photo's lighting.
+    """Render Gaussians under a photo's lighting.
 
-    Coverage, depth and further channels belong to the scene, not to a photo: where a look changes opacities,
+    Coverage, depth and further channels belong to the scene, not to a photo. If a look changes opacities,
     they are rendered separately, with the opacities of the scene.
 
     Args:
         splats: the Gaussians, world frame.
-        camera: where to render them from.
+        camera: the view.
         look: the lighting; None for the Gaussians' own colors.
         channels, background, backend: see `render`.
     """

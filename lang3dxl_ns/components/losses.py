@@ -30,7 +30,7 @@ def rgb_loss(
     mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
     ssim_weight: float = 0.5,
 ) -> Float[Tensor, ""]:
-    """(1 − w)·L1 + w·(1 − SSIM), colors in [0, 1]; SSIM's window is 11 pixels with σ 1.5.
+    """Compute (1 − w)·L1 + w·(1 − SSIM) of colors in [0, 1]; SSIM's window is 11 pixels with σ 1.5.
 
     L1 is a mean over the mask. SSIM sees the whole images, as in the published system. An image narrower than
     the window is extended by its border.
@@ -48,7 +48,7 @@ def clip_loss(
     target: Float[Tensor, "hd wd c"],
     weight: Bool[Tensor, "hd wd"] | Float[Tensor, "hd wd"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Mean absolute difference between downsampled features and the CLIP target, not normalized."""
+    """Compute the mean absolute difference of downsampled features and the CLIP target, not normalized."""
     return _weighted_mean((prediction - target).abs(), weight)
 
 
@@ -59,13 +59,13 @@ def dense_loss(
     weight: Bool[Tensor, "hw ww"] | Float[Tensor, "hw ww"] | None = None,
     compare_at: Literal["auto", "target"] = "auto",
 ) -> Float[Tensor, ""]:
-    """Mean absolute difference between decoded dense features and their target, on one grid.
+    """Compute the mean absolute difference between decoded dense features and their target, on one grid.
 
-    compare_at: "target" resizes the prediction to the target's grid, as in the published system. "auto"
-    resizes the target instead, which needs no gradient and costs a fraction, unless the target has less than
-    half as many cells as the prediction: then it would suppress detail that the target doesn't show. The
-    resize is bilinear and antialiased: it averages when shrinking, and keeps positions within a tenth of a
-    cell. The weight, of any size, is resized like the features.
+    With `compare_at` "target", the prediction is resized to the target's grid, as in the published system.
+    "auto" resizes the target instead, which needs no gradient and costs a fraction, unless the target has
+    less than half as many cells as the prediction: then it would suppress detail that the target doesn't
+    show. The resize is bilinear and antialiased: it averages when shrinking, and keeps positions within a
+    tenth of a cell. The weight, of any size, is resized like the features.
     """
     at_prediction = compare_at == "auto" and prediction.numel() <= 2 * target.numel()
     rows, columns, _ = (prediction if at_prediction else target).shape
@@ -81,10 +81,10 @@ def region_variance_loss(
     labels: Int[Tensor, "h w"],
     mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
 ) -> Float[Tensor, ""]:
-    """Variance of the features inside each region, summed over channels, averaged over the valid pixels.
+    """Compute the variance of features inside regions, summed over channels and averaged over valid pixels.
 
-    Σ_r Σ_{i∈r} ‖f_i − mean_r‖² / (number of valid pixels). Labels are any integers, negative for no region;
-    the mask is thresholded at 0.5. A region of one pixel only adds to the pixel count.
+    It is Σ_r Σ_{i∈r} ‖f_i − mean_r‖² / (number of valid pixels). Labels are any integers, negative for no
+    region; the mask is thresholded at 0.5. A region of one pixel only adds to the pixel count.
     """
     valid = labels >= 0 if mask is None else (labels >= 0) & (mask >= 0.5)
     features, valid = features.flatten(0, 1), valid.flatten()
@@ -98,13 +98,13 @@ def region_variance_loss(
 def _region_means(
     features: Float[Tensor, "n c"], labels: Int[Tensor, " n"]
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"]]:
-    """Mean of each pixel's region, as a rounded value and its rounding error.
+    """Compute the mean of each pixel's region, as a rounded value and its rounding error.
 
     Both are needed where features are large compared with their spread: subtract one, then the other. They
-    carry no gradient, and the loss above loses none: the deviations in a region sum to zero, and so does the
-    gradient through its mean.
+    carry no gradient. The loss above is still exact, because the deviations in a region sum to zero, and so
+    does the gradient through its mean.
     """
-    # Regions are numbered without asking how many there are, for which a GPU would have to be waited for.
+    # Regions are numbered without reading how many there are, which would synchronize a GPU.
     order = labels.argsort()
     ranked = labels[order]
     first = F.pad((ranked[1:] != ranked[:-1]).long(), (1, 0))
@@ -140,7 +140,7 @@ def _ssim(prediction: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) ->
 
 @functools.cache
 def _window(device: torch.device) -> Float[Tensor, "3 1 1 11"]:
-    """SSIM's Gaussian window, copied to a device once."""
+    """Return SSIM's Gaussian window, which is copied to a device once."""
     x = torch.arange(_SSIM_WINDOW, dtype=torch.float32) - _SSIM_WINDOW // 2
     weights = torch.exp(-(x**2) / (2 * 1.5**2))
     return to_device((weights / weights.sum()).expand(3, 1, 1, -1).contiguous(), device)

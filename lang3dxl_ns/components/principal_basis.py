@@ -1,4 +1,4 @@
-"""Principal components of features: the few directions in which those of one scene differ."""
+"""Principal components of features: the few directions in which the features of one scene differ."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class PrincipalBasis:
-    """An affine subspace of features: mean and orthonormal directions, of largest variance first."""
+    """Affine subspace of features: mean and orthonormal directions, in order of decreasing variance."""
 
     mean: Float[Tensor, " c"]
     axes: Float[Tensor, "c r"]
 
     @classmethod
     def of(cls, maps: Iterable[Float[Tensor, "*pixels c"]], most: int) -> PrincipalBasis:
-        """The first `most` principal components of all rows of all maps, which are read once; rows with a
-        value that isn't finite are left out. Moments are merged in float64 (Chan, Golub & LeVeque 1983).
+        """Compute the first `most` principal components of all rows of all maps, which are read once.
 
-        Raises ValueError if no row is left.
+        Rows with a value that isn't finite are left out. Moments are merged in float64 (Chan, Golub & LeVeque
+        1983). Raises ValueError if no row is left.
         """
         count, mean, scatter = 0, torch.zeros(()), torch.zeros(())
         for values in maps:
@@ -40,13 +40,13 @@ class PrincipalBasis:
         return cls(mean.float(), axes[:, -most:].flip(1).float().contiguous())
 
     def to(self, like: Tensor) -> PrincipalBasis:
-        """The basis in the number type and on the device of a tensor."""
+        """Return the basis in the number type and on the device of a tensor."""
         return PrincipalBasis(self.mean.to(like), self.axes.to(like))
 
     def coordinates(self, features: Float[Tensor, "*batch c"]) -> Float[Tensor, "*batch r"]:
-        """Coordinates of the nearest point of the subspace."""
+        """Compute the coordinates of the subspace's nearest points to features."""
         return (features - self.mean) @ self.axes
 
     def features(self, coordinates: Float[Tensor, "*batch r"]) -> Float[Tensor, "*batch c"]:
-        """The point with these coordinates."""
+        """Compute the features with these coordinates."""
         return self.mean + coordinates @ self.axes.T

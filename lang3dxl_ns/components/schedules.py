@@ -1,7 +1,7 @@
 """Learning-rate and loss-weight schedules: pure functions of the step or of x, the run's fraction in [0, 1].
 
-Outside its range a schedule keeps its nearest end value. All return Python floats: a NumPy scalar would end
-up in optimizer state and checkpoints, where a safe loader rejects it.
+Outside its range a schedule keeps its nearest end value. All return Python floats, because a NumPy scalar
+would end up in optimizer state and checkpoints, where a safe loader rejects it.
 """
 
 from __future__ import annotations
@@ -10,23 +10,23 @@ import math
 
 
 def log_linear(x: float, start: float, end: float) -> float:
-    """From start to end (both positive), linear in the logarithm."""
+    """Interpolate from start to end (both positive), linearly in the logarithm."""
     x = _fraction(x)
     return math.exp((1 - x) * math.log(start) + x * math.log(end))
 
 
 def exponential_ramp(step: float, start: float, end: float, steps: float) -> float:
-    """From start to end (both positive) over the first `steps` steps, by a constant factor per step."""
+    """Go from start to end (both positive) over the first `steps` steps, by a constant factor per step."""
     return log_linear(step / steps if steps > 0 else 1.0, start, end)
 
 
 def semantic_ramp(x: float, share: float) -> float:
-    """Weight of the semantic losses: 0.1 to 1 over the first `share` of the run, so that geometry leads."""
+    """Raise the weight of the semantic losses from 0.1 to 1 over the run's first `share`: geometry leads."""
     return exponential_ramp(x, 0.1, 1.0, share)
 
 
 def cosine_decay(x: float, peak: float, end: float, power: float = 1.0) -> float:
-    """From peak to end along half a cosine of x^power; a power above 1 stays near the peak longer."""
+    """Go from peak to end along half a cosine of x^power; a power above 1 stays near the peak longer."""
     peak, end = float(peak), float(end)
     return end + 0.5 * (peak - end) * (1 + math.cos(math.pi * _fraction(x) ** float(power)))
 

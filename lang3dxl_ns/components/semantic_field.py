@@ -1,8 +1,8 @@
-"""The semantic field: a per-pixel decoder from bottleneck codes to CLIP and dense features.
+"""Semantic field: a per-pixel decoder from bottleneck codes to CLIP and dense features.
 
-The rendered code of a pixel is the *coordinate* of a multi-resolution hash grid, so the field is indexed by
-feature value, not by position: repeated structures share codes (Lang3D-XL). An MLP turns the encoding into
-CLIP features and, through the same hidden layers, dense (DINO) features.
+The rendered code of a pixel is the *coordinate* of a multi-resolution hash grid. So the field is indexed by
+feature value, not by position, and repeated structures share codes (Lang3D-XL). An MLP turns the encoding
+into CLIP features and, through the same hidden layers, dense (DINO) features.
 """
 
 import math
@@ -25,8 +25,7 @@ Preset = Literal["default", "short", "paper", "official"]
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """All settings of a semantic field, resolved; documented in `SemanticFieldConfig`. The defaults are the
-    preset `default`."""
+    """Resolved settings of a semantic field (see `SemanticFieldConfig`); defaults are preset `default`."""
 
     # One lookup of 16 × 32 features replaces the method's four indexed passes of 16 × 8 in a fraction of the
     # time. The table size is a compromise between capacity for a large scene and the optimizer's memory.
@@ -48,8 +47,8 @@ class FieldSettings:
 
 
 _DEFAULT = FieldSettings()
-# As printed. The index coordinate is kept, not folded into a wider row: the table has the printed size.
-# Where the paper is silent (range, initial codes, features per level) these are safe choices.
+# Values as printed. The index coordinate is kept, not folded into a wider row, so the table has the printed
+# size. Values that the paper does not give (range, initial codes, features per level) are safe choices.
 _PAPER = replace(
     _DEFAULT, indexed=True, features_per_level=8, log2_table_size=8, max_resolution=2048,
     coarse_to_fine=0.0, hidden_layers=3, activation="last", whiten=False,
@@ -62,7 +61,7 @@ PRESETS: dict[Preset, FieldSettings] = {
         max_resolution=256, coarse_to_fine=0.0, hidden_layers=1, hidden_width=64,
     ),
     "paper": _PAPER,
-    # As released by the authors.
+    # The values of the code that the authors released.
     "official": replace(
         _PAPER, code_std=0.0, bounding="raw", log2_table_size=19, hidden_layers=2, activation="every"
     ),
@@ -75,47 +74,50 @@ class SemanticFieldConfig:
     """Settings of a semantic field: a preset, and values that override it."""
 
     preset: Preset | Literal["auto"] = "auto"
-    """`default`: long GPU run; `short`: hundreds to a few thousand steps; `paper`: as printed; `official`: as
-    released; `auto`: `short` in runs of under 5,000 iterations, in longer ones `paper` with the paper's
-    method and else `default` (also where the length is unknown)."""
+    """Values of all unset options. `default`: for long GPU runs. `short`: for hundreds to a few thousand
+    steps. `paper`: as printed. `official`: as released by the authors. `auto`: `short` in runs of under 5,000
+    iterations; in longer ones `paper` with the paper's method, otherwise `default`, which also applies if
+    the length is unknown."""
     code_dim: int | None = None
     """Channels of the rendered code, 2 to 6 (2 to 5 with `indexed`). Each doubles the cost of a lookup."""
     code_std: float | None = None
-    """Standard deviation of the initial codes. Small: a wide start scatters equal surfaces over the field."""
+    """Standard deviation of the initial codes. Presets keep it small, because a wide start scatters equal
+    surfaces over the field."""
     bounding: Literal["sigmoid", "raw"] | None = None
-    """How a code becomes a coordinate. `sigmoid`: into (0, 1), where distinct cells have distinct vertices;
-    `raw`: unchanged, and codes outside [0, 1] share entries with those inside."""
+    """How a code becomes a coordinate. `sigmoid`: it is mapped into (0, 1), where distinct cells have
+    distinct vertices. `raw`: it is unchanged, and codes outside [0, 1] share entries with those inside."""
     fourier_frequencies: int | None = None
-    """Octaves of sines and cosines of the coordinate, alongside the grid; the longest has one wave per unit.
-    0 for none."""
+    """Octaves of sines and cosines of the coordinate, as inputs beside the grid's features; 0 for none. The
+    longest has one wave per unit."""
     indexed: bool | None = None
     """Prepend an index coordinate to the code and look up at index 0, 1/k, 2/k, … until there are as many
     channels as CLIP has (Lang3D-XL). Otherwise the grid is read once."""
     levels: int | None = None
-    """Levels of the hash grid; 0 for none, only Fourier features."""
+    """Number of levels of the hash grid; 0 for Fourier features only."""
     features_per_level: int | None = None
-    """Features per level."""
+    """Number of features per level of the hash grid."""
     log2_table_size: int | None = None
-    """Log2 of the most entries per level."""
+    """Log2 of the maximum number of entries per level."""
     min_resolution: int | None = None
     """Vertices per axis of the coarsest level."""
     max_resolution: int | None = None
-    """Vertices per axis of the finest level. Capped low, because Adam with epsilon 1e-15 moves every touched
-    entry equally far: fine levels would grow as large as coarse ones, and neighboring codes would decode to
-    unrelated features."""
+    """Vertices per axis of the finest level. Presets keep it low, because Adam with epsilon 1e-15 moves every
+    touched entry equally far: fine levels would grow as large as coarse ones, and neighboring codes would
+    decode to unrelated features."""
     coarse_to_fine: float | None = None
     """Fraction of the run over which levels open, coarsest first; 0 opens all from the start."""
     hidden_layers: int | None = None
-    """Hidden linear layers of the decoder."""
+    """Number of hidden linear layers of the decoder."""
     hidden_width: int | None = None
-    """Channels of a hidden layer."""
+    """Number of channels of a hidden layer."""
     activation: Literal["every", "last"] | None = None
-    """A ReLU after `every` hidden layer or only after the `last` (as printed in the paper)."""
+    """Whether a ReLU follows `every` hidden layer, or only the `last` (as printed in the paper)."""
     whiten: bool | None = None
-    """Outputs are mean + deviation × network, with the targets' statistics: training starts at their mean."""
+    """Output mean + deviation × network, with the targets' statistics, so that training starts at their mean.
+    Otherwise the network's output is used as it is."""
 
     def resolved(self) -> FieldSettings:
-        """All settings, with unset ones taken from the preset.
+        """Return all settings, with unset ones taken from the preset.
 
         Raises:
             UserError: the preset is unknown, the code has too many or too few channels for the grid, or the
@@ -142,7 +144,7 @@ class SemanticFieldConfig:
 
 
 class SemanticField(Decoder):
-    """Decodes rendered codes to raw (not unit length) CLIP features and, if configured, dense features.
+    """Decoder of rendered codes to raw (not unit length) CLIP features and, if configured, dense features.
 
     Codes may be any number: ±inf decode to finite features, NaN to NaN in their own pixel alone. Everything
     is per pixel, so large maps can be decoded in chunks.
@@ -185,51 +187,51 @@ class SemanticField(Decoder):
     def initial_codes(
         self, count: int, generator: torch.Generator | None = None
     ) -> Float[Tensor, "count code"]:
-        """Initial codes, one per Gaussian; sampled on the generator's device."""
+        """Sample initial codes, one per Gaussian, on the generator's device."""
         device = generator.device if generator else None
         noise = torch.randn(count, self.code_dim, generator=generator, device=device)
         return (self.settings.code_std * noise).to(self.output_mean)
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
-        """See `Decoder`; without `whiten` they are ignored."""
+        """Set the targets' statistics (see `Decoder.set_output_statistics`), which need `whiten`."""
         if self.settings.whiten:
             super().set_output_statistics(mean, std)
 
     def set_progress(self, fraction: float) -> None:
-        """Set the fraction of the run done (0 to 1), which opens grid levels; saved in the checkpoint."""
+        """Open grid levels by the fraction of the run done (0 to 1); checkpoints contain them."""
         if self.level_weights is not None:
             self.level_weights.copy_(self.grid.coarse_to_fine(fraction / self.settings.coarse_to_fine))
 
     def forward(
         self, codes: Float[Tensor, "*batch code"]
     ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
-        """CLIP and dense features of every code; dense is None without a dense head."""
+        """Decode the CLIP and dense features of every code; dense is None without a dense head."""
         hidden = self.hidden(codes)
         clip = F.linear(hidden, *self._head(slice(0, self.clip_dim)))
         dense = F.linear(hidden, *self._head(slice(self.clip_dim, None))) if self.dense_dim else None
         return clip, dense
 
     def decode_clip(self, codes: Float[Tensor, "*batch code"]) -> Float[Tensor, "*batch clip"]:
-        """CLIP features of every code, without computing the dense ones."""
+        """Decode the CLIP features of every code, without computing the dense ones."""
         return F.linear(self.hidden(codes), *self.clip_head())
 
     def clip_head(self) -> tuple[Float[Tensor, "clip hidden"], Float[Tensor, " clip"]]:
-        """See `Decoder`."""
+        """Return weight and bias of the last layer for CLIP features (see `Decoder.clip_head`)."""
         return self._head(slice(0, self.clip_dim))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         return {"field_encoding": self.encoding_parameters(), "field_decoder": self.decoder_parameters()}
 
     def encoding_parameters(self) -> list[nn.Parameter]:
-        """Parameters of the hash grid: an optimizer group without weight decay."""
+        """Return the parameters of the hash grid, an optimizer group without weight decay."""
         return list(self.grid.parameters())
 
     def decoder_parameters(self) -> list[nn.Parameter]:
-        """Parameters of the MLP: a group with weight decay, so that CLIP and dense outputs share edges."""
+        """Return the parameters of the MLP, a group with weight decay so that CLIP and dense share edges."""
         return [*self.layers.parameters(), *self.output.parameters()]
 
     def hidden(self, codes: Float[Tensor, "*batch code"]) -> Float[Tensor, "*batch hidden"]:
-        """Activations of the last hidden layer."""
+        """Compute the activations of the last hidden layer."""
         coordinates = self._coordinates(codes.reshape(-1, self.code_dim))
         encoding = self._read_grid(coordinates)
         if self.settings.fourier_frequencies:
@@ -257,8 +259,9 @@ class SemanticField(Decoder):
         return torch.cat((coordinates, angles.sin(), angles.cos()), 1)
 
     def _head(self, channels: slice) -> tuple[Float[Tensor, "out hidden"], Float[Tensor, " out"]]:
-        """Weight and bias of the last layer for some of its outputs, with whitening folded in: scaling its
-        few weights costs less than scaling a feature map."""
+        """Return weight and bias of the last layer for some of its outputs, with whitening folded in.
+
+        Scaling its few weights costs less than scaling a feature map."""
         std = self.output_std[channels]
         weight = self.output.weight[channels] * std[:, None]
         return weight, self.output.bias[channels] * std + self.output_mean[channels]

@@ -1,7 +1,7 @@
-"""The sky: opaque Gaussians on a sphere around the scene, with colors that are one smooth function.
+"""Sky: opaque Gaussians on a sphere around the scene, with colors that are one smooth function.
 
-Colors learned one by one are mottled after a run of minutes, since a photo shows a few of them only, and
-gray where no photo looked.
+Colors learned one by one are mottled after a run of minutes, since each photo shows only a few of them. Where
+no photo looked, they stay gray.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ OPACITY = 0.98
 
 
 class Sky(nn.Module):
-    """The first Gaussians of a scene. In training they stay where they are, and share nine colors.
+    """Sky of a scene, which is its first Gaussians. In training they don't move, and share nine colors.
 
     Outside training they are Gaussians like any others, with the colors that they had last.
 
     Args:
-        directions: of the Gaussians from the scene's center, of any length.
+        directions: directions from the scene's center to the Gaussians, of any length.
     """
 
     directions: Float[Tensor, "k 3"]
@@ -40,15 +40,16 @@ class Sky(nn.Module):
 
     @property
     def colors(self) -> Float[Tensor, "k 3"]:
-        """Colors of the Gaussians, at least 0; gray at first."""
+        """Colors of the sky's Gaussians, at least 0; gray before training."""
         shared = self.harmonics.expand(len(self), -1, -1)
         return (spherical_harmonics(DEGREE, self.directions, shared) + 0.5).clamp_min(0.0)
 
     def forward(
         self, gaussians: Gaussians, colors: Float[Tensor, "n 3"]
     ) -> tuple[Gaussians, Float[Tensor, "n 3"]]:
-        """All Gaussians and their colors, the first of which are the sky's: no gradient moves them, and that
-        of their colors reaches the harmonics."""
+        """Replace the colors of the first Gaussians by the sky's, and return all Gaussians and their colors.
+
+        No gradient moves the sky's Gaussians; the gradient of their colors reaches the harmonics."""
 
         def still(values: Tensor) -> Tensor:
             return torch.cat((values[: len(self)].detach(), values[len(self) :]))

@@ -23,10 +23,10 @@ _GAUSSIAN /= _GAUSSIAN.sum()
 
 
 def ssim(prediction: Float[Tensor, "c h w"], target: Float[Tensor, "c h w"]) -> Float[Tensor, ""]:
-    """Mean SSIM (Wang et al. 2004) of values in 0…1, over channels and windows: 11 pixels, σ 1.5, no border.
+    """Compute the mean SSIM (Wang et al. 2004) of values in 0…1, over channels and windows inside the images.
 
-    Both images are at least a window wide and high, on the CPU, in float32 or float64. The gradient reaches
-    the prediction alone.
+    Windows have 11 pixels, σ 1.5. Both images are at least a window wide and high, on the CPU, in float32 or
+    float64. The gradient reaches the prediction alone.
     """
     return _Similarity.apply(prediction, target)
 
@@ -64,7 +64,7 @@ def _padded(width: int) -> int:
 
 
 def _roomy(image: Float[Tensor, "c h w"]) -> Float[np.ndarray, " entries"]:
-    """The planes line by line, each line filled up to whole vectors; room for one more at the end."""
+    """Flatten the planes line by line, with each line padded to whole vectors, and one more at the end."""
     channels, height, width = image.shape
     room = image.new_zeros(channels * height * _padded(width) + LANES)
     room[:-LANES].view(channels, height, -1)[:, :, :width] = image.detach()
@@ -73,7 +73,7 @@ def _roomy(image: Float[Tensor, "c h w"]) -> Float[np.ndarray, " entries"]:
 
 @numba.njit(forceinline=True)
 def _across(line, x, weights):
-    """The line's window that begins at x, and the next 15."""
+    """Blur across a line: compute the windows that begin at x and at the next `LANES` − 1 places."""
     blurred = load(line, x) * weights[0]
     for k in range(1, WINDOW):
         blurred += load(line, x + k) * weights[k]
@@ -82,7 +82,7 @@ def _across(line, x, weights):
 
 @kernel
 def _similarity(first, last, a, b, channels, height, width, weights, slopes):
-    """Sum of SSIM over a range of lines (all channels' one after another); stores the slopes."""
+    """Sum SSIM over a range of lines (all channels' one after another), and store the slopes."""
     lines, stride = height - WINDOW + 1, slopes.shape[2]
     means = np.zeros((5, stride + LANES), a.dtype)
     found = np.zeros(LANES, a.dtype)
@@ -132,11 +132,11 @@ def _similarity(first, last, a, b, channels, height, width, weights, slopes):
 
 @kernel
 def _gradient(first, last, a, b, height, width, weights, slopes, factor, gradient):
-    """Gradient by the first image for a range of its lines: each window's slopes spread over the window."""
+    """Compute the gradient by the first image for a range of its lines, from the slopes of all windows."""
     lines, stride = height - WINDOW + 1, slopes.shape[2]
     plane = slopes.shape[1] * stride
     flat, out = slopes.reshape(-1), gradient.reshape(-1)
-    # Windows that begin up to ten places to the left reach a pixel: room for them in front.
+    # Windows that begin up to ten places to the left reach a pixel, so there is room for them in front.
     sums = np.zeros((3, stride + 2 * LANES), a.dtype)
     for row in range(first, last):
         channel, y = row // height, row % height
@@ -149,7 +149,7 @@ def _gradient(first, last, a, b, height, width, weights, slopes, factor, gradien
                     total += load(flat, at + line * stride) * weights[y - line]
                 store(sums[map_], LANES + x, total)
         for x in range(0, stride, LANES):
-            # The window is symmetric, so that the weights may be read forwards.
+            # The window is symmetric, so the weights may be read forwards.
             begin = LANES + x - WINDOW + 1
             by_mean = _across(sums[0], begin, weights)
             by_square = _across(sums[1], begin, weights)

@@ -1,4 +1,4 @@
-"""Step guard: skips optimizer steps whose loss or gradient is not finite."""
+"""Step guard: skipping optimizer steps whose loss or gradient is not finite."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 
 LARGEST_GRADIENT = 1e18
-"""Adam stores squared gradients: above this norm they overflow float32, and the parameter never moves
-again."""
+"""Bound on losses and gradient norms. Adam stores squared gradients: above this norm they overflow float32,
+and the parameter never moves again."""
 
 
 class StepGuard:
-    """Counts and reports skipped steps, and gives up after too many in a row."""
+    """Guard that counts and reports skipped steps, and gives up after too many in a row."""
 
     def __init__(self, most_in_a_row: int, log: Callable[[str], None]):
         self.most_in_a_row = most_in_a_row
         self.skipped = 0
-        """Steps skipped so far, in this run."""
+        """Number of steps skipped so far in this run."""
         self._in_a_row = 0
         self._log = log
         self._seen: Counter[tuple[str, str]] = Counter()
@@ -34,17 +34,17 @@ class StepGuard:
         groups: Mapping[str, Iterable[Tensor]],
         scale: float = 1.0,
     ) -> bool:
-        """Whether all losses and all gradients of the parameter groups are finite.
+        """Return whether all losses and all gradients of the parameter groups are finite.
 
-        One reduction per gradient, one synchronization in all. `scale`: of the gradients, under
-        mixed precision. Raises UserError after too many broken steps in a row.
+        This takes one reduction per gradient, and one synchronization in all. `scale` is the scale of the
+        gradients under mixed precision. Raises UserError after too many broken steps in a row.
         """
         named = {f"loss {name}": value.detach().float() for name, value in losses.items()}
         for name, parameters in groups.items():
             norms = [torch.linalg.vector_norm(p.grad).float() for p in parameters if p.grad is not None]
             if norms:
                 named[f"gradient of {name}"] = torch.stack(norms).sum() / scale
-        # Also false for NaN.
+        # The comparison is also false for NaN.
         sound = torch.stack([value.abs() < LARGEST_GRADIENT for value in named.values()])
         if bool(sound.all()):
             self._in_a_row = 0
@@ -57,7 +57,7 @@ class StepGuard:
         self.skipped += 1
         self._in_a_row += 1
         self._seen[photo, what] += 1
-        if self._seen[photo, what] == 1:  # a broken photo comes up in every round
+        if self._seen[photo, what] == 1:  # a broken photo recurs in every round
             self._log(f"[yellow]Step {step} is skipped: photo {photo} gives no finite {what}")
         if self._in_a_row >= self.most_in_a_row:
             raise UserError(
@@ -68,7 +68,7 @@ class StepGuard:
             )
 
     def summary(self) -> str | None:
-        """What was skipped, in one sentence; None if nothing was."""
+        """Summarize the skipped steps in one sentence; None if there were none."""
         if not self.skipped:
             return None
         worst = Counter[str]()

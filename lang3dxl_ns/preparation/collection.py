@@ -1,4 +1,4 @@
-"""Preparation of a photo collection: choose crop sizes, log the reasons, make the targets."""
+"""Preparation of a photo collection: choosing crop sizes, logging the reasons, making the targets."""
 
 from __future__ import annotations
 
@@ -28,30 +28,31 @@ from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
 
 SCALE_RATIO = 1.6
-"""Ratio of the physical pixel sizes of far and near photos up to which one pyramid of fixed size suffices:
-each photo is then within half a level (levels are √2 apart) of the middle one."""
+"""Ratio of the widths that far and near photos show up to which one pyramid of fixed size suffices. Each
+photo is then within half a level of the middle one (levels are √2 apart)."""
 
 
 @dataclass(frozen=True)
 class CropPlan:
-    """Crop sizes of the photos, with reasons."""
+    """Crop sizes of the photos, with the reasons for them."""
 
     scales: list[float]
-    """Sides, ascending: world units, or fractions of a photo's width."""
+    """Sides of the crops, ascending, in world units or fractions of a photo's width."""
     pixel_sizes: dict[str, float] | None
     """World units per pixel of each photo as it is read; None if the scales are fractions."""
     spread: float | None
-    """Ratio of the photos' pixel sizes, 95th over 5th percentile; None without 3D points."""
+    """Ratio of the widths that photos show, 95th over 5th percentile; None without 3D points."""
     reasons: list[str]
 
 
 def plan_crops(
     photos: Sequence[Photo], reconstruction: Reconstruction, config: PreparationConfig
 ) -> CropPlan:
-    """Choose crop sizes: the configured ones, or proposed from the scene.
+    """Choose crop sizes, which are configured or proposed from the scene.
 
-    Crops have one size in the world, unless the scene has no 3D points to measure with, or its photos are so
-    similar in scale (`SCALE_RATIO`) that under "auto" one size in the photo is equivalent.
+    Crops have one size in the world, unless relative sizes are configured, the scene has no 3D points to
+    measure with, or (under "auto") its photos are so similar in scale that one size in the photo is
+    equivalent (`SCALE_RATIO`). Raises UserError for physical sizes without 3D points.
     """
     if config.scale_mode == "physical" and not len(reconstruction.points):
         raise UserError(
@@ -97,8 +98,7 @@ def prepare_collection(
     regions: RegionSource | None = None,
     fine: Collection[str] = (),
 ) -> PreparedTargets:
-    """Make the missing targets of the photos in `cache_dir`; the log says which crops, and why. fine: see
-    `prepare`."""
+    """Choose crops, log the reasons, and make missing targets in `cache_dir`; for `fine`, see `prepare`."""
     plan = plan_crops(photos, reconstruction, config)
     for reason in plan.reasons:
         log(reason)
@@ -124,7 +124,7 @@ def _scale_range(
 
 
 def _resampled(scales: list[float], config: PreparationConfig) -> list[float]:
-    """The configured number of sizes, evenly spaced over the same range (by ratio); if one, the middle."""
+    """Space the configured number of sizes evenly (by ratio) over the same range; one gets the middle."""
     if config.scales is None:
         return scales
     if config.scales == 1:

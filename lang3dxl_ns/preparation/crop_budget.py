@@ -1,4 +1,4 @@
-"""Crop budget: sizes and spacing of a photo's crops that an encoder can use, in a bounded number."""
+"""Crop budget: sizes and spacing of a bounded number of crops of a photo that an encoder can use."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from lang3dxl_ns.preparation.pyramid import HALF, THIRD, crop_count
 from lang3dxl_ns.preparation.settings import Quality
 
 MOST_CROPS: dict[Quality, float] = {"fast": 700, "normal": 2_500, "fine": math.inf}
-"""Crops of a photo for an encoder of 224 pixels. An encoder of half the side may have four times as many,
-which take about as long."""
+"""Maximum number of crops per photo for an encoder of 224 pixels, by quality. An encoder of half the side may
+have four times as many, which take about as long."""
 USUAL_INPUT = 224
-"""Pixels of an encoder's input."""
+"""Side of an encoder's input for which `MOST_CROPS` holds, in pixels."""
 _LEAST_SHARE = 1 / 4
-"""Side of the smallest crop, as a share of the encoder's input: enlarged more than that, a crop is a blur."""
+"""Smallest side of a crop, as a share of the encoder's input; a crop that is enlarged more is a blur."""
 _GROWTH = 1.05
-"""Factor by which crops grow until they are few enough."""
+"""Factor by which crops are enlarged until there are few enough."""
 
 
 @dataclass(frozen=True)
 class Crops:
-    """The crops of a photo."""
+    """Sizes and spacing of a photo's crops."""
 
     sides: list[int]
-    """Pixels, ascending."""
+    """Sides of the crops in pixels, ascending."""
     steps: int
-    """Crops per side of the smallest; others have two."""
+    """Spacing of the smallest crops: this many steps make up a side. Others have two."""
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the smallest crops, in a photo of `height` × `width` pixels."""
+        """Count the rows and columns of the smallest crops in a photo of `height` × `width` pixels."""
         return _grid(height, width, self.sides[0], self.steps)
 
     def count(self, height: int, width: int) -> int:
-        """Number of crops in a photo of `height` × `width` pixels."""
+        """Count the crops in a photo of `height` × `width` pixels."""
         larger = sum(math.prod(_grid(height, width, side, HALF)) for side in self.sides[1:])
         return math.prod(self.grid(height, width)) + larger
 
@@ -48,16 +48,18 @@ def choose_crops(
     input_side: int,
     quality: Quality,
 ) -> Crops:
-    """The crops of a photo: those of the scales, but none that the encoder can't use, and no more than the
-    quality allows. They first move apart, from a third to half of their side, and then grow.
+    """Choose a photo's crops: those of the scales, without crops too small for the encoder.
+
+    If there are more than the quality allows, fine crops first move apart, from a third to half of their
+    side; then the crops grow.
 
     Args:
         scales: sides in world units, or in photo widths.
         pixel_size: world units per pixel of the photo; 1 / width for relative scales.
         size: width and height of the photo in pixels.
-        is_fine: small crops alone (`fine_crops`) instead of the whole pyramid.
-        input_side: pixels of the encoder's input.
-        quality: bound of the number; "fine" has none, and crops down to 32 pixels.
+        is_fine: whether to cut small crops alone (`fine_crops`) instead of the whole pyramid.
+        input_side: side of the encoder's input in pixels.
+        quality: bound on the number; "fine" has no bound, and allows crops down to 32 pixels.
     """
     width, height = size
     most = MOST_CROPS[quality] * (USUAL_INPUT / input_side) ** 2

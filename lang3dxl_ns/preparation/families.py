@@ -1,8 +1,7 @@
-"""Families of image-text encoders: how each reads texts, and how its patches come to fit them.
+"""Families of image-text encoders: how each reads texts, and how its patches become comparable with them.
 
-A contrastive encoder is trained to compare one vector per picture with one per text. Where its patches are to
-be compared with texts as well, the last step that mixes them is replaced, by a published recipe for each
-family."""
+A contrastive encoder is trained to compare one vector per picture with one per text. To compare its patches
+with texts as well, the last step that mixes them is replaced, by a published recipe for each family."""
 
 from __future__ import annotations
 
@@ -17,20 +16,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 Features = Literal["crops", "dense"]
-"""One vector for each of many crops of a photo, or a map of patch features in a few passes."""
+"""Reading of a photo: one vector for each of many crops, or a map of patch features in a few passes."""
 Patches = Callable[[Any, Float[Tensor, "n 3 h w"]], Float[Tensor, "n p c"]]
-"""From a model and normalized pictures to patch features, row by row, without class or register tokens."""
+"""Function from model and normalized pictures to patch features by row, without class and register tokens."""
 
 
 def own_patches(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n p c"]:
-    """Patch tokens as they are: TIPSv2 (Cao et al. 2026) is trained to align them with texts."""
+    """Compute the patch tokens as they are: TIPSv2 (Cao et al. 2026) is trained to align them with texts."""
     tokens = model.get_image_features(**vision_inputs(model, pictures)).last_hidden_state
     return tokens[:, 1 + model.config.vision_config.num_register_tokens :]  # two class tokens come first
 
 
 def value_value_patches(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n p c"]:
-    """CLIP's patches, with a last block that attends from values to values (CLIP Surgery, Li et al. 2023),
-    without its residual connection and feed-forward layer (ClearCLIP, Lan et al. 2024)."""
+    """Compute CLIP's patches with a last block that attends from values to values (CLIP Surgery, Li et al.
+    2023), without its residual connection and feed-forward layer (ClearCLIP, Lan et al. 2024)."""
     tower = model.vision_model
     hidden = tower.pre_layrnorm(tower.embeddings(pictures, interpolate_pos_encoding=True))
     *layers, last = tower.encoder.layers
@@ -46,8 +45,8 @@ def value_value_patches(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Float
 
 
 def singly_pooled_patches(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n p c"]:
-    """Patches of a SigLIP, each pooled as if it were the only one: its value instead of an average of values,
-    as MaskCLIP (Zhou, Loy and Dai 2022) does in CLIP's attention pooling."""
+    """Compute a SigLIP's patches, each pooled as if it were the only one: its value replaces an average of
+    values, as in MaskCLIP (Zhou, Loy and Dai 2022) for CLIP's attention pooling."""
     tower = model.vision_model
     tokens = tower(**vision_inputs(model, pictures)).last_hidden_state
     pooled = torch.cat([tower.head(patch[:, None]) for patch in tokens.flatten(0, 1).split(_POOLED)])
@@ -55,24 +54,24 @@ def singly_pooled_patches(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Flo
 
 
 _POOLED = 16_384
-"""Patches pooled at a time, to bound memory."""
+"""Number of patches pooled at a time, to bound memory."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """What encoders of one model type have in common."""
+    """Common properties of the encoders of one model type."""
 
     recipe: str
-    """Name of the recipe for patches, part of what identifies a target."""
+    """Name of the recipe for patches, which is part of a target's settings."""
     patches: Patches
     features: Features = "crops"
-    """What it is best at: the default."""
+    """Default way of reading photos, which gives the best features."""
     fixed_length: bool = False
-    """Whether it was trained with lower-case texts padded to its full length."""
+    """Whether the encoder was trained with lower-case texts padded to its full length."""
     text_inputs: tuple[str, ...] = ("input_ids", "attention_mask")
-    """What its text tower is given: a SigLIP has learned with its padding unmasked."""
+    """Inputs of the text tower; a SigLIP was trained with unmasked padding."""
     first_position: int = 0
-    """Number of the first text position; an XLM-RoBERTa counts from behind its padding token."""
+    """Number of the first text position; an XLM-RoBERTa counts from after its padding token."""
 
 
 _VALUE_VALUE = "value-value"
@@ -85,20 +84,18 @@ FAMILIES: dict[str, Family] = {
     "siglip2": _SIGLIP,
     "tipsv2": Family("patch tokens", own_patches, "dense", fixed_length=True),
 }
-"""By model type, as in a model's config.json. Checkpoints of SigLIP 2 with a fixed resolution are
-`siglip`."""
+"""Families by model type in config.json. Checkpoints of SigLIP 2 with a fixed resolution are `siglip`."""
 
 
 def input_side(vision: Any) -> int:
-    """Side in pixels of the pictures that a vision tower with this configuration was trained on. A SigLIP 2
-    of any resolution has a number of patches instead."""
+    """Return the side in pixels of a vision tower's training pictures, by its configuration. A SigLIP 2 of
+    any resolution has a number of patches instead."""
     patches = getattr(vision, "num_patches", None)
     return vision.image_size if patches is None else isqrt(patches) * vision.patch_size
 
 
 def vision_inputs(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> dict[str, Tensor | bool]:
-    """Arguments for a vision tower. A picture of another size than in training has its positions
-    interpolated."""
+    """Build the arguments of a vision tower; positions are interpolated for sizes not seen in training."""
     vision = model.config.vision_config
     if model.config.model_type == "siglip2":
         return _as_patches(pictures, vision.patch_size)
@@ -108,7 +105,7 @@ def vision_inputs(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> dict[str, T
 
 
 def _as_patches(pictures: Float[Tensor, "n 3 h w"], side: int) -> dict[str, Tensor | bool]:
-    """Pictures as SigLIP 2 of any resolution takes them: flat patches, all valid, and the grid's shape."""
+    """Convert pictures to the input of a SigLIP 2 of any resolution: flat patches, mask and grid shape."""
     tiles = pictures.unfold(2, side, side).unfold(3, side, side)  # n 3 rows columns side side
     count, _, rows, columns = tiles.shape[:4]
     patches = tiles.permute(0, 2, 3, 4, 5, 1).reshape(count, rows * columns, -1)

@@ -1,7 +1,7 @@
 """Foreground masks of photos: from a folder, from prompts, or none.
 
-Every source reduces to one thing: the file of a photo's mask (`Photo.mask_path`), or None if the whole photo
-is foreground. `Photo.read_mask` does the rest, for training, evaluation and queries alike.
+Every source yields the file of a photo's mask (`Photo.mask_path`), or None if the whole photo is foreground.
+`Photo.read_mask` reads it for training, evaluation and queries alike.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ FOREGROUND = "foreground"
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 _LONGER_SIDE = 1024
-"""Pixels at which prompts are searched; the networks take no more anyway."""
+"""Longer side in pixels of photos in which prompts are searched; the networks take no more anyway."""
 _READERS = 4
-"""Threads."""
+"""Number of threads that read masks."""
 _RULE = 1
-"""Increased when masks are made in another way, so that older ones are made again."""
+"""Version of the masks, which is increased when they are made in another way, to make older ones again."""
 
 Log = Callable[[str], None]
 
@@ -45,10 +45,10 @@ def with_foreground(
     device: torch.device | str,
     log: Log = print,
 ) -> list[Photo]:
-    """The photos with the masks configured in `config.foreground`; logs the photos without one.
+    """Return the photos with the masks configured in `config.foreground`, and log the photos without one.
 
-    A folder is relative to `data`. Raises UserError if it is missing or fits no photo, and if a model
-    can't be loaded.
+    A folder is relative to `data`. Raises UserError if it is missing or matches no photo, if masks are
+    damaged or all black, and if a model can't be loaded.
     """
     if config.foreground == "none":
         return [replace(photo, mask_path=None) for photo in photos]
@@ -82,8 +82,10 @@ def with_foreground(
 
 
 def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
-    """The photos, once every mask was read. Names those that can't be read all at once (in a UserError, or,
-    with `skip`, in the log: they count whole), and those that are black."""
+    """Read all masks, log the black ones, and return the photos.
+
+    Unreadable masks raise one UserError that names them all; with `skip`, they are logged, and their photos
+    count whole. Raises UserError if all masks are black."""
     masked = [photo for photo in photos if photo.mask_path is not None]
     with ThreadPoolExecutor(_READERS) as pool, progress("checking masks", len(masked)) as advance:
         states = []
@@ -110,7 +112,7 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
 
 
 def _state(photo: Photo) -> bool | str:
-    """Whether a photo's mask keeps anything; why it can't be read."""
+    """Return whether a photo's mask keeps anything, or the reason why it can't be read."""
     assert photo.mask_path is not None
     try:
         with open_picture(photo.mask_path) as image:
@@ -120,7 +122,7 @@ def _state(photo: Photo) -> bool | str:
 
 
 def find_mask(folder: Path, name: str, follow_links: bool = False) -> Path | None:
-    """A photo's mask in a folder: named like the photo, as PNG or JPEG."""
+    """Find a photo's mask in a folder, a PNG or JPEG that is named like the photo."""
     return companion(folder, name, MASK_SUFFIXES, follow_links)
 
 
@@ -131,8 +133,9 @@ def _prompted(
     device: torch.device | str,
     log: Log,
 ) -> list[Photo]:
-    """Make the masks that are missing or were made with other settings, photo by photo, and log the photos
-    in which nothing was found: they are used whole."""
+    """Make missing or outdated masks and return the photos with them.
+
+    Photos in which nothing is found are logged and used whole."""
     if not config.foreground_prompts:
         raise UserError("foreground text needs prompts: --pipeline.datamanager.foreground-prompts building")
     files = find_text_segmenter(config.foreground_model, config.sam)
@@ -158,7 +161,7 @@ def _prompted(
                 try:
                     image = photo.read_file(_LONGER_SIDE)
                 except UserError:
-                    continue  # as above
+                    continue  # reading it later reports the reason
                 mask = segmenter.segment(image, config.foreground_prompts)
                 if not mask.any():
                     empty.append(photo.name)

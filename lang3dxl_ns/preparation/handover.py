@@ -17,17 +17,17 @@ _KEY = "lang3dxl"
 class _Photo(TypedDict):
     image: UInt8[Tensor, "h w 3"]
     image_idx: int
-    """In its dataset."""
+    """Index of the photo in its dataset."""
     name: str
 
 
 class Batch(_Photo, total=False):
-    """A photo and its targets, on the model's device; what a scene doesn't have is absent."""
+    """Photo and its targets on the model's device; keys that a scene doesn't have are absent."""
 
     mask: Bool[Tensor, "h w 1"]
-    """The foreground."""
+    """Foreground."""
     clip_target: Float[Tensor, "hd wd c"]
-    """As `preparation.targets.StoredClipTarget.features`."""
+    """CLIP target, as in `preparation.targets.StoredClipTarget.features`."""
     crop_sides: list[float]
     """Sides of the crops in the CLIP target, ascending, as fractions of the photo's width."""
     dense_target: Float[Tensor, "t t d"]
@@ -38,31 +38,31 @@ class Batch(_Photo, total=False):
 
 @dataclass
 class SceneFacts:
-    """What a model is built from, beside its settings and the scene's points."""
+    """Facts about a scene from which a model is built, beside its settings and the scene's points."""
 
     names: list[str] = field(default_factory=list)
-    """Training photos, in the order of their cameras."""
+    """Names of the training photos, in the order of their cameras."""
     positions: Float[Tensor, "p 3"] | None = None
-    """Positions of these cameras, in the model's frame; None for a model that is loaded."""
+    """Positions of the training cameras, in the model's frame; None for a model that is loaded."""
     needs: Mapping[str, bool] = field(default_factory=dict)
-    """Whether the scene needs an optional component; empty if that wasn't measured."""
+    """Whether the scene needs each optional component; empty if that wasn't measured."""
     statistics: FeatureStatistics | None = None
     """Channel statistics of the targets; None for a model without semantics, or one that is loaded."""
     clip_targets: Callable[[], Iterator[Float[Tensor, "hd wd c"]]] | None = None
-    """The CLIP targets of the training photos, one at a time."""
+    """Function that yields the CLIP targets of the training photos, one at a time."""
     dense_targets: Callable[[], Iterator[Float[Tensor, "t t d"]]] | None = None
-    """Their dense features; None without a dense encoder."""
+    """Function that yields the dense features of the training photos; None without a dense encoder."""
 
     def wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
-        """Whether a component (named as in `needs`) is to be built, for the setting `on`, `off` or `auto`:
-        then by its need, or `unmeasured`."""
+        """Return whether to build a component (named as in `needs`) for a setting: `on`, `off`, or `auto`,
+        for which its need decides, or `unmeasured` if that is unknown."""
         return self.needs.get(component, unmeasured) if choice == "auto" else choice == "on"
 
     def into(self, metadata: dict[str, Any]) -> None:
-        """Put them where nerfstudio carries them from dataset to model."""
+        """Put the facts into a dataset's metadata, which nerfstudio hands to the model."""
         metadata[_KEY] = self
 
     @staticmethod
     def of(metadata: Mapping[str, Any]) -> SceneFacts:
-        """The facts put there, or none."""
+        """Return the facts in a dataset's metadata, or empty ones."""
         return metadata.get(_KEY) or SceneFacts()

@@ -1,4 +1,4 @@
-"""Brightness and tint of dark photos, brought to those that a small encoder has learned from."""
+"""Correction of dark photos to the brightness and tint of the photos that a small encoder was trained on."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 _DIM = 0.75
-"""Share of the known brightness below which a photo is dark: nearly all photos of landmarks are above it."""
+"""Share of the known brightness below which a photo is dark; nearly all photos of landmarks are above it."""
 _DARKEST = 0.02
-"""A photo's mean is taken to be no less: black stays black, and no exponent is extreme."""
+"""Lower bound on a photo's mean brightness, so that black photos stay black and exponents stay moderate."""
 
 
 def in_known_light(photo: Float[Tensor, "h w 3"], brightness: float) -> Float[Tensor, "h w 3"]:
-    """A dark photo (RGB in 0…1) with about this mean, and the same mean in all channels; others unchanged.
+    """Bring a dark photo (RGB in 0…1) to about this mean, the same in all channels; others stay unchanged.
 
-    A gamma curve sets the brightness, which keeps black and white; then each channel is multiplied (gray
+    A gamma curve sets the brightness, which keeps black and white. Then each channel is multiplied (gray
     world), which removes a tint. Encoders trained on millions of photos need neither.
     """
     mean = max(float(photo.mean()), _DARKEST)

@@ -26,33 +26,33 @@ BUILTIN = "builtin"
 """Name of the small encoders that ship with this package."""
 _PREFIX = "--pipeline.datamanager."
 option_prefix: ContextVar[str] = ContextVar("option_prefix", default=_PREFIX)
-"""Prefix of the options in the current command: `lang3dxl prepare` has none."""
+"""Prefix of the options in the current command; `lang3dxl prepare` has none."""
 _DEMO = Path(__file__).parents[1] / "demo"
 _BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
 _WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
 _FILES = ("*.json", "*.txt", "*.model")
-"""Configuration, vocabularies, and SentencePiece models."""
+"""Patterns of configuration, vocabularies, and SentencePiece models."""
 _MOST_LAYERS = 1000
-"""Layers of a network; a damaged number would keep transformers building for hours."""
+"""Largest number of layers of a network; a damaged number would keep transformers building for hours."""
 
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """A model's local folder and a fingerprint of its contents."""
+    """Local folder of a model, with a fingerprint of its contents."""
 
     name: str
     folder: Path
     identity: str
-    """Depends on configuration and weights, not on the name: targets stay valid if the model is moved."""
+    """Fingerprint of configuration and weights, not of the name, so targets stay valid if the model moves."""
     option: str
-    """The option that chose the model, for messages."""
+    """Command-line option that chose the model, for messages."""
 
 
 def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
-    """A model's files: a local folder, a Hugging Face name (downloaded once), or "builtin", the CLIP
-    or dense encoder that ships with this package, depending on the option.
+    """Find a model's files by a local folder, a Hugging Face name (downloaded once), or "builtin".
 
-    Raises UserError if there is no such folder, the model can't be downloaded, or files are missing.
+    "builtin" is the CLIP or dense encoder that ships with this package, depending on the option. Raises
+    UserError if there is no such folder, the model can't be downloaded, or files are missing.
     """
     name = str(name_or_dir)
     local = expanded(name)
@@ -64,12 +64,13 @@ def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
 
 
 class _NotDownloaded(UserError):
-    """A model is neither on disk nor can it be downloaded."""
+    """Error for a model that is not on disk and can't be downloaded."""
 
 
 def check_encoders(clip: str, dense: str) -> None:
-    """Find both encoders, downloading missing ones; "none" and "auto" are skipped. Raises a single UserError
-    that names all unavailable ones and the remedy."""
+    """Find both encoders, downloading missing ones; "none" and "auto" are skipped.
+
+    Raises a single UserError that names all unavailable ones and the remedy."""
     wanted = {CLIP_OPTION: clip, DENSE_OPTION: dense}
     missing: dict[str, str] = {}
     for option, name in wanted.items():
@@ -93,16 +94,18 @@ def check_encoders(clip: str, dense: str) -> None:
 
 
 def spoken(option: str) -> str:
-    """An option as spelled in the current command."""
+    """Return an option as spelled in the current command."""
     return option.replace(_PREFIX, option_prefix.get())
 
 
 def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
-    """The model, frozen and in float32. Missing weights are an error, not random numbers."""
+    """Load a model, frozen and in float32.
+
+    Raises UserError for missing weights, which transformers would fill with random numbers."""
     from transformers.utils import logging
 
-    logging.disable_progress_bar()  # a second's work, and it would draw over ours
-    logging.set_verbosity_error()  # tables of tensors; what is missing is said below
+    logging.disable_progress_bar()  # loading takes a second, and its bar would draw over ours
+    logging.set_verbosity_error()  # it logs tables of tensors; missing ones are reported below
     read_config(files)
     remedy = f"download it again, or give {spoken(files.option)} another folder"
     with whole(f"{files.name}: the model in {files.folder} can't be loaded", remedy):
@@ -123,19 +126,19 @@ def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str
 
 
 def load_processor(processor_class: Any, files: ModelFiles) -> Any:
-    """Preprocessor of a network's images and texts. Raises UserError if its files are missing."""
+    """Load the preprocessor of a network's images and texts. Raises UserError if its files are missing."""
     remedy = "copy its preprocessor_config.json and tokenizer files there, or download the model again"
     with whole(f"{files.folder} lacks files that preprocess the input of {files.name}", remedy):
         return processor_class.from_pretrained(files.folder, local_files_only=True)
 
 
 def model_type(files: ModelFiles) -> str:
-    """The model type in its configuration ("clip"). Raises UserError if there is none."""
+    """Read a model's type, such as "clip", from its configuration. Raises UserError for a damaged one."""
     return read_config(files).model_type
 
 
 def read_config(files: ModelFiles) -> Any:
-    """A model's configuration. Raises UserError if its file isn't one."""
+    """Read a model's configuration. Raises UserError for a file that isn't one."""
     from transformers import AutoConfig
 
     with whole(f"{files.folder / 'config.json'} is not a model's configuration", "download the model again"):
@@ -149,8 +152,7 @@ def read_config(files: ModelFiles) -> Any:
 
 @contextmanager
 def whole(problem: str, remedy: str) -> Iterator[None]:
-    """Turns any failure of transformers into a UserError: it trusts a model's files, so that damaged ones
-    make it fail in any way."""
+    """Turn any failure of transformers into a UserError, because damaged files make it fail in any way."""
     try:
         yield
     except UserError:
@@ -160,7 +162,7 @@ def whole(problem: str, remedy: str) -> Iterator[None]:
 
 
 def _download(name: str, option: str) -> Path:
-    """The folder of a model in the Hugging Face cache, downloaded on first use."""
+    """Return the folder of a model in the Hugging Face cache, after downloading it on first use."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import GatedRepoError
 
@@ -189,7 +191,7 @@ def _weight_files(folder: Path) -> list[Path]:
 
 
 def _fingerprint(folder: Path, option: str) -> str:
-    """16 hex digits of everything that affects an image's embedding."""
+    """Compute 16 hex digits from all files that affect an image's embedding."""
     config = folder / "config.json"
     weights = _weight_files(folder)
     if not config.is_file() or not weights:
@@ -212,7 +214,7 @@ def _fingerprint(folder: Path, option: str) -> str:
 
 @lru_cache(maxsize=64)
 def _digest(path: Path, size: int, modified_ns: int) -> str:
-    """A file's SHA-256 (about a second per gigabyte), cached by size and modification time."""
+    """Compute a file's SHA-256 (about a second per gigabyte), cached by size and modification time."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 20):
@@ -221,5 +223,5 @@ def _digest(path: Path, size: int, modified_ns: int) -> str:
 
 
 def has_files(folder: Path, *names: str) -> bool:
-    """Whether a folder has all of these files."""
+    """Return whether a folder has all of these files."""
     return all((folder / name).is_file() for name in names)

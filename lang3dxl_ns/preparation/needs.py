@@ -22,32 +22,32 @@ from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.photometry import measure_photometry
 
 LIGHT = 0.3
-"""Spread of the photos' exposures, in natural logarithms of light: below half a stop, a camera's own metering
-explains it, and one color per surface absorbs it."""
+"""Spread of the photos' exposures above which appearance is needed, in natural logarithms of light. A smaller
+one, below half a stop, is explained by a camera's own metering and absorbed by one color per surface."""
 SHEEN = 0.4
-"""Share of the residual colors explained by the viewing direction: 0.1 to 0.3 on matte landmarks, where haze
-and noise mimic it, 0.5 and more on real ones."""
+"""Share of the residual colors explained by viewing direction above which view dependence is needed. It is
+0.1 to 0.3 on matte landmarks, where haze and noise mimic sheen, and 0.5 and more on shiny ones."""
 REPROJECTION = 2.0
-"""Pixels: COLMAP's bundle adjustment usually ends below one."""
+"""Reprojection error in pixels above which cameras are optimized; COLMAP usually ends below one."""
 SPREAD_OF_SCALE = "physical widths of the photos, 95th over 5th percentile"
 CUT = 0.01
-"""Share of the pixels removed by masks."""
+"""Share of the pixels removed by masks above which the foreground is needed."""
 
 NEEDS_FILE = "scene_needs"
 
 
 @dataclass(frozen=True)
 class Need:
-    """A component, its measurement, and the verdict."""
+    """Optional component with its measurement and the verdict."""
 
     component: str
     needed: bool
     measured: str
-    """What is measured."""
+    """Description of the measured quantity."""
     value: float | None
-    """None if nothing could be measured."""
+    """Measured value; None if nothing could be measured."""
     threshold: float | None
-    """The component is needed above this value; None if no number decides."""
+    """Value above which the component is needed; None if no number decides."""
 
     @property
     def verdict(self) -> str:
@@ -68,7 +68,7 @@ def scene_needs(
     crops: CropPlan,
     sources: Sources,
 ) -> list[Need]:
-    """Measure the need for every optional component; takes seconds for a hundred photos."""
+    """Measure the need for every optional component, which takes seconds for a hundred photos."""
     light = measure_photometry(photos, reconstruction)
     # Levels are clipped to 32 pixels and to the photo; duplicates are never made.
     sizes = {p.name: 1 / p.width for p in photos} if crops.pixel_sizes is None else crops.pixel_sizes
@@ -101,7 +101,7 @@ def scene_needs(
 def _measured(
     component: str, measured: str, value: float | None, threshold: float, unmeasured: bool = True
 ) -> Need:
-    """A component that is needed above a threshold, or by default if nothing could be measured."""
+    """Decide whether a component is needed: above a threshold, or by default if nothing was measured."""
     return Need(component, unmeasured if value is None else value > threshold, measured, value, threshold)
 
 
@@ -119,7 +119,7 @@ def _foreground(photos: Sequence[Photo], at_most: int = 20) -> Need:
 
 
 def _reprojection_error(photo: Any) -> float | None:
-    """Mean distance in pixels between a photo's keypoints and its projected points; None without any."""
+    """Average the distances in pixels between a photo's keypoints and projected points; None without any."""
     import cv2
 
     if not len(photo.points) or len(photo.points) != len(photo.pixels):  # a scene without tracks
@@ -137,23 +137,23 @@ def _reprojection_error(photo: Any) -> float | None:
 
 
 def needs_table(needs: Sequence[Need]) -> str:
-    """The needs as a markdown table."""
+    """Format the needs as a markdown table."""
     rows = [[n.component, n.measured, _figure(n.value), _figure(n.threshold), n.verdict] for n in needs]
     return markdown_table(["component", "measured", "value", "needed above", "verdict"], rows)
 
 
 def as_data(needs: Sequence[Need]) -> dict[str, dict[str, Any]]:
-    """The needs for JSON, by component."""
+    """Convert the needs to data for JSON, by component."""
     return {n.component: {**asdict(n), "verdict": n.verdict} for n in needs}
 
 
 def write_needs(needs: Sequence[Need], folder: Path) -> None:
-    """scene_needs.json and .md in the run's folder."""
+    """Write scene_needs.json and .md to the run's folder."""
     write_report(folder, NEEDS_FILE, f"# What this scene needs\n\n{needs_table(needs)}", as_data(needs))
 
 
 def read_needs(folder: Path) -> dict[str, bool]:
-    """The verdicts in a run's folder, by component; empty without a file. UserError for a damaged one."""
+    """Read the verdicts in a run's folder; empty without a file. Raises UserError for a damaged file."""
     path = folder / f"{NEEDS_FILE}.json"
     if not path.is_file():
         return {}

@@ -1,4 +1,4 @@
-"""Cache of decoded photos and their targets, bounded in memory, with several readers ahead of training."""
+"""Cache of decoded photos and their targets, bounded in memory, with several threads that read ahead."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 
 PATIENCE_S = (1.0, 5.0, 15.0)
-"""Seconds to wait before retrying a file that has vanished: a network share may have dropped out."""
+"""Seconds to wait before each retry for a file that has vanished; a network share may have dropped out."""
 
 
 class PhotoCache:
-    """Keeps the first decoded photos that fit, and reads the others ahead in the order of their use.
+    """Cache that keeps the first decoded photos that fit, and reads the others ahead in the order of use.
 
-    Photos come in shuffled rounds. Keeping the latest ones would hit hardly ever, since each round uses every
-    photo once; those kept for good hit by their share.
+    Photos come in shuffled rounds, and each round uses every photo once. So a cache of the latest ones would
+    hardly ever hit, while photos that are kept for good hit in proportion to their number.
 
     Args:
-        read: the data of a photo by its index; called in several threads.
-        max_bytes: memory of the photos kept.
-        readers: threads.
+        read: function that reads a photo's data by its index; it is called in several threads.
+        max_bytes: memory for the photos that are kept.
+        readers: number of threads.
     """
 
     def __init__(self, read: Callable[[int], dict[str, Any]], max_bytes: float, readers: int = 4):
@@ -36,7 +36,7 @@ class PhotoCache:
         self._pool = ThreadPoolExecutor(readers, thread_name_prefix="photo-reader")
 
     def get(self, index: int, upcoming: list[int]) -> dict[str, Any]:
-        """The photo at `index`, with retries if its file has vanished; starts reading the `upcoming`."""
+        """Return the photo at `index`, with retries if its file has vanished; start reading `upcoming`."""
         for i in (index, *upcoming):
             if i not in self._kept and i not in self._ahead:
                 self._ahead[i] = self._pool.submit(self._read, i)
@@ -48,7 +48,7 @@ class PhotoCache:
         return dict(data)
 
     def _patiently(self, index: int) -> dict[str, Any]:
-        """A photo's data, with retries if its files have vanished."""
+        """Wait for a photo's data, with retries if its files have vanished."""
         for seconds in PATIENCE_S:
             try:
                 return self._ahead[index].result()
@@ -62,7 +62,7 @@ class PhotoCache:
 
     @property
     def bytes(self) -> int:
-        """Memory of the decoded photos, those read ahead included."""
+        """Memory of the decoded photos, including those read ahead."""
         done = (f.result() for f in self._ahead.values() if f.done() and not f.exception())
         return sum(map(_bytes, (*self._kept.values(), *done)))
 
@@ -72,5 +72,5 @@ def _bytes(data: dict[str, Any]) -> int:
 
 
 def has_vanished(reason: UserError) -> bool:
-    """Whether a file was missing or its disk did not answer (errors in its content have no number)."""
+    """Return whether a file was missing or its disk did not answer; errors in its content have no errno."""
     return isinstance(reason.__cause__, OSError) and reason.__cause__.errno is not None

@@ -1,4 +1,4 @@
-"""A folder of photos with poses, from a COLMAP model, a transforms.json, or photos alone."""
+"""Photo collection: a folder's photos with poses from a COLMAP model, a transforms.json, or photos alone."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
 OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
-"""Folder for a model of ours if sparse is taken."""
+"""Folder of a model that is reconstructed here, if sparse/ is taken."""
 TRANSFORMS = "transforms.json"
 MaskOf = Callable[[str], Path | None]
 
 
 @dataclass(frozen=True)
 class PhotoCollection:
-    """Photos on disk, and where they were taken."""
+    """Photos on disk with their poses."""
 
     folder: Path
-    """The scene's folder."""
+    """Folder of the scene."""
     photos: list[Photo]
-    """In the order of the reconstruction."""
+    """Usable photos, in the order of the reconstruction."""
     reconstruction: Reconstruction
-    """Their poses and points, in the frame of the file that the poses come from."""
+    """Poses and points of the photos, in the frame of the file from which they were read."""
     left_out: dict[str, str]
-    """Photos of the file that can't be used, with reasons."""
+    """Photos of that file that can't be used, with reasons."""
     reconstructed: bool = False
     """Whether the poses were computed here, in a frame that no other program knows."""
 
 
 def read_collection(data: str | Path) -> PhotoCollection:
-    """The photos of a folder or video; those without poses are reconstructed, which takes minutes.
+    """Read the photos of a folder or video. Photos without poses are reconstructed, which takes minutes.
 
     Args:
         data: a folder with a COLMAP model or a transforms.json, a folder of photos alone, or a video.
@@ -92,7 +92,7 @@ def _collection(
 
 
 def images_path(data: Path, named: Path = Path("images")) -> Path:
-    """The photos' folder relative to the scene's: the named one if it exists, else one with photos."""
+    """Return the photos' folder relative to the scene's: `named` if it has files, else one with photos."""
     if (data / named).is_dir() and any((data / named).iterdir()):
         return named
     return find_photos(data).folder.relative_to(data) if any(find_photos(data).names) else named
@@ -101,14 +101,16 @@ def images_path(data: Path, named: Path = Path("images")) -> Path:
 def usable_photos(
     reconstruction: Reconstruction, images: Path, mask_of: MaskOf, follow_links: bool = False
 ) -> tuple[dict[Path, Photo], dict[str, TrackedPhoto], dict[str, UserError]]:
-    """The photos of a COLMAP model that are on disk, by their files; their entries in the model, turned as
-    the files are; and why the others can't be used.
+    """Find the photos of a COLMAP model on disk.
 
     Args:
         reconstruction: the model.
         images: folder of the photos.
-        mask_of: finds a photo's foreground mask by its name.
+        mask_of: function that finds a photo's foreground mask by its name.
         follow_links: whether photos may be links that leave the folder.
+
+    Returns:
+        Usable photos by file, their entries in the model turned like the files, and reasons for the others.
     """
     photos, left_out = dict[Path, Photo](), dict[str, UserError]()
     kept = dict[str, TrackedPhoto]()
@@ -133,10 +135,10 @@ _Read = tuple[dict[Path, Photo], dict[str, UserError], Reconstruction]
 
 
 def read_transforms(path: Path) -> _Read:
-    """Photos and poses of a transforms.json, as instant-ngp and nerfstudio write it; without points.
+    """Read the photos and poses of a transforms.json, as instant-ngp and nerfstudio write it.
 
     Returns:
-        Photos by file, reasons for those left out, and the reconstruction in the file's frame.
+        Photos by file, reasons for those left out, and the reconstruction (without points) in its frame.
 
     Raises:
         UserError: the file is damaged, or lists no photo.
@@ -160,7 +162,7 @@ def read_transforms(path: Path) -> _Read:
 
 
 def _photo_name(folder: Path, name: str) -> str:
-    """Relative to the folder; instant-ngp leaves out the suffix."""
+    """Return a photo's name relative to the folder, with the suffix that instant-ngp leaves out."""
     if Path(name).is_absolute() and Path(name).is_relative_to(folder):
         name = Path(name).relative_to(folder).as_posix()
     name = name.removeprefix("./")
@@ -177,7 +179,7 @@ def _transforms_photo(folder: Path, name: str, frame: Mapping[str, Any]) -> tupl
         raise UserError(f"there is no {path}")
     mask, pose = frame.get("mask_path"), _camera_from_world(frame["transform_matrix"])
     nothing = np.zeros((0, 3)), np.zeros((0, 2))
-    # Programs that write this file read the pixels as stored, whatever EXIF says.
+    # Programs that write this file read the pixels as stored, whatever their EXIF orientation.
     tracked = upright_in_model(TrackedPhoto(name, _transforms_lens(frame, path, name), pose, *nothing), path)
     return Photo.from_model(tracked, path, None if mask is None else inside(folder, str(mask), True)), tracked
 

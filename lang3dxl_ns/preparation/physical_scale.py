@@ -1,7 +1,7 @@
 """Physical scale: world units per pixel of each photo, and crop sides in world units.
 
 Everything here is in units of the original COLMAP model. Poses that a trainer has recentered and rescaled
-don't belong here: the scale ranges would lose their meaning.
+must not be used here, because the scale ranges would lose their meaning.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from lang3dxl_ns.preparation.settings import AngleRule, DistanceRule
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 
 SMALLEST_CROP = 32
-"""Pixels: smaller crops show an image encoder nothing."""
+"""Smallest side of a crop in pixels; smaller ones contain too little for an image encoder."""
 FINE_SHARE = 0.7
 """Side of the finest crops relative to the pyramid's smallest; chosen by measurement (docs/lab/words.md)."""
 EDGE_MARGIN = 0.1
-"""Share of a side: observations nearer to the photo's edge are ignored by the "mean-inner" distance."""
+"""Margin, as a share of a photo's side, in which the "mean-inner" distance ignores observations."""
 
 
 @dataclass(frozen=True)
 class ScaleRange:
-    """Sides of the smallest and the largest crop in world units, and in one sentence where they come from."""
+    """Sides of the smallest and the largest crop in world units, with a sentence that explains them."""
 
     smallest: float
     largest: float
@@ -36,23 +36,25 @@ class ScaleRange:
 
 
 def points_in_view(points: Float[Array, "m 3"], photo: TrackedPhoto) -> Float[Array, "k 3"]:
-    """The points in front of the camera that project into the (undistorted) photo, even if occluded."""
+    """Select the points in front of the camera that project into the (undistorted) photo, occluded or not."""
     return _track_all_in_view(points, photo).points
 
 
 def pixel_size(
     photo: TrackedPhoto, distance: DistanceRule = "median", angle: AngleRule = "half"
 ) -> float | None:
-    """World units that a pixel of the photo shows at the distance of its tracked points.
+    """Compute the world units that a pixel of the photo shows at the distance of its tracked points.
 
-    distance: "median" is the camera's distance to the points' median (per camera axis), robust
-    against outliers;
-    "mean" to their mean; "mean-inner" to the mean without points near the photo's edges (the paper).
-    angle: "half" is 2 d tan(θ/2) with θ the full field of view over the pixels, as assumed by the published
-    scale ranges; "paper" is the paper's text, 2 d tan θ with θ = arctan(W / f) / W; "exact" the pinhole's
-    d / f. Width and height versions are averaged.
+    The result averages width and height. It is None if the photo has no tracked points in front of the
+    camera. Method: Lang3D-XL, physical scale.
 
-    None if the photo has no tracked points in front of the camera. Method: Lang3D-XL, physical scale.
+    Args:
+        photo: the photo with its tracked points.
+        distance: "median" is the camera's distance to the points' median (per camera axis), robust against
+            outliers; "mean" to their mean; "mean-inner" to the mean without points near edges (the paper).
+        angle: "half" is 2 d tan(θ/2) with θ the full field of view over the pixels, as assumed by the
+            published scale ranges; "paper" is the paper's text, 2 d tan θ with θ = arctan(W / f) / W; "exact"
+            is the pinhole's d / f.
     """
     d = _subject_distance(photo, distance)
     if d is None:
@@ -65,7 +67,7 @@ def pixel_size(
 def pixel_sizes(
     reconstruction: Reconstruction, distance: DistanceRule = "median", angle: AngleRule = "half"
 ) -> tuple[dict[str, float], list[str]]:
-    """Pixel size of every photo, and the names of the photos for which it is a fallback.
+    """Compute every photo's pixel size, and list the photos for which it is a fallback.
 
     A photo without tracked points is measured by the points in its view; without those, it gets the median of
     the other photos. Raises UserError if no photo can be measured.
@@ -86,7 +88,7 @@ def pixel_sizes(
 
 
 def physical_scales(smallest: float, largest: float) -> list[float]:
-    """Crop sides in world units, geometric from `smallest` to `largest`, both included.
+    """List crop sides in world units, geometric from `smallest` to `largest`, both included.
 
     There are round(log_√2(largest / smallest)) of them, at least 1 (then the smallest alone). Raises
     UserError for an empty range. Method: Lang3D-XL, scale list.
@@ -100,34 +102,34 @@ def physical_scales(smallest: float, largest: float) -> list[float]:
 
 
 def relative_scales(count: int = 7, smallest: float = 0.05, largest: float = 0.5) -> list[float]:
-    """Crop sides as fractions of the photo's width, LERF's range."""
+    """List crop sides as fractions of the photo's width, by default over LERF's range."""
     return np.geomspace(smallest, largest, count).tolist()
 
 
 def crop_sides(
     scales: Sequence[float], pixel_size: float, width: int, smallest: float = SMALLEST_CROP
 ) -> list[int]:
-    """Crop sides in pixels of a photo of `width` pixels, ascending.
+    """Convert scales to crop sides in pixels of a photo of `width` pixels, ascending.
 
-    Sides are clipped to `smallest` … `width` pixels; duplicates are dropped, so that a photo can have fewer
-    crops than there are scales. For relative scales the pixel size is 1 / width.
+    Sides are clipped to `smallest` … `width` pixels. Duplicates are dropped, so a photo can have fewer sides
+    than there are scales. For relative scales, the pixel size is 1 / width.
     """
     sides = (min(max(scale / pixel_size, smallest), width) for scale in sorted(scales))
     return list(dict.fromkeys(math.floor(side + 1e-6) for side in sides))  # 0.47 / 0.01 is 46.99…
 
 
 def fine_crops(side: int) -> list[int]:
-    """Sides in pixels of fine crops: the smallest of a photo's pyramid, and smaller ones."""
+    """List the sides in pixels of fine crops: `side`, the smallest of a pyramid, and a smaller one."""
     return [max(round(FINE_SHARE * side), 2), side]
 
 
 def propose_scale_range(reconstruction: Reconstruction, pixel_sizes: dict[str, float]) -> ScaleRange:
-    """A scale range for a scene without a hand-made one, from what its photos show.
+    """Propose a scale range for a scene without a hand-made one, from the widths that its photos show.
 
-    The smallest crop is 1/20 of the width that the median photo shows, about a window on a building that
-    fills the photo, and at least 32 pixels there. The largest is half of what the wider photos show, but no
-    larger than the building (the sphere that holds 80 % of the points). Their ratio stays within that of the
-    published hand-made ranges, 4.5–16.
+    The smallest crop is 1/20 of the median photo's width in the world, about a window on a building that
+    fills the photo, and at least 32 pixels there. The largest is half of the wider photos' (75th percentile),
+    but no larger than the building (the sphere that contains 80 % of the points). Their ratio stays within
+    4.5–16, as in the published hand-made ranges.
     """
     widths = np.array([photo.width for photo in reconstruction.photos.values()])
     sizes = np.array([pixel_sizes[name] for name in reconstruction.photos])
@@ -144,15 +146,15 @@ def propose_scale_range(reconstruction: Reconstruction, pixel_sizes: dict[str, f
 
 
 def _extent(points: Float[Array, "m 3"]) -> float:
-    """Diameter of the sphere around the median point that holds 80 % of the points."""
+    """Compute the diameter of the sphere around the median point that contains 80 % of the points."""
     return 2 * float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.8))
 
 
 def _subject_distance(photo: TrackedPhoto, rule: DistanceRule) -> float | None:
-    """Distance from the camera to the middle of its tracked points; None without a usable one.
+    """Compute the distance from the camera to the middle of its tracked points; None without a usable one.
 
-    In the camera's frame, since a per-axis median depends on the frame. Points behind the camera can't be
-    seen: such tracks are wrong, and ignored.
+    The middle is taken in the camera's frame, since a per-axis median depends on the frame. Points behind the
+    camera can't be seen, so such tracks are wrong and ignored.
     """
     points = (photo.points - photo.center) @ photo.camera_from_world[:, :3].T
     in_front = points[:, 2] > 0
@@ -169,7 +171,7 @@ def _subject_distance(photo: TrackedPhoto, rule: DistanceRule) -> float | None:
 
 
 def _footprint(length: int, focal: float, distance: float, rule: AngleRule) -> float:
-    """World units per pixel along an axis of `length` pixels."""
+    """Compute the world units per pixel along an axis of `length` pixels."""
     if rule == "exact":
         return distance / focal
     if rule == "paper":
@@ -178,7 +180,7 @@ def _footprint(length: int, focal: float, distance: float, rule: AngleRule) -> f
 
 
 def _track_all_in_view(points: Float[Array, "m 3"], photo: TrackedPhoto) -> TrackedPhoto:
-    """The photo with all points in its view instead of its tracked ones."""
+    """Return the photo with all points in its view instead of its tracked ones."""
     lens = photo.lens
     x, y, z = photo.camera_from_world @ np.column_stack([points, np.ones(len(points))]).T
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

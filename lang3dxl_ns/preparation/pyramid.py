@@ -1,4 +1,4 @@
-"""Crop pyramid: a photo's CLIP target from square crops on a regular grid per scale, averaged over scales."""
+"""Crop pyramid: a photo's CLIP target as the mean over scales of square crops on regular grids."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ class ClipTarget:
 
 
 HALF, THIRD = 2, 3
-"""Crops per side: how many steps a crop's own side is, from one center to the next."""
+"""Spacing of crops: the number of steps from center to center that make up a crop's side."""
 
 
 def crop_count(length: int, side: int, steps: int = HALF) -> int:
-    """Number of crops along an axis of `length` pixels."""
+    """Count the crops along an axis of `length` pixels."""
     return max(length // max(2 * _half(side) // steps, 1), 1)
 
 
 def crop_centers(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]:
-    """Pixel positions of the crop centers along an axis of `length` pixels: the middles of n equal cells, as
-    a target is read, n such that they are about a crop over `steps` apart.
+    """Compute the pixel positions of the crop centers along an axis of `length` pixels.
 
-    A crop covers `side // 2` pixels to either side of its center and may reach out of the photo. Method:
-    Lang3D-XL, crop grid; there centers are exactly half a crop apart, up to half a cell beside their cells.
+    They are the middles of equal cells, like a target's, about `side` / `steps` apart. A crop covers
+    `side // 2` pixels to either side of its center and may extend beyond the photo. Method: Lang3D-XL, crop
+    grid; there the centers are exactly half a crop apart, and up to half a cell off their cells' middles.
     """
     count = crop_count(length, side, steps)
     return ((2 * torch.arange(count) + 1) * length + count - 1) // (2 * count)  # rounded
 
 
 def valid_fractions(height: int, width: int, side: int, steps: int = HALF) -> Float[Tensor, "ny nx"]:
-    """Fraction of each crop's area that lies inside a photo of `height` × `width` pixels."""
+    """Compute the fraction of each crop's area that lies inside a photo of `height` × `width` pixels."""
     return torch.outer(_inside(height, side, steps), _inside(width, side, steps))
 
 
 def iterate_crops(
     photo: Float[Tensor, "h w 3"], side: int, size: int, batch_size: int, steps: int = HALF
 ) -> Iterator[Float[Tensor, "n 3 s s"]]:
-    """Yield the photo's crops, row by row from the top left, as `size` pixels, `batch_size` at a time.
+    """Yield the photo's crops, row by row from the top left, at `size` pixels, `batch_size` at a time.
 
-    Black outside the photo. The resize is CLIP's own, antialiased bicubic, clamped to 0..1 like the photo.
+    They are black outside the photo. CLIP's own antialiased bicubic resize is used, then clamped to 0..1.
     """
     windows, tops, lefts = _windows(photo, side, steps)
     columns = len(lefts)
@@ -78,9 +78,9 @@ def build_clip_target(
 ) -> ClipTarget:
     """Encode the crops of every scale and average the scales on the finest scale's grid.
 
-    `photo` holds RGB in 0..1; `crop_sides` are pixels, a side per scale; `encode` takes crops of `crop_size`
-    pixels in 0..1; `steps`: of the finest scale's crops per side, others have two. All scales have equal
-    weight. Method: Lang3D-XL, average over scales.
+    `photo` is RGB in 0..1, `crop_sides` has one side in pixels per scale, and `encode` takes crops of
+    `crop_size` pixels in 0..1. `steps` is the spacing of the finest scale's crops; others have two steps per
+    side. All scales have equal weight. Method: Lang3D-XL, average over scales.
     """
     finest = valid_fractions(photo.shape[0], photo.shape[1], min(crop_sides), steps).shape
     total = torch.zeros(())
@@ -100,8 +100,8 @@ def _encode_scale(
     batch_size: int,
     steps: int,
 ) -> Float[Tensor, "c+1 ny nx"]:
-    """The embeddings of one scale as a grid, with the valid fraction as a last channel; in smaller batches
-    if memory runs out."""
+    """Encode one scale's crops to a grid of embeddings, with the valid fraction as the last channel; batches
+    become smaller if memory runs out."""
     features = with_less_memory(
         lambda batch: torch.cat(
             [encode(crops).float() for crops in iterate_crops(photo, side, crop_size, batch, steps)]
@@ -113,14 +113,14 @@ def _encode_scale(
 
 
 def _half(side: int) -> int:
-    """Half of a crop's side; a crop is twice this wide."""
+    """Return half of a crop's side, rounded down. Raises ValueError for a side of less than 2 pixels."""
     if side < 2:
         raise ValueError(f"a crop needs a side of at least 2 pixels, not {side}")
     return side // 2
 
 
 def _inside(length: int, side: int, steps: int) -> Float[Tensor, " n"]:
-    """Fraction of each crop that lies inside the photo along one axis."""
+    """Compute the fraction of each crop that lies inside the photo along one axis."""
     half, centers = _half(side), crop_centers(length, side, steps)
     return ((centers + half).clamp(max=length) - (centers - half).clamp(min=0)) / (2 * half)
 
@@ -128,8 +128,9 @@ def _inside(length: int, side: int, steps: int) -> Float[Tensor, " n"]:
 def _windows(
     photo: Float[Tensor, "h w 3"], side: int, steps: int
 ) -> tuple[Float[Tensor, "3 H W t t"], Int[Tensor, " ny"], Int[Tensor, " nx"]]:
-    """A crop at every pixel, as a view of the photo padded with black (no memory per crop), and the first row
-    and column of those that are wanted."""
+    """Return a crop at every pixel, and the rows and columns at which the required crops begin.
+
+    The crops are a view of the photo padded with black, so they take no memory each."""
     half = _half(side)
     padding: list[int] = []
     starts = []

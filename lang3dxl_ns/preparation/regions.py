@@ -1,4 +1,4 @@
-"""Region label maps: segments of a photo whose features should agree, from networks, colors, or a folder."""
+"""Region label maps: segments of a photo with similar features, from networks, colors, or a folder."""
 
 from __future__ import annotations
 
@@ -32,32 +32,32 @@ from lang3dxl_ns.scene.companions import companion, named_folder
 from lang3dxl_ns.scene.photo import Photo
 
 LONGER_SIDE = 256
-"""Pixels of a stored label map: over twice the size at which training decodes."""
+"""Longer side of a stored label map in pixels, over twice the size at which training decodes."""
 LABEL_SUFFIXES = (".png", ".npy")
 
 _SAM_SIDE = 1024
-"""Pixels of SAM's input."""
+"""Longer side of SAM's input in pixels."""
 _FELZENSZWALB = {"scale": 100.0, "sigma": 0.8, "min_size": 20}
-"""Gives about 250 regions per photo, half of them over 60 pixels."""
+"""Parameters that give about 250 regions per photo, half of them over 60 pixels."""
 _RULE = 1
-"""Increased when label maps are made in another way, so that older ones are made again."""
+"""Version of the label maps, increased when they are made in another way, to make older ones again."""
 
 
 class RegionSource(Protocol):
     """Source of a scene's label maps."""
 
     def settings(self, photo: Photo) -> dict[str, Any] | None:
-        """Everything besides the photo that determines its labels; None for a photo without regions."""
+        """Return everything besides the photo that determines its labels; None for one without regions."""
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
-        """Labels of the photo as read by `photo.read()` (`image`), at any size; negative for no region."""
+        """Label `image`, the photo as read by `photo.read()`, at any size; negative for no region."""
 
 
 def region_source(config: PreparationConfig, data: Path, device: torch.device | str) -> RegionSource | None:
-    """The source named by `config.regions`: none, felzenszwalb, sam, text, a folder (relative to `data`), or
-    auto, the folder regions/ if `data` has one.
+    """Create the source that `config.regions` names; None for "none", or "auto" without a folder regions/.
 
-    Raises UserError if there is no such folder, or a network can't be found or downloaded.
+    A folder is relative to `data`. Raises UserError if it does not exist, or a network can't be found or
+    downloaded.
     """
     if config.regions == "auto":
         folder = data / "regions"
@@ -75,14 +75,14 @@ def region_source(config: PreparationConfig, data: Path, device: torch.device | 
 
 
 class FelzenszwalbRegions:
-    """Regions of similar color (Felzenszwalb and Huttenlocher 2004): no weights, a fraction of a second."""
+    """Regions of similar color (Felzenszwalb and Huttenlocher 2004), fast and without weights."""
 
     def settings(self, photo: Photo) -> dict[str, Any]:
-        """As `RegionSource.settings`."""
+        """Return the algorithm's parameters."""
         return {"regions": "felzenszwalb", **_FELZENSZWALB, "rule": _RULE}
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
-        """As `RegionSource.labels`."""
+        """Label the regions of similar color in `image`, shrunk to the size of a stored label map."""
         from skimage.segmentation import felzenszwalb
 
         return torch.from_numpy(felzenszwalb(_shrunk(image, LONGER_SIDE).numpy(), **_FELZENSZWALB))
@@ -96,11 +96,11 @@ class _MaskRegions:
         self._made_with = {**made_with, "level": level, "rule": _RULE}
 
     def settings(self, photo: Photo) -> dict[str, Any]:
-        """As `RegionSource.settings`."""
+        """Return the network's identity and the settings of its masks."""
         return self._made_with
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
-        """As `RegionSource.labels`."""
+        """Label `image` by the network's masks, at the size of a stored label map."""
         small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
         size = label_size(*small.shape[:2])
         masks = [_nearest(mask, size) for mask in self._masks(small)]
@@ -126,8 +126,7 @@ class SamRegions(_MaskRegions):
 
 
 class TextRegions(_MaskRegions):
-    """Regions from SAM 3: one for each instance of what the prompts name. Raises UserError for another
-    model."""
+    """Regions from SAM 3, one for each instance of a prompt. Raises UserError for another model."""
 
     def __init__(
         self, files: SegmenterFiles, prompts: Sequence[str], level: RegionLevel, device: torch.device | str
@@ -148,13 +147,13 @@ class TextRegions(_MaskRegions):
 
 
 class FolderRegions:
-    """User-provided label maps: drawn on the photos' files, at any size, named like them."""
+    """Regions from the user's label maps, drawn on the photos' files at any size and named like them."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def settings(self, photo: Photo) -> dict[str, Any] | None:
-        """As `RegionSource.settings`."""
+        """Return a hash of the photo's label map; None for a photo without one."""
         path = companion(self._folder, photo.name, LABEL_SUFFIXES)
         if path is None:
             return None
@@ -162,15 +161,15 @@ class FolderRegions:
         return {"regions": "folder", "file": digest, "rule": _RULE}
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
-        """As `RegionSource.labels`. Raises UserError for a file that holds no label map."""
+        """Read and undistort the photo's label map. Raises UserError for a file that is not a label map."""
         path = companion(self._folder, photo.name, LABEL_SUFFIXES)
         assert path is not None, "settings() found it"
         return photo.undistort_labels(_numbered(_read_labels(path, photo.name)))
 
 
 def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "h w"]:
-    """One label per pixel from overlapping masks: the smallest mask that contains it, the largest, or the
-    median by area; −1 outside all masks."""
+    """Choose one label per pixel from overlapping masks: the smallest mask that contains it, the largest, or
+    the median by area; −1 outside all masks."""
     masks = masks[masks.sum(dim=(1, 2)).argsort(stable=True)]
     rank = masks.cumsum(dim=0, dtype=torch.int32)  # the smallest of a pixel's masks has rank 1
     count = rank[-1]
@@ -180,19 +179,19 @@ def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "
 
 
 def stored_labels(labels: Int[Tensor, "hl wl"]) -> Int[Tensor, "h w"]:
-    """A label map as stored: `label_size` (nearest), numbered from 0, −1 for none, on the CPU."""
+    """Convert a label map for storage: `label_size` (nearest), numbered from 0, −1 for none, on the CPU."""
     small = _numbered(_nearest(labels, label_size(*labels.shape)).cpu())
     return small.to(torch.int16 if small.max() < 2**15 else torch.int32)
 
 
 def label_size(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of a stored label map: at most 256 on the longer side."""
+    """Compute the rows and columns of a stored label map, at most 256 on the longer side."""
     shrink = min(LONGER_SIDE / max(height, width), 1.0)
     return max(round(height * shrink), 1), max(round(width * shrink), 1)
 
 
 def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
-    """A file's labels: integers, negative for no region (0 in a picture, which has no sign)."""
+    """Read a file's labels: integers, negative for no region (0 in a picture, which has no sign)."""
     try:
         if path.suffix == ".npy":
             labels, first = read_array(path), 0
@@ -212,13 +211,13 @@ def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
 
 
 def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """The same regions, renumbered without gaps from 0; −1 for none."""
+    """Renumber regions without gaps from 0; −1 for none."""
     regions, numbers = labels.clamp(min=-1).unique(return_inverse=True)
     return numbers - int(regions[0] < 0)
 
 
 def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Integers resized: every pixel takes the value under its center."""
+    """Resize integers: every pixel takes the value under its center."""
     rows, columns = (
         ((torch.arange(n, device=values.device) + 0.5) * length / n).long()
         for n, length in zip(size, values.shape, strict=True)
@@ -227,5 +226,5 @@ def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def _shrunk(image: Float[Tensor, "h w 3"], longer_side: int) -> Float[Tensor, "hs ws 3"]:
-    """The image on the CPU, averaged down to at most `longer_side` pixels."""
+    """Average an image down to at most `longer_side` pixels, and return it on the CPU."""
     return resize(image, fitted_size(image, longer_side)).contiguous().clamp(0, 1).cpu()

@@ -1,5 +1,4 @@
-"""SAM 3 (Carion et al. 2025): everything in a picture that a text names, each instance with a mask and a
-score."""
+"""SAM 3 (Carion et al. 2025), which finds all instances of a text in a picture, with masks and scores."""
 
 from __future__ import annotations
 
@@ -14,13 +13,13 @@ from torch import Tensor
 from lang3dxl_ns.preparation.model_files import ModelFiles, load_processor, load_weights
 
 MODEL_TYPES = ("sam3", "sam3_video")
-"""In its configuration: published checkpoints hold the detector inside a video model."""
+"""Model types in SAM 3's configuration; published checkpoints contain the detector inside a video model."""
 _LEAST_SCORE = 0.5
 """Lowest score of an instance, and of its mask at a pixel."""
 
 
 class Sam3:
-    """A text segmenter. The picture is encoded once for all prompts."""
+    """Text segmenter that encodes a picture once for all prompts."""
 
     def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
         from transformers import Sam3Model, Sam3Processor
@@ -29,12 +28,12 @@ class Sam3:
         self._processor = load_processor(Sam3Processor, files)
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
-        """As `TextSegmenter.segment`."""
+        """Combine the masks of all instances (see `TextSegmenter.segment`)."""
         found = self.instances(image, prompts)
         return torch.cat([masks for masks, _ in found]).any(dim=0)
 
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """As `TextSegmenter.probabilities`: the best instance's score times its mask, whatever the score."""
+        """Compute, for each prompt and pixel, the highest instance score × mask, without a threshold."""
         maps = []
         for output in self._outputs(image, prompts):
             scores = (output.pred_logits.sigmoid() * output.presence_logits.sigmoid())[0]
@@ -45,14 +44,13 @@ class Sam3:
     def instances(
         self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]
     ) -> list[tuple[Bool[Tensor, "n h w"], Float[Tensor, " n"]]]:
-        """For each prompt the masks of what it names, at the size of the image, and their scores; on the
-        CPU."""
+        """Find each prompt's instances: masks at the size of the image, and scores, on the CPU."""
         size, found = tuple(image.shape[:2]), []
         for output in self._outputs(image, prompts):
             (result,) = self._processor.post_process_instance_segmentation(
                 output, _LEAST_SCORE, _LEAST_SCORE, target_sizes=[size]
             )
-            masks = result["masks"].reshape(-1, *size)  # none has another shape
+            masks = result["masks"].reshape(-1, *size)  # an empty result has another shape
             found.append((masks.bool().cpu(), result["scores"].float().cpu()))
         return found
 

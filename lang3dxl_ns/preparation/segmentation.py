@@ -1,6 +1,6 @@
-"""Segmentation networks: CLIPSeg, SAM 3, or GroundingDINO with SAM for prompts; SAM alone for everything.
+"""Segmentation networks: CLIPSeg, SAM 3, or GroundingDINO with SAM for prompts; SAM alone without prompts.
 
-All are read from a local folder or by Hugging Face name, like the encoders.
+All are loaded from a local folder or by Hugging Face name, like the encoders.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ SAM_OPTION = "--pipeline.datamanager.sam"
 
 _BOX_THRESHOLD = 0.3
 """Minimum confidence of a box (LangSAM's)."""
-# Published for language fields: LangSplat's settings of SAM's automatic masks. Its extra round over crops of
-# the photo is omitted: it takes five times as long and finds masks smaller than the label maps resolve.
+# These are LangSplat's settings of SAM's automatic masks, published for language fields. Its extra round over
+# crops of the photo is omitted: it takes five times as long and finds masks too small for the label maps.
 _AUTOMATIC = {
     "points_per_crop": 32,
     "pred_iou_thresh": 0.7,
@@ -41,22 +41,22 @@ _AUTOMATIC = {
 
 
 class TextSegmenter(Protocol):
-    """Finds what prompts name in an image."""
+    """Network that finds the things that prompts name in an image."""
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
-        """Mask of any of the prompts, at the size of the image, on the CPU."""
+        """Compute the mask of any of the prompts, at the size of the image, on the CPU."""
 
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Confidence in every prompt at every pixel, 0…1, at the size of the image, on the CPU."""
+        """Compute the confidence in every prompt at every pixel, 0…1, at the image's size, on the CPU."""
 
 
 @dataclass(frozen=True)
 class SegmenterFiles:
-    """The local files of a text segmenter's networks."""
+    """Local files of a text segmenter's networks."""
 
     words: ModelFiles
     sam: ModelFiles | None
-    """Segments the boxes of a detector; None if `words` makes masks itself."""
+    """SAM that segments the boxes of a detector; None if `words` makes masks itself."""
 
     @property
     def identity(self) -> str:
@@ -65,9 +65,9 @@ class SegmenterFiles:
 
 
 def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
-    """A text segmenter's files: a CLIPSeg or SAM 3 alone, or a GroundingDINO with a SAM.
+    """Find a text segmenter's files: a CLIPSeg or SAM 3 alone, or a GroundingDINO with a SAM.
 
-    Raises UserError when one can't be found or downloaded, or is another kind of model.
+    Raises UserError if one can't be found or downloaded, or is another kind of model.
     """
     words = find_model(name_or_dir, TEXT_OPTION)
     kind = model_type(words)
@@ -80,7 +80,7 @@ def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
 
 
 def find_sam(name_or_dir: str) -> ModelFiles:
-    """SAM's files. Raises UserError when they can't be found or downloaded, or are another kind of model."""
+    """Find SAM's files. Raises UserError if they are unavailable, or of another kind of model."""
     files = find_model(name_or_dir, SAM_OPTION)
     kind = model_type(files)
     if kind != "sam":
@@ -89,19 +89,19 @@ def find_sam(name_or_dir: str) -> ModelFiles:
 
 
 def load_text_segmenter(files: SegmenterFiles, device: torch.device | str) -> TextSegmenter:
-    """The networks on `device`. Raises UserError when one is incomplete."""
+    """Load the networks onto `device`. Raises UserError if one is incomplete."""
     if files.sam is not None:
         return BoxesAndSam(files.words, files.sam, device)
     return Sam3(files.words, device) if is_sam3(files) else ClipSeg(files.words, device)
 
 
 def is_sam3(files: SegmenterFiles) -> bool:
-    """Whether a text segmenter is a SAM 3, which tells instances apart."""
+    """Return whether a text segmenter is a SAM 3, which distinguishes instances."""
     return model_type(files.words) in MODEL_TYPES
 
 
 class ClipSeg:
-    """CLIPSeg (Lüddecke and Ecker 2022): a probability per pixel and prompt, thresholded at 0.5."""
+    """CLIPSeg (Lüddecke and Ecker 2022), which predicts a probability per pixel and prompt."""
 
     def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
         from transformers import CLIPSegForImageSegmentation, CLIPSegProcessor
@@ -111,12 +111,12 @@ class ClipSeg:
         self._context: int = self._model.config.text_config.max_position_embeddings
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
-        """As `TextSegmenter.segment`."""
+        """Threshold the probabilities at 0.5 (see `TextSegmenter.segment`)."""
         return (self.probabilities(image, prompts) >= 0.5).any(dim=0)
 
     @torch.no_grad()
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """As `TextSegmenter.probabilities`."""
+        """Compute the probabilities of all prompts (see `TextSegmenter.probabilities`)."""
         inputs = self._processor(
             text=list(prompts),
             images=[_picture(image)] * len(prompts),
@@ -131,7 +131,7 @@ class ClipSeg:
 
 
 class BoxesAndSam:
-    """GroundingDINO (Liu et al. 2023) finds boxes, SAM (Kirillov et al. 2023) segments each: LangSAM."""
+    """LangSAM: GroundingDINO (Liu et al. 2023) finds boxes, and SAM (Kirillov et al. 2023) segments each."""
 
     def __init__(self, words: ModelFiles, sam: ModelFiles, device: torch.device | str) -> None:
         from transformers import (
@@ -147,11 +147,11 @@ class BoxesAndSam:
         self._sam_processor = load_processor(SamProcessor, sam)
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
-        """As `TextSegmenter.segment`."""
+        """Combine the masks of all boxes (see `TextSegmenter.segment`)."""
         return (self.probabilities(image, prompts) > 0).any(dim=0)
 
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """As `TextSegmenter.probabilities`: the score of the best box whose mask covers the pixel, else 0.
+        """Compute the score of the best box whose mask covers the pixel, else 0, for each prompt.
 
         The detector sees one prompt at a time, so that prompts don't compete.
         """
@@ -182,7 +182,7 @@ class BoxesAndSam:
     def boxes(
         self, image: UInt8[Tensor, "h w 3"], prompt: str
     ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-        """Left, top, right and bottom of what the prompt names, in pixels; and the scores."""
+        """Find the boxes of what the prompt names (left, top, right, bottom in pixels), and their scores."""
         caption = prompt.strip().lower().rstrip(".") + "."  # the form that the detector was trained with
         inputs = self._detector_processor(images=_picture(image), text=caption, return_tensors="pt")
         output = self._detector(**inputs.to(self._detector.device))
@@ -195,7 +195,7 @@ class BoxesAndSam:
 
 
 class AutomaticSam:
-    """SAM prompted with a grid of points: overlapping masks of everything."""
+    """SAM prompted with a grid of points, which gives overlapping masks of everything."""
 
     def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
         from transformers import SamModel, SamProcessor, pipeline
@@ -205,7 +205,7 @@ class AutomaticSam:
         self._generate = pipeline("mask-generation", model=model, image_processor=processor, device=device)
 
     def masks(self, image: UInt8[Tensor, "h w 3"]) -> list[Bool[Tensor, "h w"]]:
-        """Masks at the size of the image, on the CPU; empty if nothing is found."""
+        """Find all masks, at the size of the image, on the CPU; empty if there are none."""
         return [
             torch.as_tensor(mask).cpu() for mask in self._generate(_picture(image), **_AUTOMATIC)["masks"]
         ]

@@ -1,4 +1,4 @@
-"""Feature store: prepared targets on disk, one file per photo and kind, written atomically, memory-mapped."""
+"""Feature store: prepared targets on disk, one memory-mapped file per photo and kind, written atomically."""
 
 from __future__ import annotations
 
@@ -27,35 +27,35 @@ logger = logging.getLogger(__name__)
 
 _HALF_MAX = torch.finfo(torch.float16).max
 _ENTRIES = (".safetensors", ".png", ".jpg")
-"""Targets, masks, and photos at working size."""
+"""Suffixes of targets, masks, and photos at working size."""
 _HASHES = "photo_hashes.json"
 _SECOND = 10**9  # nanoseconds
 _LEFTOVER_AGE_S = 3600.0
-"""A write takes seconds: an older temporary file belongs to a process that was killed."""
+"""Age in seconds from which a temporary file is a leftover of a killed process; a write takes seconds."""
 _READERS = 4
-"""Threads that check photos."""
+"""Number of threads that check photos."""
 
 
 class FeatureStore:
-    """A folder of safetensors files, `root/kind/photo.safetensors`, each with the settings that made it.
+    """Folder of safetensors files, `root/kind/photo.safetensors`, each with the settings that made it.
 
-    Floating-point tensors are stored as float16. Any number of processes may read and write at the same time:
-    the last complete write of an entry wins.
+    Floating-point tensors are stored as float16 if their values allow. Any number of processes may read and
+    write at the same time, and the last complete write of an entry wins.
     """
 
     def __init__(self, root: Path) -> None:
         self.root = Path(root)
 
     def path(self, kind: str, name: str) -> Path:
-        """The entry's file. Different names never share a file, on any file system."""
+        """Return the entry's file. Different names never share a file, on any file system."""
         digest = hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:16]
         readable = re.sub(r"[^A-Za-z0-9._-]", "_", name)[-80:]
         return self.root / kind / f"{readable}.{digest}.safetensors"
 
     def write(self, kind: str, name: str, tensors: dict[str, Tensor], settings: dict[str, Any]) -> None:
-        """Store an entry, atomically: a failure at any moment leaves the old entry, or none.
+        """Store an entry atomically: a failure at any moment leaves the old entry, or none.
 
-        Raises UserError on NaN or infinity, and when the disk is full.
+        Raises UserError on NaN or infinity, and if the disk is full or read-only.
         """
         from safetensors.torch import save
 
@@ -66,12 +66,12 @@ class FeatureStore:
         _seal(path)
 
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
-        """Write a file of the store, atomically. Raises UserError if the disk is full or read-only."""
+        """Write a file of the store atomically. Raises UserError if the disk is full or read-only."""
         with self._writable(what):
             write_atomically(path, content)
 
     def make_folder(self) -> None:
-        """Create the folder. Raises UserError if the disk is full or read-only."""
+        """Create the store's folder. Raises UserError if the disk is full or read-only."""
         with self._writable("its folder"):
             self.root.mkdir(parents=True, exist_ok=True)
 
@@ -91,7 +91,7 @@ class FeatureStore:
             ) from error
 
     def read(self, kind: str, name: str) -> dict[str, Tensor]:
-        """An entry's tensors, memory-mapped: only what is accessed is read from disk. CPU, float16.
+        """Map an entry's tensors into memory (CPU, float16): only the parts in use are read from disk.
 
         Raises UserError if the entry is missing or damaged.
         """
@@ -99,19 +99,20 @@ class FeatureStore:
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 
     def shapes(self, kind: str, name: str) -> dict[str, tuple[int, ...]]:
-        """The shapes of an entry's tensors, from its header alone. Raises like `read`."""
+        """Read the shapes of an entry's tensors from its header alone. Raises UserError like `read`."""
         with _opened(self.path(kind, name), f"{kind} of {name}") as file:
             return {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
 
     def settings(self, kind: str, name: str) -> dict[str, Any]:
-        """The settings that made an entry. Raises like `read`."""
+        """Read the settings that made an entry. Raises UserError like `read`."""
         with _opened(self.path(kind, name), f"{kind} of {name}") as file:
             return json.loads(file.metadata()["settings"])
 
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
-        """Whether the entry exists, is complete, and was made with these settings. Damaged counts as absent.
+        """Return whether the entry exists, is complete, and was made with these settings.
 
-        Reads the entry's header alone, and all of it only if the file has changed since it was last whole.
+        A damaged entry counts as absent. Only the header is read, unless the file has changed since it was
+        last found complete.
         """
         path = self.path(kind, name)
         if not path.exists():
@@ -133,9 +134,9 @@ class FeatureStore:
             return False
 
     def photo_hashes(self, photos: Sequence[Photo]) -> dict[str, str | UserError]:
-        """A hash of every photo's file by name, or the reason why it can't be read.
+        """Compute a hash of every photo's file by name, or the reason why it can't be read.
 
-        A file is read once, and again when its size, time of change or inode is another than recorded.
+        A file is read once, and again if its size, modification time or inode has changed.
         """
         path = self.root / _HASHES
         known = _read_json(path)
@@ -162,7 +163,7 @@ class FeatureStore:
         return hashes
 
     def sizes(self) -> dict[str, tuple[int, int]]:
-        """Files and bytes on disk, by kind."""
+        """Count the files and bytes on disk, by kind."""
         sizes = {}
         for folder in sorted(path for path in self.root.glob("*") if path.is_dir()):
             files = [path for path in folder.iterdir() if path.suffix in _ENTRIES]
@@ -170,7 +171,7 @@ class FeatureStore:
         return sizes
 
     def clean(self, kinds: Collection[str], names: Iterable[str]) -> tuple[int, int]:
-        """Delete all entries except those of these kinds and photos; returns their number and bytes."""
+        """Delete all entries except those of these kinds and photos, and return their number and bytes."""
         self.remove_leftovers()
         keep = {self.path(kind, name).with_suffix("") for name in names for kind in kinds}
         files, freed = 0, 0
@@ -206,7 +207,7 @@ def _opened(path: Path, what: str) -> Iterator[Any]:
 
 
 def _compact(tensor: Tensor, what: str) -> Tensor:
-    """The tensor as stored: contiguous, on the CPU, floats in half precision where they fit."""
+    """Convert a tensor for storage: contiguous, on the CPU, floats in half precision if values allow."""
     tensor = tensor.detach().cpu().contiguous()
     if not tensor.is_floating_point():
         return tensor
@@ -219,7 +220,7 @@ def _compact(tensor: Tensor, what: str) -> Tensor:
 
 
 def _checksum(tensors: dict[str, Tensor]) -> str:
-    """Checksum of names, shapes and contents."""
+    """Compute a checksum of the tensors' names, types, shapes and contents."""
     digest = hashlib.blake2b(digest_size=16)
     for key, tensor in sorted(tensors.items()):
         digest.update(f"{key} {tensor.dtype} {list(tensor.shape)}".encode())
@@ -228,7 +229,7 @@ def _checksum(tensors: dict[str, Tensor]) -> str:
 
 
 def _seal(path: Path) -> None:
-    """Mark a file as whole by a time of change in full seconds, which a later change makes another."""
+    """Mark a file as complete by a modification time in full seconds, which a later change replaces."""
     with contextlib.suppress(OSError):
         seconds = path.stat().st_mtime_ns // _SECOND
         os.utime(path, ns=(seconds * _SECOND, seconds * _SECOND))
@@ -239,7 +240,7 @@ def _is_sealed(path: Path) -> bool:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """A JSON object; empty for a file that is missing or damaged."""
+    """Read a JSON object; empty for a file that is missing or damaged."""
     with contextlib.suppress(OSError, ValueError, RecursionError):
         content = json.loads(path.read_text())
         return content if isinstance(content, dict) else {}

@@ -20,7 +20,7 @@ _STD_FLOOR = 0.01
 
 @dataclass
 class StoredClipTarget:
-    """A photo's CLIP target, memory-mapped: float16, CPU."""
+    """CLIP target of a photo, memory-mapped (CPU, float16)."""
 
     features: Float[Tensor, "hd wd c"]
     """Mean embedding over the scales, not normalized."""
@@ -32,7 +32,7 @@ class StoredClipTarget:
 
 @dataclass
 class ChannelStatistics:
-    """Mean and standard deviation per channel; deviations are at least 1 % of the channels' average."""
+    """Mean and standard deviation per channel; deviations are at least 1 % of their average."""
 
     mean: Float[Tensor, " c"]
     std: Float[Tensor, " c"]
@@ -47,7 +47,7 @@ class FeatureStatistics:
 
 
 class TargetReader:
-    """The prepared targets of a scene's photos, by photo name; loaded on access."""
+    """Reader of the prepared targets of a scene's photos, by photo name; they are loaded on access."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class TargetReader:
         return FINE if name in self._fine else CLIP
 
     def clip(self, name: str) -> StoredClipTarget:
-        """The CLIP target of a photo. Raises UserError if it isn't prepared."""
+        """Read a photo's CLIP target. Raises UserError if it isn't prepared."""
         settings = self._store.settings(self._clip_kind(name), name)
         width = settings["size"][0]
         return StoredClipTarget(
@@ -77,23 +77,23 @@ class TargetReader:
         )
 
     def clip_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "hd wd c"]]:
-        """The CLIP targets of photos, one at a time, float16."""
+        """Yield the CLIP targets of photos, one at a time, float16."""
         return (self.clip(name).features for name in names)
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
-        """The dense features of the photo squashed to a square, float16; None for a photo without."""
+        """Read the dense features of the photo squashed to a square, float16; None for a photo without."""
         return self._store.read(DENSE, name)["features"] if name in self._with_dense else None
 
     def dense_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "t t d"]]:
-        """The dense features of those photos that have some, one at a time, float16."""
+        """Yield the dense features of those photos that have some, one at a time, float16."""
         return (self._store.read(DENSE, name)["features"] for name in names if name in self._with_dense)
 
     def regions(self, name: str) -> Int[Tensor, "h w"] | None:
-        """Region labels of the photo, −1 for none; None (no file is read) for a photo without regions."""
+        """Read the photo's region labels, −1 for none; None (no file is read) for one without regions."""
         return self._store.read(REGIONS, name)["labels"] if name in self._with_regions else None
 
     def bytes_of(self, name: str) -> int:
-        """Bytes of a photo's targets on disk."""
+        """Compute the bytes of a photo's targets on disk."""
         kinds = (
             [self._clip_kind(name)]
             + [DENSE] * (name in self._with_dense)
@@ -102,7 +102,7 @@ class TargetReader:
         return sum(self._store.path(kind, name).stat().st_size for kind in kinds)
 
     def check(self, encoder: ImageTextEncoder) -> None:
-        """Raises UserError if a photo's target is missing or was made by another CLIP than `encoder`."""
+        """Raise UserError if a photo's target is missing or was made by another CLIP than `encoder`."""
         for name in self.names:
             width = self._store.shapes(self._clip_kind(name), name)["features"][-1]
             made_with = self._store.settings(self._clip_kind(name), name)["encoder"]
@@ -116,7 +116,7 @@ class TargetReader:
     def feature_statistics(
         self, names: Sequence[str] | None = None, with_dense: bool = True, sample: int = 100
     ) -> FeatureStatistics:
-        """Mean and deviation per channel over at most `sample` photos, evenly spaced in `names` (or all)."""
+        """Compute channel statistics over at most `sample` photos, evenly spaced in `names` (or in all)."""
         names = self.names if names is None else list(names)
         names = names[:: -(-len(names) // sample)]
         clip = _statistics(self.clip(name).features for name in names)
@@ -125,7 +125,7 @@ class TargetReader:
 
 
 def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:
-    """Statistics over all pixels of all maps, merged map by map in float64 (Chan, Golub & LeVeque 1983)."""
+    """Compute statistics over all maps' pixels, merged map by map in float64 (Chan, Golub & LeVeque 1983)."""
     count, mean, squares = 0, torch.zeros(()), torch.zeros(())
     for values in maps:
         pixels = values.flatten(0, 1).double()

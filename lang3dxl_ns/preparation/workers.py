@@ -22,16 +22,16 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 
 PATIENCE_S = 30.0
-"""Seconds to wait for a Ray cluster."""
+"""Seconds to wait for a Ray cluster to answer."""
 Item = TypeVar("Item", contravariant=True)
 Result = TypeVar("Result", covariant=True)
 
 
 class Maker(Protocol[Item, Result]):
-    """Setup of a worker; can be sent to another process."""
+    """Setup of a worker, which can be sent to another process."""
 
     def start(self, device: str) -> Callable[[Item], Result]:
-        """Load what the work needs onto a device, once per worker."""
+        """Load everything for the work onto a device, once per worker, and return the work function."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,15 @@ class Workers:
     count: int = 1
     """Number of processes."""
     engine: Literal["local", "ray"] = "local"
-    """Processes on this machine, or on a Ray cluster (which must see the same folders)."""
+    """Where the processes run: on this machine, or on a Ray cluster (which must see the same folders)."""
     address: str | None = None
     """Address of the Ray cluster; None starts one on this machine."""
 
     def run(
         self, maker: Maker[Item, Result], items: Sequence[Item], device: str
     ) -> Iterator[tuple[Item, Result]]:
-        """Every item with its result, as they finish. Raises what the work raises, and UserError if a process
-        dies; results until then are kept."""
+        """Yield every item with its result, as they finish. Raises the exceptions of the work, and UserError
+        if a process dies; earlier results are kept."""
         if self.engine == "ray":
             return _run_on_ray(self, maker, items, device)
         if self.count <= 1 or len(items) <= 1:
@@ -66,7 +66,7 @@ def _run_here(maker: Maker[Item, Result], items: Sequence[Item], device: str):
 # --- processes of this machine ----------------------------------------------------------------------------
 
 _work: Any = None
-"""The work function of this worker process."""
+"""Work function of this worker process."""
 
 
 def _run_in_processes(count: int, maker: Maker[Item, Result], items: Sequence[Item], device: str):
@@ -98,7 +98,7 @@ def _start(maker: Maker, device: str, count: int, turn: Any) -> None:
 
 
 def _end_with_parent() -> None:
-    """Exit when the parent is killed, instead of waiting for ever."""
+    """Exit when the parent is killed, instead of waiting forever."""
     parent = parent_process()
     assert parent is not None
     parent.join()
@@ -110,7 +110,7 @@ def _do(item: Any) -> Any:
 
 
 def _device(device: str, number: int, count: int) -> str:
-    """The worker's share of the machine: one of the GPUs, or some of the cores."""
+    """Return the worker's device, one of the GPUs; on a CPU, take a share of the cores."""
     if device.startswith("cuda"):
         return f"cuda:{number % torch.cuda.device_count()}"
     torch.set_num_threads(max(torch.get_num_threads() // count, 1))
@@ -121,7 +121,7 @@ def _device(device: str, number: int, count: int) -> str:
 
 
 class _Actor:
-    """A worker on a cluster. If it dies, Ray starts another and repeats its item."""
+    """Worker on a Ray cluster. If it dies, Ray starts another and repeats its item."""
 
     def __init__(self, maker: Maker, device: str) -> None:
         self._work = maker.start(device)
@@ -151,8 +151,8 @@ def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[It
 
 
 def _within(seconds: float, job: Callable[[], Any]) -> None:
-    """Run a job with a time limit. Raises TimeoutError when it is reached (the job stays in a daemon
-    thread), otherwise what the job raises."""
+    """Run a job with a time limit. Raises TimeoutError when it is reached (the job stays in a daemon thread),
+    or the job's exception."""
     ended: Future[None] = Future()
 
     def run() -> None:
@@ -169,7 +169,9 @@ def _within(seconds: float, job: Callable[[], Any]) -> None:
 
 
 def _connect(ray: Any, workers: Workers, attempts: int = 2) -> None:
-    """Ray allows its processes half a minute to start; the second attempt finds them in the disk cache."""
+    """Connect to the Ray cluster, or start one here. Raises UserError if it doesn't answer.
+
+    Ray allows its processes half a minute to start; a second attempt finds them in the disk cache."""
     # A cluster started here listens on this machine only.
     own = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     try:
@@ -178,7 +180,7 @@ def _connect(ray: Any, workers: Workers, attempts: int = 2) -> None:
             _within(PATIENCE_S, lambda: ray.init(log_to_driver=False, address=workers.address))
         else:
             ray.init(log_to_driver=False, **own)
-    except Exception as error:  # the class that Ray raises if its processes don't start in time
+    except Exception as error:  # Ray raises this class itself if its processes don't start in time
         if not isinstance(error, TimeoutError):
             ray.shutdown()
             if attempts > 1 and not workers.address:

@@ -1,4 +1,4 @@
-"""Photos at working size: decoded, turned upright, undistorted and shrunk once, kept beside the targets."""
+"""Photos at working size: decoded, turned upright, undistorted and shrunk once, stored beside the targets."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ PHOTOS, PHOTO_MASKS = "photos", "photo_masks"
 _QUALITY = 95
 """JPEG quality: 46 dB, a tenth of the bytes, 12 ms to decode 1,600 × 1,200 pixels on one core."""
 _SMALL = 1_000_000
-"""Pixels of a file that is decoded as fast as a copy."""
+"""Largest file, in pixels, that is decoded as fast as a copy."""
 _RULE = 1
-"""Increased when photos are decoded in another way, so that older copies are made again."""
+"""Version of the copies, increased when photos are decoded in another way, to make older ones again."""
 
 
 class WorkingPhotos:
-    """Reads photos as `Photo.read_uint8` and `Photo.read_mask` do, from copies that it keeps in a store.
+    """Reader of photos like `Photo.read_uint8` and `Photo.read_mask`, from copies that it keeps in a store.
 
-    A copy is made when a photo is first read, if its file is large, and has to be shrunk, turned or
-    undistorted; again when the file or the lens has changed. Safe from several threads and processes.
+    A copy is made when a photo is first read, if its file is large and has to be shrunk, turned or
+    undistorted. It is made again if file or lens have changed. Threads and processes may share a store.
     """
 
     def __init__(self, store: FeatureStore) -> None:
         self._store = store
 
     def read(self, photo: Photo, scale: float = 1.0) -> UInt8[Tensor, "h w 3"]:
-        """As `Photo.read_uint8`; raises like it, also if a copy is there but the file is gone."""
+        """Read a photo like `Photo.read_uint8`. It raises UserError likewise, even for a file with a copy."""
         path = self._store.path(PHOTOS, photo.name).with_suffix(".jpg")
         made_with = _made_with(photo, photo.path)
         image = kept_picture(path, made_with, "RGB")
@@ -53,7 +53,7 @@ class WorkingPhotos:
         return _resized(image, photo, scale, Image.Resampling.BILINEAR)
 
     def mask(self, photo: Photo, scale: float = 1.0) -> Bool[Tensor, "h w"] | None:
-        """As `Photo.read_mask`; raises like it."""
+        """Read a mask like `Photo.read_mask`, and raise UserError likewise."""
         source = photo.mask_path or photo.path
         if (photo.mask_path is None and not photo.lens.distorts) or not _is_slow(photo, source):
             return photo.read_mask(scale)
@@ -68,7 +68,7 @@ class WorkingPhotos:
         return _resized(image, photo, scale, Image.Resampling.NEAREST)
 
     def _keep(self, path: Path, content: bytes) -> None:
-        """Write a copy; without room or permission, the photo is decoded anew each time."""
+        """Write a copy. Without space or permission it is not written, and the photo is decoded each time."""
         try:
             self._store.write_bytes(path, content, path.name)
         except UserError:
@@ -76,7 +76,7 @@ class WorkingPhotos:
 
 
 def mask_png(mask: Bool[Tensor, "h w"], made_with: str) -> bytes:
-    """A black-and-white PNG that contains what made it, so that no mask is ever without it."""
+    """Encode a mask as a black-and-white PNG that contains the settings that made it."""
     text, content = PngImagePlugin.PngInfo(), io.BytesIO()
     text.add_text("settings", made_with)
     Image.fromarray(mask.numpy()).save(content, "PNG", pnginfo=text)
@@ -84,9 +84,9 @@ def mask_png(mask: Bool[Tensor, "h w"], made_with: str) -> bytes:
 
 
 def kept_picture(path: Path, made_with: str, mode: str | None = None) -> Image.Image | None:
-    """A `mask_png`, or a JPEG with such a comment, if it is whole and was made like this.
+    """Read a `mask_png`, or a JPEG with such a comment, if it is complete and was made with these settings.
 
-    mode: of the pixels; None checks the file and decodes nothing.
+    Otherwise return None. `mode` is the mode of the pixels; None checks the file and decodes nothing.
     """
     if not path.is_file():
         return None
@@ -106,19 +106,19 @@ def kept_picture(path: Path, made_with: str, mode: str | None = None) -> Image.I
 
 
 def _made_with(photo: Photo, source: Path) -> str:
-    """Everything that determines a copy. Raises UserError if the source is missing."""
+    """Describe everything that determines a copy, as JSON. Raises UserError if the source is missing."""
     size = [photo.width, photo.height, photo.quarter_turns]
     made_with = {"file": photo.stamp(source), "size": size, "undistorted": photo.lens.undistortion}
     return json.dumps({**made_with, "rule": _RULE})
 
 
 def _is_slow(photo: Photo, source: Path) -> bool:
-    """Whether reading a file takes longer than reading a copy at the photo's size."""
+    """Return whether reading a file takes longer than reading a copy at the photo's size."""
     try:
         with open_picture(source) as image:
             pixels = math.prod(image.size)
     except (OSError, NoPictureError):
-        return False  # reading it says why
+        return False  # reading it reports the reason
     shrinks = pixels > 1.2 * photo.width * photo.height
     return pixels > _SMALL and (shrinks or photo.lens.distorts or photo.quarter_turns > 0)
 

@@ -17,20 +17,20 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 
 MOST_PIXELS = 180_000_000
-"""Most pixels of a picture: Pillow rejects larger ones as an attack."""
+"""Largest picture, in pixels; Pillow rejects larger ones as an attack."""
 
 LONGEST_SIDE = 1 << 16
-"""Most pixels of a picture's side."""
+"""Longest side of a picture, in pixels."""
 
 
 def scaled_size(width: int, height: int, scale: float) -> tuple[int, int]:
-    """Width and height of a photo at `scale`, at least one pixel each."""
+    """Compute the width and height of a photo at `scale`, at least one pixel each."""
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of a photo of `width` × `height` pixels; origin at the corner of the top-left pixel."""
+    """Intrinsics of a photo of `width` × `height` pixels, with the origin at its top-left corner."""
 
     width: int
     height: int
@@ -39,7 +39,7 @@ class Lens:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
-    """In OpenCV's order: k1 k2 p1 p2 [k3 …], or k1 k2 k3 k4 for a fisheye; empty without distortion."""
+    """Coefficients in OpenCV's order: k1 k2 p1 p2 [k3 …], or k1 k2 k3 k4 for a fisheye; empty for none."""
     fisheye: bool = False
 
     @property
@@ -49,7 +49,7 @@ class Lens:
 
     @property
     def undistortion(self) -> list[float] | None:
-        """Everything that an undistortion depends on; None where there is none."""
+        """All values that an undistortion depends on; None if the lens does not distort."""
         return [self.fx, self.fy, self.cx, self.cy, *self.distortion, self.fisheye] if self.distorts else None
 
     @property
@@ -59,7 +59,7 @@ class Lens:
         return torch.tensor(rows, dtype=torch.float64)
 
     def check(self) -> None:
-        """Raises ValueError for a lens that cannot be rendered with."""
+        """Raise ValueError if the lens cannot be rendered with."""
         values = (self.width, self.height, self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(map(is_coordinate, values)):
             raise ValueError("a lens has a value that is not a number")
@@ -73,24 +73,26 @@ class Lens:
             raise ValueError("a lens has no known distortion")
 
     def resized(self, width: int, height: int) -> Lens:
-        """The same lens at another resolution."""
+        """Return the lens at another resolution."""
         x, y = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
         )
 
     def scaled(self, scale: float) -> Lens:
-        """The lens at `scale`, exact for the rounded size."""
+        """Return the lens at `scale`, exact for the rounded size."""
         return self.resized(*scaled_size(self.width, self.height, scale))
 
     def camera(self, view_matrix: Float[Tensor, "4 4"]) -> Camera:
-        """This lens, undistorted, at a pose (world → camera, OpenCV axes)."""
+        """Return a camera with this lens, undistorted, at a pose (world → camera, OpenCV axes)."""
         return Camera(view_matrix, self.matrix.float(), self.width, self.height)
 
 
 def check_pose(rows: object) -> None:
-    """The check of every pose that a file gives, whatever wrote it: [3, 4] or [4, 4] nested lists of finite
-    numbers, in which a rotation keeps volumes within a factor of eight. Raises ValueError otherwise."""
+    """Check a pose that was read from a file.
+
+    It must be a [3, 4] or [4, 4] nested list of finite numbers, and its rotation must keep volumes within a
+    factor of eight. Raises ValueError otherwise."""
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
         raise ValueError("a pose is not three rows of four numbers")
     if len(rows) not in (3, 4) or not all(is_coordinate(value) for row in rows for value in row):
@@ -102,40 +104,41 @@ def check_pose(rows: object) -> None:
 
 @dataclass
 class Camera:
-    """A pinhole camera without distortion and skew; OpenCV axes (x right, y down, z forward)."""
+    """Pinhole camera without distortion and skew; OpenCV axes (x right, y down, z forward)."""
 
     view_matrix: Float[Tensor, "4 4"]
-    """World to camera, rigid, world units."""
+    """Rigid transform from world to camera, in world units."""
     intrinsics: Float[Tensor, "3 3"]
-    """Pixels; origin at the top-left corner of the top-left pixel, so pixel centers lie at +0.5."""
+    """Intrinsic matrix in pixels; the origin is the photo's top-left corner, so pixel centers lie at +0.5."""
     width: int
     height: int
 
     @property
     def pose(self) -> Float64[Array, "4 4"]:
-        """Camera → world, nerfstudio's axes (x right, y up, z backward), as `Scene.camera` takes it."""
+        """Camera → world in nerfstudio's axes (x right, y up, z backward), as accepted by `Scene.camera`."""
         return np.vstack([camera_to_world(self.view_matrix.detach().double()).cpu().numpy(), [0, 0, 0, 1.0]])
 
     @property
     def position(self) -> Float[Tensor, "3"]:
-        """Where the camera is, world units."""
+        """Position of the camera, world units."""
         return -self.view_matrix[:3, :3].T @ self.view_matrix[:3, 3]
 
     def detach(self) -> Camera:
-        """The same camera, without gradient."""
+        """Return the camera without gradient."""
         return Camera(self.view_matrix.detach(), self.intrinsics.detach(), self.width, self.height)
 
     def to(self, device: torch.device | str) -> Camera:
-        """The same camera on a device."""
+        """Return the camera on a device."""
         view, intrinsics = (to_device(part, device) for part in (self.view_matrix, self.intrinsics))
         return Camera(view, intrinsics, self.width, self.height)
 
     def at_origin(self, like: Tensor) -> tuple[Camera, Float[Tensor, "3"]]:
-        """The camera in a world whose origin is the camera's position (rounded), and that position.
+        """Return the camera in a world whose origin is its own (rounded) position, and that position.
 
         Far from the origin (map coordinates are in the millions) R·x + t is a small difference of large
-        numbers. R·(x − position) + (R·position + t) is not, if the last bracket is computed in float64: where
-        the camera is, or on the CPU, since Apple's GPUs have none. Type and device are those of `like`.
+        numbers. R·(x − position) + (R·position + t) is not, if the last bracket is computed in float64. That
+        happens on the camera's device, or on the CPU for Apple's GPUs, which lack float64. The result has the
+        type and device of `like`.
         """
         view = self.view_matrix.cpu() if self.view_matrix.device.type == "mps" else self.view_matrix
         view = view.to(torch.float64)
@@ -147,7 +150,7 @@ class Camera:
 
 
 def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
-    """World → camera (OpenCV axes) from nerfstudio's camera → world (OpenGL axes)."""
+    """Convert nerfstudio's camera → world (OpenGL axes) to world → camera (OpenCV axes)."""
     right, up_and_back = camera_to_world[:, :3].split([1, 2], dim=1)
     rotation = torch.cat([right, -up_and_back], dim=1).T
     top = torch.cat([rotation, -rotation @ camera_to_world[:, 3:]], dim=1)
@@ -157,7 +160,7 @@ def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
 
 
 def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
-    """The inverse of `view_matrix`: nerfstudio's camera → world from world → camera (OpenCV axes)."""
+    """Convert world → camera (OpenCV axes) to nerfstudio's camera → world; inverse of `view_matrix`."""
     rotation = view_matrix[:3, :3].T
     position = -rotation @ view_matrix[:3, 3:]
     return torch.cat([rotation * view_matrix.new_tensor([1.0, -1.0, -1.0]), position], dim=1)
@@ -165,9 +168,9 @@ def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
 
 @torch.no_grad()
 def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Which Gaussians may be visible: includes all that are, and some that aren't.
+    """Return which Gaussians may be visible: all that are, and some that aren't.
 
-    Tests the ball of 3.5 standard deviations around each against the planes through the image's edges.
+    The ball of 3.5 standard deviations around each is tested against the planes through the image's edges.
     """
     points = means @ camera.view_matrix[:3, :3].T + camera.view_matrix[:3, 3]
     reach = 3.5 * scales.amax(dim=1)
@@ -182,17 +185,19 @@ def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "
 
 
 _PER_PIXEL = 20
-"""Bytes per pixel of a rendering and its maps: 5.7 GB were measured at 20,000 × 15,000 pixels."""
+"""Bytes per pixel of a rendering and its maps; 5.7 GB were measured at 20,000 × 15,000 pixels."""
 
 
 def resized(camera: Camera, longer_side: int) -> Camera:
-    """The same view with fewer pixels, never more."""
+    """Return the view with at most `longer_side` pixels on its longer side; it is never enlarged."""
     return with_longer_side(camera, min(longer_side, max(camera.width, camera.height)))
 
 
 def with_longer_side(camera: Camera, pixels: int) -> Camera:
-    """The same view at another resolution. Raises UserError for fewer than one pixel, or more than the memory
-    holds."""
+    """Return the view at another resolution.
+
+    Raises UserError for a side below 1 or above `LONGEST_SIDE`, and if over half of the memory is needed.
+    """
     if not (isinstance(pixels, int) and 1 <= pixels <= LONGEST_SIDE):
         raise UserError(f"a picture of {pixels} pixels can't be rendered: give 1 to {LONGEST_SIDE}")
     factor = pixels / max(camera.width, camera.height)
@@ -208,9 +213,9 @@ def with_longer_side(camera: Camera, pixels: int) -> Camera:
 
 
 def with_field_of_view(camera: Camera, degrees: float) -> Camera:
-    """The same view through a lens with another vertical field of view, centered, with square pixels.
+    """Return the view through a centered lens with another vertical field of view and square pixels.
 
-    Raises UserError unless it lies between 1 and 170 degrees.
+    Raises UserError unless the field of view lies between 1 and 170 degrees.
     """
     if not (isinstance(degrees, int | float) and 1 <= degrees <= 170):
         raise UserError(f"the field of view is {degrees}: give 1 to 170 degrees")
@@ -222,7 +227,7 @@ def with_field_of_view(camera: Camera, degrees: float) -> Camera:
 
 
 def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:
-    """A camera at a pose (camera → world, nerfstudio's axes) with the lens and size of `like`."""
+    """Return a camera at a pose (camera → world, nerfstudio's axes) with the lens and size of `like`."""
     if pose.shape not in ((3, 4), (4, 4)):
         raise UserError(f"a pose has shape [3, 4] or [4, 4], not {list(pose.shape)}")
     try:

@@ -22,48 +22,49 @@ if TYPE_CHECKING:
 
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE_MODELS = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
-"""COLMAP camera models with OpenCV's distortion, and their parameters in OpenCV's order."""
+"""COLMAP's fisheye camera models. Like `PERSPECTIVE_MODELS`, they have OpenCV's distortion, with parameters
+in OpenCV's order."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedPhoto:
-    """A photo of a COLMAP model: lens, pose and the 3D points tracked in it."""
+    """Photo of a COLMAP model: lens, pose and the 3D points tracked in it."""
 
     name: str
     lens: Lens
     camera_from_world: Float[Array, "3 4"]
-    """COLMAP's camera frame: x right, y down, z forward."""
+    """Pose, world → camera, in COLMAP's camera frame: x right, y down, z forward."""
     points: Float[Array, "n 3"]
-    """World units."""
+    """Tracked points, world units."""
     pixels: Float[Array, "n 2"]
     """Positions of the points in the (distorted) photo."""
     quarter_turns: int = 0
-    """Clockwise, from the file's pixels as stored to this photo's."""
+    """Clockwise quarter turns from the file's pixels as stored to this photo's."""
 
     @property
     def width(self) -> int:
-        """Pixels."""
+        """Width in pixels."""
         return self.lens.width
 
     @property
     def height(self) -> int:
-        """Pixels."""
+        """Height in pixels."""
         return self.lens.height
 
     @property
     def center(self) -> Float[Array, "3"]:
-        """The camera's position in the world."""
+        """Position of the camera in the world."""
         return -self.camera_from_world[:, :3].T @ self.camera_from_world[:, 3]
 
     def resized(self, width: int, height: int) -> TrackedPhoto:
-        """The same photo at another resolution."""
+        """Return the photo at another resolution."""
         factor = [width / self.width, height / self.height]
         return replace(self, lens=self.lens.resized(width, height), pixels=self.pixels * factor)
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A COLMAP model: its photos, sorted by name, and its points with their colors."""
+    """COLMAP model: its photos, sorted by name, and its points with their colors."""
 
     photos: dict[str, TrackedPhoto]
     points: Float[Array, "m 3"]
@@ -98,7 +99,7 @@ def read_reconstruction(model_dir: Path) -> Reconstruction:
 
 
 def _name(number: int, image: pycolmap.Image) -> str | None:
-    """A photo's name; None (logged) if it can't be read."""
+    """Return a photo's name; if it can't be used, log the reason and return None."""
     try:
         if is_plain(image.name):
             return image.name
@@ -113,7 +114,7 @@ def _name(number: int, image: pycolmap.Image) -> str | None:
 
 
 def photos_in_model(model_dir: Path) -> int:
-    """Number of photos in a COLMAP model, from the header or lines of its images file alone."""
+    """Count the photos in a COLMAP model from the header or lines of its images file alone."""
     binary, text = model_dir / "images.bin", model_dir / "images.txt"
     if binary.is_file():
         with binary.open("rb") as file:
@@ -123,7 +124,7 @@ def photos_in_model(model_dir: Path) -> int:
 
 
 def _read_model(folder: Path) -> pycolmap.Reconstruction:
-    """pycolmap's model; UserError with the reason if it can't be read."""
+    """Read pycolmap's model. Raises UserError with the reason if it can't be read."""
     pycolmap = load_pycolmap()
     parts = ("cameras", "images", "points3D")
     if not any(all((folder / (part + ending)).is_file() for part in parts) for ending in (".bin", ".txt")):
@@ -169,7 +170,9 @@ def _tracked_photo(
 
 
 def _distortion(name: str, camera: pycolmap.Camera) -> tuple[tuple[float, ...], bool]:
-    """OpenCV's distortion coefficients for a COLMAP camera, and whether it is a fisheye."""
+    """Return OpenCV's distortion coefficients for a COLMAP camera, and whether it is a fisheye.
+
+    Raises UserError for a camera model that OpenCV can't undistort."""
     model = camera.model_name
     coefficients = tuple(camera.params[camera.extra_params_idxs()].tolist())
     coefficients += (0.0,) * (4 - len(coefficients))

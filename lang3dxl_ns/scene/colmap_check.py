@@ -1,7 +1,7 @@
 """Integrity check of a COLMAP model's binary files, since pycolmap trusts every length in them.
 
-A damaged length can make it allocate all memory or read for hours. Layout: COLMAP's documentation of its
-output format; little endian.
+A damaged length can make it allocate all memory or read for hours. The layout follows COLMAP's documentation
+of its output format; numbers are little endian.
 """
 
 from __future__ import annotations

@@ -10,14 +10,15 @@ from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded
 
 _LONGEST_NAME = 255
-"""Bytes that file systems allow."""
+"""Longest file name that file systems allow, in bytes."""
 
 
 def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
-    """The path in `folder` of a file that a model or a list names; sub-folders are allowed.
+    """Return the path in `folder` of a file that a model or a list names; sub-folders are allowed.
 
-    Models come from other people, so a name may not leave the folder: through `..`, as an absolute path, or
-    by a symbolic link (unless `follow_links`). The folder itself may be a link. Raises UserError otherwise.
+    Models come from other people, so a name must not lead out of the folder, be it through `..`, as an
+    absolute path, or by a symbolic link (unless `follow_links`). The folder itself may be a link. Raises
+    UserError for such a name, and for one that is too long.
     """
     path = folder / name
     if not name or "\0" in name or os.path.isabs(name) or ".." in Path(name).parts:
@@ -34,7 +35,7 @@ def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
 
 
 def is_name(name: object) -> bool:
-    """Whether this can be the name of a photo in a folder: relative, not upwards, no control characters."""
+    """Return whether this can name a photo in a folder: relative, without .. and control characters."""
     if not isinstance(name, str) or not is_plain(name):
         return False
     path = PurePosixPath(name)
@@ -42,10 +43,11 @@ def is_name(name: object) -> bool:
 
 
 def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bool = False) -> Path | None:
-    """The file in `folder` for a photo: `name` with a suffix appended (COLMAP's photo.jpg.png, which
-    distinguishes photo.jpg from photo.png) or replaced. None if there is none.
+    """Find the file in `folder` that belongs to a photo; None if there is none.
 
-    Raises UserError for a name that leads out of the folder, and for a pipe or a device of that name.
+    It is called like the photo, with a suffix appended (COLMAP's photo.jpg.png, which distinguishes photo.jpg
+    from photo.png) or replaced. Raises UserError for a name that leads out of the folder, and for a pipe or a
+    device of that name.
     """
     path = inside(folder, name, follow_links=True)  # the photo's name; the file found is checked below
     candidates = [path.with_name(path.name + suffix) for suffix in suffixes]
@@ -57,7 +59,7 @@ def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bo
 
 
 def named_folder(choice: str, data: Path, option: str) -> Path:
-    """The folder given to an option, relative to `data`. Raises UserError if it does not exist."""
+    """Return the folder given to an option, relative to `data`. Raises UserError if it does not exist."""
     folder = data / expanded(choice)
     if not folder.is_dir():
         raise UserError(

@@ -10,8 +10,9 @@ import numpy  # noqa: F401 (before pycolmap: in the other order, Pillow's PNG wr
 
 
 def load_pycolmap() -> ModuleType:
-    """The module. On import it installs a SIGTERM handler that prints a stack trace and kills; the previous
-    handler in Python, such as that of the `lang3dxl` command, is restored."""
+    """Import pycolmap, and restore the Python SIGTERM handler that its import replaces.
+
+    pycolmap's handler prints a stack trace and kills the process."""
     handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 

@@ -1,8 +1,8 @@
-"""Test views: cameras that are not a photo's, with reference pictures and labels, in test_views/.
+"""Test views in test_views/: cameras that took no photo, with reference pictures and labels.
 
 `test_views/cameras.json` holds the cameras in the COLMAP model's world, `images/` the pictures, `masks/`
-(optional) the foreground, `ground_truth/<category>/` the labels. They are not in the COLMAP model; only
-evaluation reads them.
+(optional) the foreground, and `ground_truth/<category>/` the labels. The views are not in the COLMAP model;
+only evaluation reads them.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ _CAMERAS = "cameras.json"
 
 @dataclass(frozen=True)
 class NovelViews:
-    """A scene's test views."""
+    """Test views of a scene."""
 
     folder: Path
     cameras: list[TrackedPhoto]
     """Cameras in the COLMAP model's world, each with some of the surface points it sees. Names are
     `test_views/NNNN.jpg`, relative to the scene; the pictures are in `images/`."""
     same_light: bool
-    """Whether the photos were taken in the same light, so that colors can be compared."""
+    """Whether the scene's photos share one lighting, so that the colors of views can be compared."""
 
     def image(self, view: TrackedPhoto) -> Path:
-        """The file of a view's picture."""
+        """Return the file of a view's picture."""
         return self.folder / "images" / Path(view.name).name
 
 
 def read_novel_views(scene: Path) -> NovelViews | None:
-    """A scene's test views, or None if it has none. Raises UserError for a damaged cameras.json."""
+    """Read a scene's test views; None if it has none. Raises UserError for a damaged cameras.json."""
     path = scene / FOLDER / _CAMERAS
     if not path.is_file():
         return None
@@ -53,7 +53,7 @@ def read_novel_views(scene: Path) -> NovelViews | None:
 
 
 def write_novel_cameras(folder: Path, cameras: Sequence[TrackedPhoto], same_light: bool) -> None:
-    """Write cameras.json into a scene's `folder`; views are named after their files."""
+    """Write test_views/cameras.json into a scene's `folder`; views are named after their files."""
     views = [
         {
             "name": g.name,

@@ -1,7 +1,7 @@
-"""Orientation: photos taken upright whose pixels are stored lying, as EXIF says.
+"""EXIF orientation: turning photos upright whose pixels are stored sideways.
 
-Phones store the sensor's pixels and say in EXIF by how many quarter turns they are shown upright. COLMAP
-reads the pixels as stored. So a model's photo is turned as a whole: pixels, lens and pose, which is exact.
+Phones store the sensor's pixels, and note in EXIF how many quarter turns bring them upright. COLMAP reads the
+pixels as stored. So pixels, lens and pose of a model's photo are turned together, which is exact.
 """
 
 from __future__ import annotations
@@ -19,20 +19,21 @@ if TYPE_CHECKING:
     from lang3dxl_ns.scene.colmap import TrackedPhoto
 
 _QUARTER_TURNS = {6: 1, 3: 2, 8: 3}
-"""By EXIF's orientation. Mirrored photos (2, 4, 5, 7) stay as stored: no camera could have taken them."""
+"""Clockwise quarter turns by EXIF's orientation. Mirrored photos (2, 4, 5, 7), which no camera could have
+taken, stay as stored."""
 _QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""Turns a camera's frame (x right, y down) with a photo that turns clockwise."""
+"""Rotation of a camera's frame (x right, y down) when its photo is turned clockwise by a quarter."""
 
 
 def quarter_turns(image: Image.Image) -> int:
-    """Quarter turns clockwise that bring a file's stored pixels upright; 0 without EXIF."""
+    """Return the clockwise quarter turns that bring a file's stored pixels upright; 0 without EXIF."""
     with suppress(Exception):  # damaged EXIF, which may hold anything
         return _QUARTER_TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1), 0)
     return 0
 
 
 def turned_lens(lens: Lens, quarters: int) -> Lens:
-    """The lens of a photo that is turned clockwise by quarters."""
+    """Return the lens of a photo after clockwise quarter turns."""
     for _ in range(quarters):
         k = lens.distortion
         if len(k) >= 4 and not lens.fisheye:  # tangential coefficients are a vector; others are radial
@@ -43,14 +44,15 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
 
 
 def upright(tracked: TrackedPhoto, size: tuple[int, int], quarters: int) -> TrackedPhoto:
-    """A model's photo as it is seen upright: lens, pose and tracks turned with the pixels.
+    """Turn a model's photo upright: lens, pose and tracks are turned with the pixels.
+
+    The photos may already have been turned when the model was made (by another program). Then the shape of
+    the model's camera differs from the stored pixels', and lens, pose and tracks are kept.
 
     Args:
-        tracked: as COLMAP knows it, by the pixels as stored or already turned.
+        tracked: the photo in the COLMAP model, whose pixels are as stored or already turned.
         size: width and height of the file's pixels as stored.
-        quarters: of the file, as `quarter_turns`.
-
-    A model of photos that were turned before (by another program) is told by its camera's shape.
+        quarters: quarter turns of the file, from `quarter_turns`.
     """
     width, height = size
     fits_stored = (tracked.width > tracked.height) == (width > height)

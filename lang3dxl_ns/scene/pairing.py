@@ -10,20 +10,22 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
 EXHAUSTIVE = 200
-"""Most photos for which every pair is matched: 19,900 pairs."""
+"""Largest number of photos for which every pair is matched, which makes 19,900 pairs."""
 NEIGHBORS = 40
-"""Partners of each photo in larger collections."""
+"""Most similar photos with which each photo is paired in larger collections."""
 _WORDS = 64
 _SAMPLE = 50_000  # descriptors for learning the words
 _PER_PHOTO = 1_500  # descriptors per photo
 
 Descriptors = Callable[[str], UInt8[Array, "n 128"]]
-"""SIFT descriptors of a photo."""
+"""Function from a photo's name to its SIFT descriptors."""
 
 
 def pairs_to_match(names: Sequence[str], descriptors: Descriptors) -> list[tuple[str, str]]:
-    """Pairs of photos that may overlap: all of them up to EXHAUSTIVE photos, beyond that those found by
-    `similar_pairs`, and neighbors in name order, which is the order of a video or a walk."""
+    """List the pairs of photos that may overlap: all of them for up to `EXHAUSTIVE` photos.
+
+    For more photos, the pairs are those of `similar_pairs`, and neighbors in name order, which is the order
+    of a video or a walk."""
     if len(names) <= EXHAUSTIVE:
         return list(combinations(names, 2))
     found = set(similar_pairs(names, descriptors, NEIGHBORS))
@@ -33,7 +35,7 @@ def pairs_to_match(names: Sequence[str], descriptors: Descriptors) -> list[tuple
 
 
 def similar_pairs(names: Sequence[str], descriptors: Descriptors, neighbors: int) -> list[tuple[str, str]]:
-    """Each photo with the `neighbors` whose aggregated descriptors (VLAD, Jégou et al. 2010) are nearest."""
+    """Pair each photo with its `neighbors` nearest by aggregated descriptors (VLAD, Jégou et al. 2010)."""
     from sklearn.cluster import MiniBatchKMeans
 
     rng = np.random.default_rng(0)
@@ -53,14 +55,14 @@ def similar_pairs(names: Sequence[str], descriptors: Descriptors, neighbors: int
 
 
 def _rows(descriptors: UInt8[Array, "n 128"], most: int, rng: np.random.Generator) -> Float[Array, "m 128"]:
-    """A sample of the rows as RootSIFT."""
+    """Sample at most `most` rows and convert them to RootSIFT."""
     chosen = rng.permutation(len(descriptors))[:most]
     rows = descriptors[chosen].astype(np.float32)
     return np.sqrt(rows / np.maximum(rows.sum(1, keepdims=True), 1e-9))
 
 
 def _aggregate(rows: Float[Array, "n 128"], words: Float[Array, "k 128"]) -> Float[Array, " d"]:
-    """Sum of the descriptors' differences from their nearest word, normalized per word and overall."""
+    """Sum the descriptors' differences from their nearest words, normalized per word and overall."""
     if not len(rows):
         return np.zeros(words.size, np.float32)
     nearest = (np.square(words).sum(1) - 2 * rows @ words.T).argmin(1)

@@ -1,4 +1,4 @@
-"""A photo on disk with its lens: reading, undistortion, masks, resizing."""
+"""Photo on disk with its lens: reading, undistortion, masks, resizing."""
 
 from __future__ import annotations
 
@@ -27,43 +27,43 @@ if TYPE_CHECKING:
     from lang3dxl_ns.scene.colmap import TrackedPhoto
 
 _LARGE = 1_500_000
-"""Pixels of a file above which JPEG's own reduction is used: half of the time, 50 dB from the exact one."""
+"""Pixels of a file above which the JPEG decoder shrinks it: in half of the time, 50 dB from exact."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One photo on disk with its lens.
+    """Photo on disk with its lens.
 
-    The file may have another size than the lens but the same aspect ratio: reading resizes it to the lens's.
-    This is the one place that decodes a photo: everything is read upright.
+    The file may differ from the lens in size, but not in aspect ratio: reading resizes it to the lens's size.
+    This class is the only place that decodes photos, and everything is read upright.
     """
 
     name: str
-    """As in the COLMAP model; may contain folders."""
+    """Name in the COLMAP model; it may contain folders."""
     path: Path
     mask_path: Path | None
-    """A picture of any size, bright on the foreground."""
+    """Picture of any size, bright on the foreground."""
     lens: Lens
     """Intrinsics of the upright photo."""
     quarter_turns: int = 0
-    """Clockwise, from the file's pixels as stored to upright ones."""
+    """Clockwise quarter turns that bring the file's pixels as stored upright."""
 
     @property
     def width(self) -> int:
-        """Pixels."""
+        """Width in pixels, upright."""
         return self.lens.width
 
     @property
     def height(self) -> int:
-        """Pixels."""
+        """Height in pixels, upright."""
         return self.lens.height
 
     @classmethod
     def from_model(cls, tracked: TrackedPhoto, path: Path, mask_path: Path | None = None) -> Photo:
-        """The photo with its lens from the COLMAP model, adapted to the size of the file on disk.
+        """Create a photo with its lens from the COLMAP model, adapted to the size of the file on disk.
 
-        So a folder of resized photos works with the same model. tracked: from `upright_in_model`. Raises
-        UserError for an unreadable file and for another aspect ratio.
+        So a folder of resized photos works with the same model. `tracked` comes from `upright_in_model`.
+        Raises UserError for an unreadable file and for another aspect ratio.
         """
         size, _ = stored_size(path, tracked.name)
         size = _turned_size(size, tracked.quarter_turns)
@@ -71,20 +71,20 @@ class Photo:
         return cls(tracked.name, path, mask_path, tracked.lens.resized(*size), tracked.quarter_turns)
 
     def at_most(self, longer_side: int) -> Photo:
-        """The same photo, read with at most `longer_side` pixels on its longer side."""
+        """Return the photo, to be read with at most `longer_side` pixels on its longer side."""
         shrink = longer_side / max(self.width, self.height)
         return self if shrink >= 1 else replace(self, lens=self.lens.scaled(shrink))
 
     def read(self, scale: float = 1.0) -> Float[Tensor, "h w 3"]:
-        """RGB in 0..1 at `scaled_size`, undistorted: what a pinhole camera with the same fx, fy, cx, cy sees.
+        """Read the photo as a pinhole camera with the same fx, fy, cx, cy would take it.
 
-        Black where the photo does not reach. Raises UserError for an unreadable file and for another aspect
-        ratio than the camera's.
+        The result is RGB in 0..1 at `scaled_size`, and black where the photo does not reach. Raises UserError
+        for an unreadable file and for an aspect ratio other than the camera's.
         """
         return self.read_uint8(scale).float() / 255
 
     def read_uint8(self, scale: float = 1.0) -> UInt8[Tensor, "h w 3"]:
-        """`read` in 0..255, for a quarter of the memory."""
+        """Read the photo like `read`, but in 0..255, for a quarter of the memory."""
         size = scaled_size(self.width, self.height, scale)
         image = self._decoded(size)
         _check_shape(self.name, self.path, image.size, (self.width, self.height))
@@ -94,10 +94,10 @@ class Photo:
         return torch.from_numpy(np.array(image.resize(size, Image.Resampling.BILINEAR)))
 
     def read_mask(self, scale: float = 1.0) -> Bool[Tensor, "h w"] | None:
-        """The foreground: where the mask is at least half bright and undistortion stays inside the photo.
+        """Read the foreground at the size of `read(scale)`; None without a mask file and distortion.
 
-        Same size as `read(scale)`. None if that is everywhere: no mask file and no distortion.
-        Raises UserError for an unreadable mask.
+        It is where the mask is at least half bright and undistortion stays inside the photo. Raises UserError
+        for an unreadable mask.
         """
         if self.mask_path is None and not self.lens.distorts:
             return None
@@ -111,9 +111,9 @@ class Photo:
         return torch.from_numpy(np.array(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST)))
 
     def read_file(self, longer_side: int) -> UInt8[Tensor, "h w 3"]:
-        """The file upright, distorted, shrunk to at most `longer_side` pixels.
+        """Read the file upright and still distorted, shrunk to at most `longer_side` pixels.
 
-        A mask drawn on it can be read by `read_mask`. Raises UserError for an unreadable file.
+        `read_mask` accepts masks drawn on this picture. Raises UserError for an unreadable file.
         """
         shrink = longer_side / max(self.width, self.height)
         image = self._decoded(scaled_size(self.width, self.height, min(shrink, 1.0)))
@@ -121,9 +121,9 @@ class Photo:
         return torch.from_numpy(np.array(image))
 
     def undistort_labels(self, labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-        """Labels drawn on the file (any size), undistorted like `read`: nearest pixel, −1 outside the photo.
+        """Undistort labels drawn on the file (at any size) like `read`, by nearest pixel.
 
-        Labels must fit into 32 bits.
+        The result is −1 outside the photo. Labels must fit into 32 bits.
         """
         labels = self._drawn_upright(labels)
         if not self.lens.distorts:
@@ -131,25 +131,27 @@ class Photo:
         return torch.from_numpy(self._undistort(labels.numpy().astype(np.int32), nearest=True, empty=-1))
 
     def stamp(self, path: Path | None = None) -> list[int]:
-        """Size, time of change and inode of the photo's file (or its mask's, at `path`): another when its
-        content is. Raises UserError if it is missing."""
+        """Return size, modification time and inode of the photo's file (or of its mask, `path`).
+
+        They change when the content does. Raises UserError if the file is missing."""
         with _readable(path or self.path, self.name):
             status = (path or self.path).stat()
             return [status.st_size, status.st_mtime_ns, status.st_ino]
 
     def content_hash(self) -> str:
-        """Hash of the file's bytes, without camera and mask."""
+        """Compute a hash of the file's bytes, without camera and mask."""
         with _readable(self.path, self.name):
             return hashlib.blake2b(self.path.read_bytes(), digest_size=16).hexdigest()
 
     def _decoded(self, at_least: tuple[int, int]) -> Image.Image:
-        """The file upright, distorted, in its size or, if that is large, in one not below `at_least`."""
+        """Decode the file upright and still distorted; a large file may be shrunk, not below `at_least`."""
         image = _read_rgb(self.path, self.name, _turned_size(at_least, self.quarter_turns))
         return image.transpose(_TURNS[self.quarter_turns]) if self.quarter_turns else image
 
     def _drawn_upright(self, drawn: Any) -> Any:
-        """A mask (picture) or labels (tensor) drawn on the file, upright: turned if they are shaped like the
-        pixels as stored. Most programs draw on photos that they show upright."""
+        """Turn a mask (picture) or labels (tensor) upright if they are shaped like the pixels as stored.
+
+        Most programs draw on photos that they show upright; what was drawn on these stays as it is."""
         width, height = drawn.size if isinstance(drawn, Image.Image) else tuple(drawn.shape)[::-1]
         lies = abs(math.log(width * self.height / (height * self.width)))
         if self.quarter_turns % 2 == 0 or lies <= abs(math.log(width * self.width / (height * self.height))):
@@ -161,7 +163,7 @@ class Photo:
     def _undistort(
         self, image: UInt8[Array, "h w *c"] | Int32[Array, "h w"], nearest: bool = False, empty: int = 0
     ) -> Any:
-        """A file of any size as seen by a pinhole camera; `empty` outside the photo."""
+        """Undistort a file of any size to a pinhole camera's view, which is `empty` outside the photo."""
         import cv2
 
         height, width = image.shape[:2]
@@ -174,7 +176,7 @@ class Photo:
 
 @lru_cache(maxsize=4)  # photos of one camera share a lens
 def _undistortion(lens: Lens) -> tuple[Float32[Array, "h w"], Float32[Array, "h w"], Bool[Array, "h w"]]:
-    """Column and row in the photo for every pixel of the pinhole's view, and whether the photo reaches it."""
+    """Compute the column and row in the photo of each pixel of a pinhole's view, and if the photo has it."""
     import cv2
 
     # OpenCV's origin is the center of the first pixel, hence -0.5.
@@ -189,10 +191,10 @@ def _undistortion(lens: Lens) -> tuple[Float32[Array, "h w"], Float32[Array, "h 
 
 
 def _seen(columns: Float32[Array, "h w"], rows: Float32[Array, "h w"]) -> Bool[Array, "h w"]:
-    """Which pixels of the undistorted image sample a valid place in the file.
+    """Return which pixels of the undistorted image sample a valid place in the file.
 
-    Invalid are those outside the file, and those beyond the distortion polynomial's turning point, which show
-    the inside of the photo a second time (there the map is mirrored: its determinant is negative).
+    Pixels outside the file are invalid. So are those beyond the distortion polynomial's turning point, which
+    show the inside of the photo a second time (there the map is mirrored: its determinant is negative).
     """
     height, width = columns.shape
     inside = (columns > -0.5) & (columns < width - 0.5) & (rows > -0.5) & (rows < height - 0.5)
@@ -203,24 +205,26 @@ def _seen(columns: Float32[Array, "h w"], rows: Float32[Array, "h w"]) -> Bool[A
 
 
 _TURNS = {1: Image.Transpose.ROTATE_270, 2: Image.Transpose.ROTATE_180, 3: Image.Transpose.ROTATE_90}
-"""Pillow counts counterclockwise."""
+"""Pillow's transpositions by clockwise quarter turns; Pillow itself counts counterclockwise."""
 
 
 def _turned_size(size: tuple[int, int], quarters: int) -> tuple[int, int]:
-    """Width and height after turning by quarters."""
+    """Return width and height after quarter turns."""
     return size[::-1] if quarters % 2 else size
 
 
 def stored_size(path: Path, name: str) -> tuple[tuple[int, int], int]:
-    """Width and height of a file's pixels as stored, and the quarter turns that bring them upright. Raises
-    UserError for an unreadable file."""
+    """Read width and height of a file's pixels as stored, and the quarter turns that bring them upright.
+
+    Raises UserError for an unreadable file."""
     with _readable(path, name), open_picture(path) as image:
         return image.size, quarter_turns(image)
 
 
 def upright_in_model(tracked: TrackedPhoto, path: Path) -> TrackedPhoto:
-    """A model's photo turned upright with its file, for `Photo.from_model`. Raises UserError for a file that
-    can't be read."""
+    """Turn a model's photo upright with its file, for `Photo.from_model`.
+
+    Raises UserError for an unreadable file."""
     return upright(tracked, *stored_size(path, tracked.name))
 
 
@@ -240,11 +244,12 @@ def _readable(path: Path, name: str) -> Iterator[None]:
 
 
 def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) -> Image.Image:
-    """The file as stored, in 8-bit RGB: gray, CMYK and palettes converted, 16 bits reduced, transparency
-    dropped. A large JPEG may be smaller, not below `at_least`."""
+    """Decode a file as stored to 8-bit RGB; a large JPEG may be shrunk, not below `at_least`.
+
+    Gray, CMYK and palettes are converted, 16 bits are reduced, and transparency is dropped."""
     with _readable(path, name), open_picture(path) as image:
         if at_least is not None and image.width * image.height > _LARGE:
-            image.draft(None, at_least)  # for other formats, nothing
+            image.draft(None, at_least)  # does nothing for other formats
         if image.mode == "F":
             raise ValueError("its pixels are floating-point numbers of unknown range")
         if image.mode.startswith("I"):  # 16-bit gray, which convert() would clip at 255
@@ -254,7 +259,7 @@ def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) ->
 
 
 def _check_shape(name: str, path: Path, size: tuple[int, int], camera: tuple[int, int]) -> None:
-    """Accept the camera's aspect ratio (resized photos), not cropped or rotated photos."""
+    """Raise UserError unless a photo has its camera's aspect ratio, which cropped or rotated ones lack."""
     (width, height), (camera_width, camera_height) = size, camera
     if abs(width * camera_height / (height * camera_width) - 1) > 0.01:
         raise UserError(

@@ -1,4 +1,4 @@
-"""Photos of a folder: flat, in images/, or in sub-folders; grouped by camera."""
+"""Finding the photos of a folder (flat, in images/, or in sub-folders), and grouping them by camera."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ _NOT_PHOTOS = {
 
 @dataclass(frozen=True)
 class PhotoFolder:
-    """A folder and the photos in it, named relative to it and sorted."""
+    """Folder with its photos, named relative to it and sorted."""
 
     folder: Path
     names: tuple[str, ...]
 
 
 def find_photos(data: Path) -> PhotoFolder:
-    """The photos of a scene's folder: those in images/ if there is one, else all in the folder and its
-    sub-folders, except masks, results and the like. Links to folders are not followed.
+    """Find the photos of a scene's folder.
 
-    Raises UserError for a folder that doesn't exist.
+    They are those in images/ or dense/images/ if there are any, otherwise all in the folder and its
+    sub-folders, except masks, results and the like. Links to folders are not followed. Raises UserError for a
+    folder that doesn't exist.
     """
     if not data.is_dir():
         raise UserError(f"{data} is not a folder: give the folder with your photos, or a video")
@@ -46,9 +47,9 @@ def find_photos(data: Path) -> PhotoFolder:
 
 
 def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
-    """The names grouped by camera and lens: same maker, model, focal length and size.
+    """Group the names by camera and lens: by maker, model, focal length and size.
 
-    Photos without EXIF share a camera if they all have one size, else each has its own.
+    Photos without EXIF share a camera if all of them have the same size; otherwise each has its own.
     """
     groups: dict[tuple, list[str]] = {}
     silent: dict[str, tuple[int, int]] = {}
@@ -64,7 +65,7 @@ def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
 
 
 def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
-    """The photos with a readable header, and the reasons for the others."""
+    """Separate the photos with a readable header from the others, for which reasons are given."""
     good, bad = [], {}
     for name in photos.names:
         path = photos.folder / name
@@ -81,7 +82,7 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
 
 
 def photos_below(folder: Path) -> list[str]:
-    """Names of the photos in a folder and its sub-folders, without masks, results and the like, sorted."""
+    """List the photos in a folder and its sub-folders, without masks, results and the like, sorted."""
     names = []
     for parent, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f.lower() not in _NOT_PHOTOS and not f.startswith((".", "_"))]
@@ -93,7 +94,7 @@ def photos_below(folder: Path) -> list[str]:
 
 
 def _size_and_lens(path: Path) -> tuple[tuple[int, int], tuple | None]:
-    """Size in pixels, and camera and focal length from EXIF, if present."""
+    """Read the size in pixels, and camera and focal length from EXIF, if present."""
     with open_picture(path) as image:
         size = image.size
         with suppress(Exception):  # damaged EXIF, which may hold anything

@@ -13,7 +13,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
 
-_SIDE = 512  # pixels, longer side at which colors are read: one pixel then averages a patch of the surface
+_SIDE = 512  # longer side in pixels at which colors are read, so that a pixel averages a patch of the surface
 _DARK, _BRIGHT = 0.03, 0.97  # beyond these, sensors do not record brightness faithfully
 _GAMMA = 2.2
 _FEWEST_POINTS = 20
@@ -21,18 +21,19 @@ _FEWEST_POINTS = 20
 
 @dataclass(frozen=True)
 class Photometry:
-    """How well photos agree on the colors of the same points, in natural logarithms of linear light."""
+    """Agreement of photos on the colors of the same points, in natural logarithms of linear light."""
 
     spread: float
-    """Standard deviation of the photos' exposures and tints (per channel): 0.7 is a stop. 0 if they agree."""
+    """Standard deviation of the photos' exposures and tints (per channel); 0 if they agree, 0.7 is a stop."""
     residual: float
     """Robust deviation of single observations after removing each photo's exposure and tint."""
     view_dependence: float
-    """Share of the residuals' variance that a linear function of the viewing direction explains, beyond
-    chance, 0…1: highlights and sheen."""
+    """Share of the residuals' variance, 0…1, that a linear function of the viewing direction explains beyond
+    chance. Highlights and sheen raise it."""
     photos: int
+    """Number of photos used."""
     points: int
-    """Photos and points used."""
+    """Number of points used."""
 
 
 def measure_photometry(
@@ -40,7 +41,7 @@ def measure_photometry(
 ) -> Photometry | None:
     """Fit log color = point + photo (robust per photo) to at most `at_most` photos, evenly spaced.
 
-    None if fewer than three photos share enough tracked points. Unreadable photos are skipped.
+    Unreadable photos are skipped. The result is None if fewer than three photos share enough tracked points.
     """
     chosen = photos[:: -(-len(photos) // at_most)] if photos else []
     point_of: dict[bytes, int] = {}
@@ -72,7 +73,7 @@ def measure_photometry(
 
 
 def _log_colors(photo: Photo, places: Float[Array, "n 2"]) -> tuple[Float[Array, "n 3"], Array]:
-    """Log of linear RGB at `places` (fractions of width and height); where it is neither dark nor clipped."""
+    """Read log linear RGB at `places` (fractions of width and height), and where it is well exposed."""
     pixels = photo.read_file(_SIDE).double().numpy() / 255
     height, width = pixels.shape[:2]
     column = (places[:, 0] * width).astype(int).clip(0, width - 1)
@@ -108,7 +109,7 @@ def _fit(
 
 
 def _grouped(numbers: Int[Array, " m"]) -> list[Int[Array, " k"]]:
-    """The rows of every number from 0 on."""
+    """Return, for every number from 0 on, the rows that hold it."""
     order = np.argsort(numbers, kind="stable")
     return np.split(order, np.cumsum(np.bincount(numbers))[:-1])
 
@@ -120,7 +121,7 @@ def _point_means(point: Int[Array, " m"], values: Float[Array, "m 3"], count: Fl
 def _explained_by_direction(
     point: Int[Array, " m"], residual: Float[Array, "m 3"], ray: Float[Array, "m 3"], fewest: int = 6
 ) -> float:
-    """Adjusted R² of a linear function of the direction, over points seen at least `fewest` times."""
+    """Compute the adjusted R² of a linear function of direction, over points seen at least `fewest` times."""
     explained, total = 0.0, 0.0
     for group in _grouped(point):
         if len(group) < fewest:

@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     import pycolmap
 
 LEAST_MATCHES = 15
-"""Verified matches from which a pair of photos has a say, as in COLMAP's mapper."""
+"""Fewest verified matches of a pair of photos that is considered, as in COLMAP's mapper."""
 APART = 20.0
-"""Degrees between the measured and the model's rotation from which they contradict each other."""
+"""Degrees between the measured and the model's rotation above which they contradict each other."""
 
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """Two photos by their numbers, and what their matches alone say of them."""
+    """Two photos by their numbers, and their relative rotation as measured from their matches alone."""
 
     first: int
     second: int
     matches: int
-    """Verified ones."""
+    """Number of verified matches."""
     turn: Float[Array, "3 3"]
     """Rotation from the first camera to the second."""
 
@@ -41,8 +41,10 @@ class MatchedPair:
 def doubtful_placements(
     rotations: Mapping[int, Float[Array, "3 3"]], pairs: Iterable[MatchedPair]
 ) -> dict[int, str]:
-    """The photos whose matches contradict their place more than they support it, or support it by one other
-    photo alone, with the reason. rotations: world → camera in the model."""
+    """Find photos that are doubtfully placed, with reasons; rotations: world → camera in the model.
+
+    Either more matches contradict a photo's placement than support it, or only one other photo supports it.
+    """
     reasons: dict[int, str] = {}
     judged = [(pair, _apart(rotations, pair) > APART) for pair in pairs]
     while True:  # the most contradicted first, since its pairs would accuse its neighbors
@@ -65,13 +67,13 @@ def doubtful_placements(
 
 
 def _apart(rotations: Mapping[int, Float[Array, "3 3"]], pair: MatchedPair) -> float:
-    """Degrees between the measured rotation of a pair and the model's."""
+    """Compute the angle in degrees between the measured rotation of a pair and the model's."""
     modeled = rotations[pair.second] @ rotations[pair.first].T
     return float(np.degrees(np.arccos(np.clip((np.trace(modeled.T @ pair.turn) - 1) / 2, -1, 1))))
 
 
 def matched_pairs(database: pycolmap.Database, model: pycolmap.Reconstruction) -> list[MatchedPair]:
-    """The verified pairs among a model's photos; those without depth or with few matches are left out."""
+    """List the verified pairs among a model's photos, except those without depth or with few matches."""
     pycolmap = load_pycolmap()
     cameras = {i: model.cameras[image.camera_id] for i, image in model.images.items() if image.has_pose}
     points = {number: database.read_keypoints(number)[:, :2].astype(float) for number in cameras}
@@ -91,6 +93,6 @@ def matched_pairs(database: pycolmap.Database, model: pycolmap.Reconstruction) -
 
 
 def rotations_of(model: pycolmap.Reconstruction) -> dict[int, Float[Array, "3 3"]]:
-    """World → camera of the model's photos, by number."""
+    """Return the rotations (world → camera) of the model's photos, by number."""
     posed = (image for image in model.images.values() if image.has_pose)
     return {image.image_id: image.cam_from_world().rotation.matrix() for image in posed}

@@ -1,8 +1,8 @@
 """Structure from motion: from a folder of photos to cameras, poses and points, with COLMAP's library.
 
-SIFT features, matching, and COLMAP's incremental or global mapper. Features and matches are stored in a
-database as they are made, so that an interrupted reconstruction continues; the model appears when it is
-complete.
+The steps are SIFT features, matching, and COLMAP's incremental or global mapper. Features and matches are
+stored in a database as they are made, so that an interrupted reconstruction can be resumed; the model is
+written only when it is complete.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ from lang3dxl_ns.scene.video import extract_frames, is_video
 if TYPE_CHECKING:
     import pycolmap
 
-_MEMORY_PER_THREAD = 1e9  # bytes, SIFT on a photo of MAX_SIZE pixels
+_MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
 _FEW_FEATURES = 50
-_SMALLEST_MODEL = 3  # photos; COLMAP's ten may be more than there are
-_CONVERTED = (".webp", ".gif")  # which Pillow reads and COLMAP does not
-_CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar, and the most work lost if killed
+_SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
+_CONVERTED = (".webp", ".gif")  # formats that Pillow reads and COLMAP does not
+_CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar; a killed process loses one step
 
 
 def reconstruct(
     photos: PhotoFolder, work: Path, model: Path, settings: ReconstructionSettings | None = None
 ) -> ReconstructionReport:
-    """Reconstruct photos; writes the largest model to `model`/0, others to `model`/1 …, intermediate results
-    to `work`. Resumes an earlier attempt with the same photos and settings.
+    """Reconstruct photos, or resume an earlier attempt with the same photos and settings.
 
-    Raises UserError for fewer than two photos, if `model` already exists, and if the photos do not
-    make a scene; the message says what to do.
+    The largest model is written to `model`/0, others to `model`/1 …, and intermediate results to `work`.
+    Raises UserError for fewer than two photos, if `model` already exists, and if the photos do not make a
+    scene; the message says what to do.
     """
     settings = settings or ReconstructionSettings()
     if model.exists() and (model_in(model) or any(model.iterdir())):
@@ -95,9 +95,9 @@ def reconstruct(
 def reconstruct_scene(
     data: Path, cache_dir: Path | None = None, settings: ReconstructionSettings | None = None
 ) -> tuple[Path, Path]:
-    """Reconstruct a folder of photos or a video, and log the result. Returns the scene's folder and model.
+    """Reconstruct a folder of photos or a video, log the result, and return the scene's folder and model.
 
-    The model goes to sparse/0 in the scene's folder or, if sparse is taken or the folder is read-only,
+    The model is written to sparse/0 in the scene's folder or, if sparse is taken or the folder is read-only,
     to the cache. Raises UserError like `reconstruct` and `extract_frames`.
     """
     data = expanded(data).absolute()
@@ -115,13 +115,14 @@ def reconstruct_scene(
 
 
 def model_in(folder: Path) -> bool:
-    """Whether a folder or one of its sub-folders holds a COLMAP model."""
+    """Return whether a folder or one of its sub-folders holds a COLMAP model."""
     return any(folder.glob("images.*")) or any(folder.glob("*/images.*"))
 
 
 def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
-    """The photos that can be read, each file once, and the others with the reason. Raises UserError if they
-    are fewer than two."""
+    """Separate the readable photos, without duplicate files, from the others, for which reasons are given.
+
+    Raises UserError if fewer than two photos are usable."""
     good, left_out = readable(photos)
     first: dict[bytes, str] = {}
     for name in good.names:
@@ -151,8 +152,9 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
 
 
 def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
-    """The photos under numbers, in their order: links or, in formats that COLMAP can't read, converted
-    copies. COLMAP separates names by spaces, so that "photo 1.jpg" would be two."""
+    """Link the photos under numbers, in their order; formats that COLMAP can't read become converted copies.
+
+    COLMAP separates names by spaces, so "photo 1.jpg" would be two names."""
     folder = work / "photos"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -166,14 +168,14 @@ def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
         else:
             try:
                 (folder / number).symlink_to(source.absolute())
-            except OSError:  # a disk or system without links
+            except OSError:  # the disk or system has no links
                 shutil.copyfile(source, folder / number)
         numbers.append(number)
     return PhotoFolder(folder, tuple(numbers))
 
 
 def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: ReconstructionSettings) -> Path:
-    """The database of photos and cameras: an earlier attempt's, if photos and settings are the same."""
+    """Make the database of photos and cameras, or reuse one with the same photos and settings."""
     pycolmap = load_pycolmap()
     states = [(photos.folder / name).stat() for name in photos.names]
     stamp = json.dumps(
@@ -202,7 +204,7 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
 
 
 def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
-    """Extract missing SIFT features."""
+    """Extract the SIFT features that are missing in the database."""
     pycolmap = load_pycolmap()
     with _opened(database) as db:
         done = {image.name for image in db.read_all_images() if db.exists_keypoints(image.image_id)}
@@ -219,7 +221,7 @@ def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettin
 
 
 def _match(database: Path, names: Sequence[str]) -> None:
-    """Find and verify missing matches of pairs."""
+    """Find and verify the matches of pairs that are missing in the database."""
     pycolmap = load_pycolmap()
     with _opened(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
@@ -244,7 +246,9 @@ def _match(database: Path, names: Sequence[str]) -> None:
 
 
 def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pycolmap.Reconstruction]:
-    """Models, largest first. If the usual thresholds find none, lower ones are tried."""
+    """Run the mapper and return the models, largest first.
+
+    If the incremental mapper finds none with the usual thresholds, lower ones are tried."""
     pycolmap = load_pycolmap()
     folder = work / "mapping"
     for relaxed in (False, True):
@@ -280,7 +284,7 @@ def _incremental_options(relaxed: bool) -> Any:
 
 
 def _publish(models: list[pycolmap.Reconstruction], work: Path, model: Path) -> None:
-    """Move all models into place at once."""
+    """Write all models, and move them into place at once."""
     complete = model.with_name(f".{model.name}.{os.getpid()}.tmp")
     shutil.rmtree(complete, ignore_errors=True)
     try:
@@ -297,7 +301,7 @@ def _publish(models: list[pycolmap.Reconstruction], work: Path, model: Path) -> 
 
 
 def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:
-    """For every photo the number of its features, and of photos with which it has verified matches."""
+    """Count, for every photo, its features and the photos with which it has verified matches."""
     with _opened(database) as db:
         images = {image.image_id: image.name for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(number) for number, name in images.items()}
@@ -313,7 +317,7 @@ def _reasons(
     features: Mapping[str, int],
     partners: Mapping[str, int],
 ) -> dict[str, str]:
-    """Reasons for the photos without a pose in the largest model."""
+    """Explain why photos have no pose in the largest model."""
     posed = [{image.name for image in model.images.values() if image.has_pose} for model in models]
     reasons = {}
     for name in (name for name in names if name not in posed[0]):
@@ -330,7 +334,7 @@ def _reasons(
 
 
 def _why_no_model(features: Mapping[str, int], partners: Mapping[str, int]) -> str:
-    """Explanation why no two photos could start a model."""
+    """Explain why no two photos could start a model."""
     if sum(count >= _FEW_FEATURES for count in features.values()) < 2:
         return (
             f"the {len(features)} photos have hardly any detail to match (median "
@@ -348,7 +352,7 @@ def _why_no_model(features: Mapping[str, int], partners: Mapping[str, int]) -> s
 
 
 def _threads(memory_each: float) -> int:
-    """Number of cores, limited by half of the machine's memory."""
+    """Return the number of cores, limited by half of the machine's memory."""
     return int(max(1, min(os.cpu_count() or 1, machine_memory() / 2 // memory_each)))
 
 
@@ -363,7 +367,7 @@ def _opened(database: Path) -> Iterator[Any]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Suppress COLMAP's log of thousands of lines; the report has what matters."""
+    """Suppress COLMAP's log of thousands of lines; the report contains what matters."""
     logging = load_pycolmap().logging
     level, logging.minloglevel = logging.minloglevel, int(logging.FATAL)
     try:

@@ -9,7 +9,7 @@ from lang3dxl_ns.common.console import some
 
 @dataclass(frozen=True)
 class ReconstructionReport:
-    """Result of a reconstruction."""
+    """Result of a reconstruction, in numbers and reasons."""
 
     photos: int
     registered: int
@@ -25,10 +25,10 @@ class ReconstructionReport:
     other_models: tuple[int, ...] = ()
     """Sizes of further models, of photos not connected to the largest one."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Per stage; for a resumed reconstruction, of the last attempt."""
+    """Duration of each stage; if the reconstruction was resumed, in the last attempt."""
 
     def lines(self) -> list[str]:
-        """The report in words."""
+        """Phrase the report as sentences."""
         found = [
             f"{self.registered} of {self.photos} photos have a pose; {self.points} points, mean error "
             f"{self.error:.2f} px, {self.cameras} camera{'s' * (self.cameras > 1)}, {self.mapper} mapper, "

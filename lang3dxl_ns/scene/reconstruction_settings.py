@@ -1,4 +1,4 @@
-"""Settings of a reconstruction, in their own module so that a command's help needs no numpy or torch."""
+"""Settings of a reconstruction, in a module of their own so that a command's help needs no numpy or torch."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Literal
 
 @dataclass
 class ReconstructionSettings:
-    """Settings of a reconstruction; changed settings start it anew."""
+    """Settings of a reconstruction. If they change, it starts anew."""
 
     mapper: Literal["incremental", "global"] = "incremental"
     """COLMAP's mapper: incremental, or global (GLOMAP), which is meant for many photos."""
     max_size: int = 1600
-    """Longer side in pixels for feature detection."""
+    """Longer side in pixels at which features are detected; larger photos are shrunk."""
     features: int = 4096
-    """Most features per photo."""
+    """Maximum number of features per photo."""
     one_camera: bool | None = None
-    """Whether one camera with one lens took all photos; by default decided by EXIF and sizes."""
+    """Whether one camera with one lens took all photos. By default, EXIF and sizes decide."""

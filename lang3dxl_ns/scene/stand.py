@@ -1,4 +1,4 @@
-"""A photo's viewpoint for nerfstudio's viewer."""
+"""Viewpoint of a photo for nerfstudio's viewer."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from lang3dxl_ns.scene.camera import Camera
 
 @dataclass(frozen=True)
 class Stand:
-    """Pose of the viewer's camera: without roll, which its controls lack. The model's axes, z up."""
+    """Pose of the viewer's camera in the model's axes, z up; without roll, which its controls lack."""
 
     position: np.ndarray
-    """[3]."""
+    """Position, shape [3]."""
     look_at: np.ndarray
-    """[3], orbit center."""
+    """Orbit center, shape [3]."""
     fov: float
     """Vertical field of view, radians."""
 
 
 def stand_of(camera: Camera, aspect: float, target: tuple[float, ...] | None = None) -> Stand:
-    """A photo's viewpoint in a window of this aspect ratio (width ÷ height), with all of the photo in view.
+    """Compute the viewpoint that shows all of a photo in a window of this aspect ratio (width ÷ height).
 
-    target: orbit center, moved onto the photo's axis at its distance; None: a unit away.
+    `target` is the orbit center, which is moved onto the photo's axis at its distance; None puts it a unit
+    away.
     """
     view = camera.view_matrix.double().cpu().numpy()
     forward, position = view[2, :3], -view[:3, :3].T @ view[:3, 3]

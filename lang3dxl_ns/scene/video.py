@@ -1,4 +1,4 @@
-"""Video frames as photos: the sharpest of every interval, through ffmpeg."""
+"""Video frames as photos: the sharpest frame of every interval, extracted by ffmpeg."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from lang3dxl_ns.common.errors import UserError
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 FRAMES_PER_SECOND = 2.0
 MOST_FRAMES = 300
-"""Most frames of a long video; the rate is reduced accordingly."""
-_LOOK = (240, 135)  # pixels at which sharpness is judged: motion blur shows there too
+"""Maximum number of frames; the rate is reduced for a long video."""
+_LOOK = (240, 135)  # pixels at which sharpness is judged; motion blur is visible there too
 
 _READING = ("-v", "error", "-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi,mpegts,mpeg")
-"""Options of ffmpeg for a stranger's file: playlists, for example, would name other files and addresses."""
+"""Options of ffmpeg for untrusted files: a playlist, for example, could name other files and addresses."""
 
 
 def _address(video: Path) -> str:
@@ -30,20 +30,20 @@ def _address(video: Path) -> str:
 
 
 def is_video(path: Path) -> bool:
-    """Whether this is a file that ffmpeg may be able to read as a video."""
+    """Return whether this is a file that ffmpeg may be able to read as a video."""
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def frames_folder(video: Path) -> Path:
-    """Folder of a video's frames: named after it, beside it."""
+    """Return the folder of a video's frames, which is beside the video and named after it."""
     return video.with_name(f"{video.stem}_photos")
 
 
 def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOST_FRAMES) -> Path:
-    """Write the sharpest frame of every interval of 1/`rate` seconds to `frames_folder`/images, upright;
-    frames of an earlier call are kept. Returns the folder.
+    """Write the sharpest frame of every interval of 1/`rate` seconds to `frames_folder`/images, upright.
 
-    Raises UserError without ffmpeg, and for a file that is not a video or a very short one.
+    Return `frames_folder`. Frames of an earlier call are kept. Raises UserError without ffmpeg, and for a
+    file that is not a video or a very short one.
     """
     folder = frames_folder(video)
     if (folder / "images").is_dir():
@@ -64,13 +64,13 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
 
 
 def _sharpest(sharpness: Float[Array, " n"], stretches: int) -> Int[Array, " s"]:
-    """Index of the largest value in each of `stretches` equal parts."""
+    """Return the index of the largest value in each of `stretches` equal parts."""
     parts = np.array_split(np.arange(len(sharpness)), stretches)
     return np.array([part[sharpness[part].argmax()] for part in parts])
 
 
 def _sharpness(video: Path) -> Float[Array, " n"]:
-    """Variance of the Laplacian of every frame, downsized and gray."""
+    """Compute the variance of the Laplacian of every frame, downsized and gray."""
     width, height = _LOOK
     command = ["ffmpeg", *_READING, "-i", _address(video), "-an", "-vf", f"scale={width}:{height}"]
     command += ["-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "gray", "-"]
@@ -99,7 +99,7 @@ def _duration(video: Path) -> float:
 
 
 def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
-    """Write the chosen frames as JPEGs, all at once: a partial folder is never taken for a complete one."""
+    """Write the chosen frames as JPEGs, all at once, so that a partial folder never looks complete."""
     partial = folder / ".images.partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
