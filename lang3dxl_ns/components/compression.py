@@ -306,7 +306,7 @@ class CompressedField(_LearningField):
             codes = fit(sample, fresh, config, generator, step if dim == dims[0] else _nothing)
             found = assign(sample.features, sample.mass, fresh, codes, basis)
             cosine = centered_cosine(sample.features, fresh, found, basis)
-            if cosine >= GOOD:
+            if cosine >= GOOD or dim == dims[-1]:
                 break
             lost += f"; {dim} numbers: {cosine:.3f}"
         self.take(fresh)

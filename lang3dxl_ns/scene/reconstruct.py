@@ -251,7 +251,7 @@ def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pyc
     If the incremental mapper finds none with the usual thresholds, lower ones are tried."""
     pycolmap = load_pycolmap()
     folder = work / "mapping"
-    for relaxed in (False, True):
+    for relaxed in (False,) if kind == "global" else (False, True):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         with progress("photos with a pose", len(photos.names)) as advance:
