@@ -324,7 +324,7 @@ def _score_segmenter(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 
     segmenter = load_text_segmenter(find_text_segmenter(*settings.segmenter(run.row.name)), "cpu")
-    found = {}
+    found: dict[str, float] = {}
     for prefix, truth, photos in _pictures(run, _colors_alone(run_configuration(run, settings, work))):
         maps = partial(_segmenter_maps, segmenter, truth.categories)
         found |= _score_pictures(prefix, MapScorer(truth), photos, maps)
@@ -353,11 +353,14 @@ def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, 
     data, config = _colors_alone(deepcopy(whole)), whole.pipeline.datamanager
     config.dense = "none"
     plan = plan_crops(list(data.photos.values()), read_collection(run.scene).reconstruction, config)
-    found, store = {}, FeatureStore(work / "targets")
+    found: dict[str, float] = {}
+    store = FeatureStore(work / "targets")
     for prefix, truth, photos in _pictures(run, data):
         sizes = plan.pixel_sizes
         if sizes is not None and data.test_views is not None and prefix:
-            sizes = novel_pixel_sizes(data.test_views, config)
+            widths = {view.name: view.width for view in data.test_views.cameras}
+            per_file_pixel = novel_pixel_sizes(data.test_views, config)
+            sizes = {p.name: per_file_pixel[p.name] * widths[p.name] / p.width for p in photos}
         names = [photo.name for photo in photos]
         targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names).reader
         scorer = open_scorer(truth, config.clip, "cpu")
