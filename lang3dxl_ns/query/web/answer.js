@@ -1,7 +1,7 @@
 // Answers: relevancy from cosines, the threshold above which a place matches, and doubt, as in Python's query/.
 
-const CLEAR = 0.55; // relevancy above which a word names a place that otherwise counts as sky or as nothing
-const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.4, BEST = 0.005, LEAST_PEAK = 0.1;
+const CLEAR = 0.6; // relevancy above which a word names a place that otherwise counts as sky or as nothing
+const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.3, BEST = 0.005, LEAST_PEAK = 0.012;
 const TIE = 0.999; // values that are equal in Python may differ by this factor in 16 bits
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
