@@ -223,7 +223,7 @@ def test_only_encoders_with_aligned_patches_are_dense_unless_asked(folders):
 
 def test_the_built_in_clip_can_be_read_densely():
     reading = patch_reading("builtin", "dense")
-    assert reading is not None and reading.recipe == "value-value"
+    assert reading is not None and reading.recipe.startswith("head ")
     encoder = load_image_text_encoder("builtin", "cpu")
     assert encoder.encode_patches(torch.rand(1, 3, 48, 60)).shape == (1, 4, 5, 96)
 
