@@ -40,7 +40,8 @@ def test_the_quick_demo_finds_words_in_photos_that_it_has_never_seen(demo_output
     for split in report["splits"].values():
         assert split["teacher_map"] > 0.5
         assert split["map"] > 0.35
-        assert split["clip_l1"] < 0.8 * split["clip_l1_of_mean"]
+        # By direction: features read from crops and patches are shorter than the pyramid's.
+        assert 1 - split["clip_cosine"] < 0.8 * (1 - split["clip_cosine_of_mean"])
     assert "lang3dxl view lang3dxl-demo" in demo_output
 
 

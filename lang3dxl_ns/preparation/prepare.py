@@ -314,8 +314,6 @@ class _Maker:
         grid = task.grids[-1]
         features, valid = (resize(x, grid) for x in (of_crops.features, of_crops.valid[..., None]))
         mean = (F.normalize(features, dim=-1) + F.normalize(patches, dim=-1)) / 2
-        # As long as the features of crops alone, which errors compare them with.
-        mean *= of_crops.features.norm(dim=-1).mean()
         return {"features": mean, "valid": valid[..., 0]}
 
     def announce(self, photos: int, device: str) -> None:

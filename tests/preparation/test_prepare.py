@@ -333,9 +333,8 @@ def test_training_photos_are_the_mean_of_crops_and_of_the_map_by_the_clips_patch
     grids = [fine_grid(80, 100, 4, side) for side in reversed(sides)]
     patches = build_dense_map(photo, grids, clip.encode_patches, 4, clip.patch_size, 1)
     crops = build_clip_target(photo, sides, clip.encode_images, clip.crop_size, 8).features
-    length = crops.norm(dim=-1).mean()
     crops = F.normalize(resize(crops, patches.shape[:2]), dim=-1)
-    expected = length * (crops + F.normalize(patches, dim=-1)) / 2
+    expected = (crops + F.normalize(patches, dim=-1)) / 2
     torch.testing.assert_close(found.features, expected.half(), atol=2e-3, rtol=2e-3)
     others = prepare(photos, None, config, SCALES, store, "cpu", fine=[NAMES[1]]).reader
     assert torch.equal(reader.clip(NAMES[0]).features, others.clip(NAMES[0]).features)  # as the 2-D teacher
