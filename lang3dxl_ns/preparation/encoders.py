@@ -126,30 +126,22 @@ class PatchReading:
     recipe: str
     tokens: int
     """Patches per side of its own input."""
+    beside_crops: bool
+    """Whether the map is averaged with the crops of training photos; otherwise it replaces all crops."""
 
 
 def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
-    """How an encoder (a name or folder) makes maps, if it is to make them; None if it reads crops.
+    """Return how an encoder (a name or folder) makes maps; None if it reads crops alone.
 
     Raises UserError like `load_image_text_encoder`.
     """
     files = find_model(clip, CLIP_OPTION)
-    family = _family(files)
-    if (family.features if features == "auto" else features) == "crops":
+    family, head = _family(files), head_recipe(files.folder)
+    by_crops = (family.features if features == "auto" else features) == "crops"
+    if features == "crops" or (by_crops and head is None):
         return None
-    return _reading(files, head_recipe(files.folder) or family.recipe)
-
-
-def head_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
-    """How an encoder reads small windows by its patch head; None if it has none, or is to read crops."""
-    files = find_model(clip, CLIP_OPTION)
-    recipe = head_recipe(files.folder)
-    return None if recipe is None or features == "crops" else _reading(files, recipe)
-
-
-def _reading(files: ModelFiles, recipe: str) -> PatchReading:
     vision = read_config(files).vision_config
-    return PatchReading(recipe, input_side(vision) // vision.patch_size)
+    return PatchReading(head or family.recipe, input_side(vision) // vision.patch_size, by_crops)
 
 
 def _family(files: ModelFiles) -> Family:

@@ -29,7 +29,6 @@ from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, fine_
 from lang3dxl_ns.preparation.encoders import (
     DenseEncoder,
     ImageTextEncoder,
-    head_reading,
     load_dense_encoder,
     load_image_text_encoder,
     patch_reading,
@@ -173,7 +172,6 @@ def _plan(
     """A task per photo, and reasons for the photos that can't be read."""
     clip_model = find_model(config.clip, CLIP_OPTION)
     patches = patch_reading(config.clip, config.clip_features)
-    head = None if patches is not None or not fine else head_reading(config.clip, config.clip_features)
     input_pixels = getattr(read_config(clip_model).vision_config, "image_size", USUAL_INPUT)
     dense_model = find_model(config.dense, DENSE_OPTION).identity if config.makes_dense else None
     tasks, left_out = [], {}
@@ -192,16 +190,17 @@ def _plan(
         clip = {**source, "encoder": clip_model.identity, "crop_sides": crops.sides, "rule": _CROP_RULE}
         if is_fine and crops.steps != THIRD:
             clip["steps"] = crops.steps
-        if patches is not None:
+        with_crops = patches is None or patches.beside_crops
+        if patches is not None and not with_crops:
             grids = map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
             sides = sorted(math.ceil(photo.width / columns) for _, columns in grids)
             clip = {**source, "encoder": clip_model.identity, "crop_sides": sides}
             clip |= {"patches": patches.recipe, "grids": grids, "rule": RULE}
-        elif head is not None and is_fine:
+        elif patches is not None and is_fine:
             descending = reversed(crops.sides)
-            grids = tuple(fine_grid(photo.height, photo.width, head.tokens, side) for side in descending)
+            grids = tuple(fine_grid(photo.height, photo.width, patches.tokens, side) for side in descending)
             crops = replace(crops, steps=HALF)  # the map is finer, and takes as long as the crops between
-            clip |= {"steps": HALF, "patches": head.recipe, "grids": grids, "map_rule": RULE}
+            clip |= {"steps": HALF, "patches": patches.recipe, "grids": grids, "map_rule": RULE}
         settings = {FINE if is_fine else CLIP: clip}
         if dense_model is not None and (is_fine or not fine):
             settings[DENSE] = {**source, "encoder": dense_model, "tokens": config.dense_tokens}
@@ -209,7 +208,7 @@ def _plan(
             settings[REGIONS] = {**source, **labels}
         missing = {kind: s for kind, s in settings.items() if not store.is_current(kind, photo.name, s)}
         fast_count = fast.count(photo.height, photo.width)
-        tasks.append(_Task(photo, crops, fast_count, grids, patches is None, set(settings), missing))
+        tasks.append(_Task(photo, crops, fast_count, grids, with_crops, set(settings), missing))
     without = [task.photo.name for task in tasks if REGIONS not in task.kinds]
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")

@@ -34,7 +34,7 @@ DOUBTFUL = 0.1
 LEAST_PEAK = 0.012
 """A prompt that fits no place better than this is in doubt whatever the unrelated words do: all of them may
 fit even less. Present things reach 0.3 and more."""
-_BEST = 0.005
+BEST = 0.005
 """Share of the Gaussians that a prompt's fit is read from."""
 _AT_A_TIME = 4
 """Unrelated words asked together."""
@@ -79,7 +79,7 @@ def peaks(relevancy: Float[Tensor, "q n"]) -> Float[Tensor, " q"]:
     0 without Gaussians."""
     if relevancy.shape[1] == 0:
         return relevancy.new_zeros(len(relevancy))
-    return relevancy.topk(math.ceil(_BEST * relevancy.shape[1]), dim=1).values.mean(1)
+    return relevancy.topk(math.ceil(BEST * relevancy.shape[1]), dim=1).values.mean(1)
 
 
 def doubtful(text: str, doubt: float, taught: bool = False) -> str | None:

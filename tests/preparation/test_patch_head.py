@@ -15,7 +15,7 @@ from transformers import CLIPModel
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import encoders
 from lang3dxl_ns.preparation.dense_map import fine_grid
-from lang3dxl_ns.preparation.encoders import head_reading, load_image_text_encoder, patch_reading
+from lang3dxl_ns.preparation.encoders import load_image_text_encoder, patch_reading
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.patch_head import FILE, head_recipe
 
@@ -57,7 +57,7 @@ def test_a_head_changes_neither_the_identity_of_its_clip_nor_its_embeddings(fold
     assert torch.equal(with_head.encode_texts(["dome"]), without.encode_texts(["dome"]))
     crops = random_picture(2, 3, with_head.crop_size, with_head.crop_size)
     assert torch.equal(with_head.encode_images(crops), without.encode_images(crops))
-    assert head_reading(str(bare), "auto") is None
+    assert patch_reading(str(bare), "auto") is None
 
 
 def test_another_head_is_another_recipe(folder):
@@ -68,9 +68,10 @@ def test_another_head_is_another_recipe(folder):
 
 
 def test_crops_are_read_where_they_are_requested(folder):
-    assert head_reading(str(folder), "crops") is None
-    found, dense = head_reading(str(folder), "auto"), patch_reading(str(folder), "dense")
-    assert found is not None and found == dense and found.recipe == head_recipe(folder)
+    assert patch_reading(str(folder), "crops") is None
+    found, dense = (patch_reading(str(folder), features) for features in ("auto", "dense"))
+    assert found is not None and dense is not None and found.beside_crops and not dense.beside_crops
+    assert found.recipe == dense.recipe == head_recipe(folder)
 
 
 def test_a_damaged_head_is_named(folder):

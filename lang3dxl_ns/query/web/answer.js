@@ -1,7 +1,5 @@
 // Answers: relevancy from cosines, the threshold above which a place matches, and doubt, as in Python's query/.
 
-const CLEAR = 0.6; // relevancy above which a word names a place that otherwise counts as sky or as nothing
-const DOUBTFUL = 0.1, EVEN = 0.5, SHARE = 0.3, BEST = 0.005, LEAST_PEAK = 0.012;
 const TIE = 0.999; // values that are equal in Python may differ by this factor in 16 bits
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
@@ -38,20 +36,20 @@ export class Answers {
   /** Return peak, doubt, threshold, and the number of Gaussians of the foreground that match.
    * strict: whether the prompt has negatives of its own, or was taught; doubt: if it is already known. */
   verdict(relevancy, { strict = false, doubt = null, threshold = null }) {
-    const sorted = relevancy.slice().sort(), count = sorted.length;
+    const { unrelated, rules } = this.words, sorted = relevancy.slice().sort(), count = sorted.length;
     let fit = 0;
-    const top = Math.max(Math.ceil(BEST * count), 1);
+    const top = Math.max(Math.ceil(rules.best * count), 1);
     for (let i = count - top; i < count; i++) fit += sorted[i] / top;
-    const { unrelated } = this.words;
     const asWell = unrelated.filter((other) => other >= fit * TIE).length;
-    doubt ??= fit < LEAST_PEAK ? 1 : (1 + asWell) / (1 + unrelated.length);
+    doubt ??= fit < rules.least_peak ? 1 : (1 + asWell) / (1 + unrelated.length);
     const low = sorted[(count - 1) >> 1]; // the lower median, as in torch
-    const own = doubt > DOUBTFUL || strict ? EVEN : Math.min(low + SHARE * (fit - low), EVEN);
+    const isDoubtful = doubt > rules.doubtful;
+    const own = isDoubtful || strict ? rules.even : Math.min(low + rules.share * (fit - low), rules.even);
     const level = threshold ?? own, { foreground } = this;
     const confined = foreground ? relevancy.map((value, i) => value * foreground[i]) : relevancy;
     let matching = 0, peak = 0;
     for (const value of confined) (peak = Math.max(peak, value)), (matching += value > level);
-    return { relevancy: confined, peak, doubt, doubtful: doubt > DOUBTFUL, threshold: level, matching };
+    return { relevancy: confined, peak, doubt, doubtful: isDoubtful, threshold: level, matching };
   }
 
   /** Find the words that match a blend of rows best, with their relevancy, best first; none at the sky. */
@@ -63,7 +61,7 @@ export class Answers {
       const { own, against } = vocabulary.word(i);
       return [word, sigmoid(words.temperature * (cosine(own) - Math.max(...against.map((k) => others[k]))))];
     });
-    const named = scored.sort((a, b) => b[1] - a[1]).find(([word]) => word !== "sky")[1] > CLEAR;
+    const named = scored.sort((a, b) => b[1] - a[1]).find(([word]) => word !== "sky")[1] > words.rules.clear;
     return named || !vocabulary.nothing.includes(others.indexOf(Math.max(...others))) ? scored.slice(0, most) : [];
   }
 }

@@ -16,12 +16,14 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, write_atomically
 from lang3dxl_ns.common.reports import watched
+from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.negatives import NOTHING, competitors
+from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.scene_file import Provenance
 from lang3dxl_ns.query.teach import known_word
 from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.threshold import EVEN, SHARE
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
 from lang3dxl_ns.query.web.pack import (
     LEAST_PIXELS,
@@ -40,6 +42,15 @@ _HERE = Path(__file__).parent
 _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
+_RULES = {
+    "best": BEST,
+    "doubtful": DOUBTFUL,
+    "least_peak": LEAST_PEAK,
+    "even": EVEN,
+    "share": SHARE,
+    "clear": CLEAR,
+}
+"""Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
 _TEXTS = 256
 """Number of texts encoded at a time."""
 MOST_TEXT = 2_000
@@ -118,6 +129,7 @@ class Page:
                 "unrelated": scene.doubts.unrelated.tolist(),
                 "gap": scene.gap,
                 "covered": scene.config.min_alpha,
+                "rules": _RULES,
                 "pixels": [LEAST_PIXELS, PIXEL_STEPS],
             }
             files |= self._meaning.files | self._vocabulary(self._meaning)
