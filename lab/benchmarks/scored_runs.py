@@ -343,24 +343,16 @@ def _segmenter_maps(
 def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
     """AP of the pictures' own fine targets, as those that the field gathers are made from training photos."""
     from lang3dxl_ns.evaluation.language import open_scorer
-    from lang3dxl_ns.plugin.novel_views import novel_pixel_sizes
-    from lang3dxl_ns.preparation.collection import plan_crops
-    from lang3dxl_ns.preparation.photo_collection import read_collection
     from lang3dxl_ns.preparation.prepare import prepare
     from lang3dxl_ns.preparation.store import FeatureStore
 
     whole = run_configuration(run, settings, work)
     data, config = _colors_alone(deepcopy(whole)), whole.pipeline.datamanager
     config.dense = "none"
-    plan = plan_crops(list(data.photos.values()), read_collection(run.scene).reconstruction, config)
     found: dict[str, float] = {}
-    store = FeatureStore(work / "targets")
+    plan, store = data.crop_plan, FeatureStore(work / "targets")
     for prefix, truth, photos in _pictures(run, data):
-        sizes = plan.pixel_sizes
-        if sizes is not None and data.test_views is not None and prefix:
-            widths = {view.name: view.width for view in data.test_views.cameras}
-            per_file_pixel = novel_pixel_sizes(data.test_views, config)
-            sizes = {p.name: per_file_pixel[p.name] * widths[p.name] / p.width for p in photos}
+        sizes = data.test_pixel_sizes(photos) if prefix else plan.pixel_sizes
         names = [photo.name for photo in photos]
         targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names).reader
         scorer = open_scorer(truth, config.clip, "cpu")

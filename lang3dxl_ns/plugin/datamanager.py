@@ -37,7 +37,7 @@ from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
-from lang3dxl_ns.preparation.collection import plan_crops, prepare_collection
+from lang3dxl_ns.preparation.collection import CropPlan, plan_crops, prepare_collection
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.handover import Batch, SceneFacts
 from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model
@@ -254,15 +254,23 @@ class Lang3DXLDataManager(FullImageDatamanager):
             novel_outputs(views, self.train_dataparser_outputs, config.foreground != "none")
         )
         if self.targets is not None:
-            plan = plan_crops(list(self.photos.values()), self._reconstruction(), config)
-            sizes = None
-            if plan.pixel_sizes is not None:  # the dataset needs them per pixel of the views' files
-                sizes = novel_pixel_sizes(views, config)
-                widths = {view.name: view.width for view in views.cameras}
-                sizes = {p.name: sizes[p.name] * widths[p.name] / p.width for p in dataset.photos}
             config = config if config.targets_in_steps else replace(config, dense="none")
-            prepare(dataset.photos, sizes, config, plan.scales, FeatureStore(self.cache_dir), self.device)
+            sizes, store = self.test_pixel_sizes(dataset.photos), FeatureStore(self.cache_dir)
+            prepare(dataset.photos, sizes, config, self.crop_plan.scales, store, self.device)
         return dataset
+
+    @cached_property
+    def crop_plan(self) -> CropPlan:
+        """Crop sizes of the scene's photos, which test views share."""
+        return plan_crops(list(self.photos.values()), self._reconstruction(), self.config)
+
+    def test_pixel_sizes(self, photos: list[Photo]) -> dict[str, float] | None:
+        """Return the world units per pixel of the test views' photos; None if crops are relative."""
+        if self.crop_plan.pixel_sizes is None or self.test_views is None:
+            return None
+        sizes = novel_pixel_sizes(self.test_views, self.config)  # per pixel of the views' files
+        widths = {view.name: view.width for view in self.test_views.cameras}
+        return {photo.name: sizes[photo.name] * widths[photo.name] / photo.width for photo in photos}
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
@@ -276,8 +284,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             dense=learns and self.config.makes_dense,
             regions=learns and self._region_source is not None,
         )
-        photos, reconstruction = list(self.photos.values()), self._reconstruction()
-        return scene_needs(photos, reconstruction, plan_crops(photos, reconstruction, self.config), sources)
+        return scene_needs(list(self.photos.values()), self._reconstruction(), self.crop_plan, sources)
 
     @cached_property
     def photos(self) -> dict[str, Photo]:
