@@ -1,4 +1,4 @@
-"""Reports of the laboratory, beyond `lang3dxl_ns.common.reports`: work in its own process, and figures."""
+"""Additions to `lang3dxl_ns.common.reports` for the laboratory: work in its own process, and figures."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from multiprocessing import get_context
 from multiprocessing.context import BaseContext
 from typing import TYPE_CHECKING, Any, TypeVar
 
-if TYPE_CHECKING:  # imported where it is used: a command's help comes without it
+if TYPE_CHECKING:  # imported where it is used, so that a command's help does not load it
     from matplotlib.figure import Figure
 
 Result = TypeVar("Result")
 
 
 def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence[str] = ()) -> Result:
-    """The result of `work(*args)`, run in its own process so that its peak memory can be measured.
+    """Run `work(*args)` in its own process, so that its peak memory can be measured, and return the result.
 
-    Without a GPU, processes are forked from one that has imported the modules of `preload` (the first call's,
-    for all calls); a process that has used a GPU can't be forked. All arguments must be picklable.
+    Without a GPU, processes are forked from one that has imported the modules `preload` of the first call.
+    With a GPU, they are started anew, since a process that has used a GPU cannot be forked. The work, its
+    arguments and its result must be picklable.
 
     Raises:
         BrokenProcessPool: the process was killed, most likely for lack of memory.
@@ -36,7 +37,7 @@ def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence
 
 
 def as_png(figure: Figure) -> bytes:
-    """A matplotlib figure as the bytes of a PNG."""
+    """Render a matplotlib figure as the bytes of a PNG."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=150)
     return file.getvalue()

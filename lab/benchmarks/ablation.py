@@ -23,10 +23,9 @@ Found = TypeVar("Found")
 @showing("out", "scene", "rows", "seeds", "steps")
 @dataclass
 class Ablation:
-    """Train and score the method, the baselines, and the method without each of its parts, all else equal;
-    several lengths show quality against time.
+    """Train and score the method, the baselines, and the method without each of its parts, all else equal.
 
-    Finished runs are kept: the command can be interrupted and repeated at any time, also with more rows,
+    Finished runs are kept, so the command can be interrupted and repeated at any time, also with more rows,
     lengths, seeds or scenes. The report is updated after every run.
     """
 
@@ -35,36 +34,37 @@ class Ablation:
     scene: tuple[Path, ...] = ()
     """Folders with images/, sparse/0/ and ground_truth/ (default: the landmarks)."""
     landmarks: Landmarks = "validation"
-    """Landmarks to use: six for decisions, or the nine of the published figures."""
+    """Landmarks, unless scenes are given: validation (six, for decisions) or test (nine, for publication)."""
     photos: int = 48
-    """Photos of each landmark."""
+    """Number of photos of each landmark."""
     test_views: int = 24
-    """Novel views of each landmark, with exact labels; the main score."""
+    """Number of novel views of each landmark, with exact labels, which give the main score."""
     rows: tuple[str, ...] = ()
-    """Rows to run; "systems" for ways to carry features (default: all that differ from the full method)."""
+    """Rows to run; "systems" compares decoders (default: all but the paper's method and duplicates)."""
     steps: tuple[int, ...] = (1_200,)
     """Training iterations; several lengths show quality against time."""
     seeds: int = 1
-    """Runs of each row on each scene, with different random numbers and photo orders. Every run of a seed is
-    made before any of the next."""
+    """Number of runs of each row on each scene, with different random numbers and photo orders. All runs of a
+    seed are made before any of the next."""
     clip: str = "builtin"
-    """CLIP: "builtin", a Hugging Face name or a folder."""
+    """CLIP to use: "builtin", a Hugging Face name or a folder."""
     dense: str = "builtin"
-    """Dense encoder: the same choices, or "none"."""
+    """Dense encoder: "builtin", a Hugging Face name, a folder or "none"."""
     foreground: str = "none"
-    """Foreground, as in `lang3dxl prepare`; "none": the whole photo."""
+    """Foreground, with the choices of `lang3dxl prepare`; "none" uses the whole photo."""
     scale: float = 0.5
     """Size of the training photos relative to those on disk. Words are scored at half the size."""
     ns_train: str = ""
-    """Extra flags of `ns-train lang3dxl`, for all rows, in one string: --ns-train="--pipeline.model.…"."""
+    """Extra flags of `ns-train lang3dxl` for all rows, in one string: --ns-train="--pipeline.model.…"."""
     clipseg: str = "CIDAS/clipseg-rd64-refined"
     """CLIPSeg: a Hugging Face name or a folder. If unavailable, its row says "not run here"."""
     langsam: tuple[str, str] = ("IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base")
-    """LangSAM's GroundingDINO and SAM, likewise."""
+    """LangSAM's GroundingDINO and SAM: names or folders. If unavailable, its row says "not run here"."""
     sam3: str = "facebook/sam3"
-    """SAM 3, likewise; gated: accept its license at Hugging Face, then `hf auth login`."""
+    """SAM 3: a name or a folder. If unavailable, its row says "not run here". It is gated: accept its license
+    at Hugging Face, then run `hf auth login`."""
     workers: int = 1
-    """Concurrent runs. They slow each other down: keep 1 where seconds matter."""
+    """Number of concurrent runs. They slow each other down, so keep 1 if times matter."""
 
     def main(self) -> None:
         from lang3dxl_ns.plugin.model_config import SHORT_FIELD_RUN
@@ -94,12 +94,12 @@ class Ablation:
         print(f"Wrote {self.out / 'ablation.md'} ({len(figures)} runs, {len(failed)} not run)")
 
     def runs(self, scenes: Mapping[str, Path], rows: Sequence[Row]) -> list[Run]:
-        """Runs in the order in which they are made. The seed is the outer loop: an interrupted comparison
-        has one run of every row on every scene before any has two.
+        """List the runs in the order in which they are made. The seed is the outer loop, so an interrupted
+        comparison has one run of every row on every scene before any has two.
 
         Args:
             scenes: Folder of each scene, by label.
-            rows: Rows to run; bounds have no runs of their own.
+            rows: Rows to run. Bounds have no runs of their own, and rows without training have one per scene.
         """
         return [
             Run(row, path, label, seed, steps)
@@ -116,7 +116,7 @@ class Ablation:
         write_ablation(self.out, command, rows, figures, self._at_all_lengths(failed))
 
     def _at_all_lengths(self, found: dict[Run, Found]) -> dict[Run, Found]:
-        """What rows see in the pictures themselves doesn't depend on the training: they run once."""
+        """Repeat at all lengths the results of rows without training, which run once per scene."""
         return {
             replace(run, steps=steps): value
             for run, value in found.items()
@@ -130,7 +130,7 @@ def make_all(
     report: Callable[[Mapping[Run, dict], Mapping[Run, str]], None],
     workers: int = 1,
 ) -> tuple[dict[Run, dict[str, float]], dict[Run, str]]:
-    """Figures of all runs, and reasons of failures; `report` receives both after each run."""
+    """Make the missing runs and return all figures and failures. `report` gets both after each run."""
     if workers < 1:
         raise UserError(f"--workers is {workers}: give 1 or more")
     figures = {run: found for run in runs if (found := store.finished(run)) is not None}
@@ -150,7 +150,7 @@ def make_all(
                 bar.update(task, advance=1, description=run.name)
                 report(figures, failed)
         except (KeyboardInterrupt, SystemExit):
-            for process in active_children():  # Ctrl-C has reached them; other signals have not
+            for process in active_children():  # Ctrl-C reaches them, but other signals do not
                 process.terminate()
             threads.shutdown(cancel_futures=True)
             raise
@@ -158,8 +158,8 @@ def make_all(
 
 
 def bound_figures(rows: Sequence[Row], figures: Mapping[Run, Mapping[str, float]]) -> dict[Run, dict]:
-    """Figures of teacher, limit and chance, which every run of the full method records as
-    `teacher_map`, `test_teacher_map` etc.: here they become `map`, `test_map` etc. of their own rows."""
+    """Extract the figures of the bounds (teacher, limit, chance) from runs of the full method. Their
+    `teacher_map`, `test_teacher_map` etc. become `map`, `test_map` etc. of the bounds' own rows."""
     found = {}
     for row in (row for row in rows if row.name in BOUNDS):
         for run, values in figures.items():

@@ -60,7 +60,7 @@ def write_ablation(
 def _summary(
     row: Row, steps: int, scenes: Sequence[str], figures: Figures, failed: Mapping[Run, str]
 ) -> dict[str, Any]:
-    """A row's figures by scene and over all scenes, each with mean and deviation over the seeds."""
+    """Summarize a row's figures by scene and over all scenes, as mean and deviation over the seeds."""
     own = {run: found for run, found in figures.items() if run.row.name == row.name and run.steps == steps}
     names = list(dict.fromkeys(name for found in own.values() for name in found))
     by_scene = {
@@ -71,7 +71,7 @@ def _summary(
         for scene in scenes
     }
     complete = {seed: [f for run, f in own.items() if run.seed == seed] for seed in {run.seed for run in own}}
-    # Only seeds that have all scenes enter the mean over scenes: otherwise scenes would pass for seeds.
+    # The mean over scenes uses only seeds with all scenes; otherwise scenes would be mixed up with seeds.
     complete = {seed: found for seed, found in complete.items() if len(found) == len(scenes)}
     overall = {
         name: spread([mean(f[name] for f in found) for found in complete.values()])
@@ -92,14 +92,14 @@ def _summary(
 
 
 def spread(values: Sequence[float]) -> dict[str, float] | None:
-    """Mean, sample deviation (0 for a single value) and count; None for an empty list."""
+    """Compute mean, sample deviation (0 for a single value) and count; return None without values."""
     if not values:
         return None
     return {"mean": mean(values), "std": stdev(values) if len(values) > 1 else 0.0, "runs": len(values)}
 
 
 def mark_front(rows: Sequence[dict[str, Any]], quality: str) -> None:
-    """Add to every row `front`: whether no other is both as fast and better, or as good and faster."""
+    """Add `front` to every row: whether no other is as fast and better, or as good and faster."""
 
     def point(row: Mapping[str, Any]) -> tuple[float, float]:
         return row["mean"]["train_seconds"]["mean"], -row["mean"][quality]["mean"]
@@ -113,7 +113,7 @@ def mark_front(rows: Sequence[dict[str, Any]], quality: str) -> None:
 
 
 def markdown(data: Mapping[str, Any]) -> str:
-    """The report in markdown."""
+    """Format the report as markdown."""
     parts = []
     for steps, rows in data["lengths"].items():
         parts += [f"## {steps} iterations", _table(rows), *_means(rows, data["scenes"], data["quality"])]
@@ -169,8 +169,8 @@ def _cell(value: Mapping[str, float] | None, form: str) -> str | None:
 
 
 def _means(rows: Sequence[Mapping[str, Any]], scenes: Sequence[str], quality: str) -> Iterator[str]:
-    """Tables of precision by scene; by family of scenes (cathedral-700, -701 …), if one has several, with the
-    deviation between them; and by category, over the scenes that have it."""
+    """Yield tables of precision by scene, by family (cathedral-700, -701 …) if one has several scenes, with
+    the deviation between them, and by category, over the scenes that have it."""
     yield _mean_table("mAP", rows, {scene: [(scene, quality)] for scene in scenes})
     families: dict[str, list[tuple[str, str]]] = {}
     for scene in scenes:
@@ -187,7 +187,7 @@ def _means(rows: Sequence[Mapping[str, Any]], scenes: Sequence[str], quality: st
 def _mean_table(
     title: str, rows: Sequence[Mapping[str, Any]], columns: Mapping[str, Sequence[tuple[str, str]]]
 ) -> str:
-    """A line per row; of each column's figures in its scenes the mean, or the only one with its deviation."""
+    """Format a table with a line per row: the mean ± deviation of each column's scenes, or of one's seeds."""
     lines = []
     for row in rows:
         cells = []
@@ -200,7 +200,7 @@ def _mean_table(
 
 
 def table_of_runs(figures: Figures) -> str:
-    """CSV with a line per run."""
+    """Format all figures as CSV, with a line per run."""
     names = list(dict.fromkeys(name for found in figures.values() for name in found))
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
@@ -212,7 +212,7 @@ def table_of_runs(figures: Figures) -> str:
 
 
 def plot(lengths: Mapping[int, Sequence[Mapping[str, Any]]], quality: str) -> bytes:
-    """PNG: quality against training time; a line per row through its lengths, bounds as dotted lines."""
+    """Plot quality against training time as a PNG: a line per row through its lengths, bounds dotted."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")

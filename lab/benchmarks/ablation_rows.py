@@ -15,12 +15,12 @@ CLIPSEG, LANGSAM, SAM3 = "clipseg", "langsam", "sam3"
 SEGMENTERS = (CLIPSEG, LANGSAM, SAM3)
 """Rows of networks that segment a picture by text."""
 IN_PICTURES = (FINE_TEACHER, *SEGMENTERS)
-"""Rows without training: what a network sees in the scored picture itself."""
+"""Rows without training, which score a network on the test picture itself."""
 BOUNDS = (TEACHER, LIMIT, CHANCE)
-"""Rows that every run of the full method includes: figures with these prefixes."""
+"""Rows whose figures every run of the full method records, with these prefixes."""
 _FIELD, _DATA = "pipeline.model.semantic_field.", "pipeline.datamanager."
 OF_TARGETS = ("scale_mode", "scale_range", "scales", "dense_tokens", "clip_features")
-"""Data manager settings that determine the targets."""
+"""Data manager settings that change the content of targets. A row that sets one needs its own cache."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Row:
     changes: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Values by dotted path in the run's configuration."""
     method: str = "lang3dxl"
-    """The method of `ns-train`."""
+    """Name of the `ns-train` method."""
     published: str = ""
     """Lang3D-XL's published figures for the same comparison, on HolyScenes."""
 
@@ -44,7 +44,7 @@ class Row:
 
     @property
     def own_targets(self) -> bool:
-        """Whether its targets differ from those of the other rows."""
+        """Whether the row's targets differ from those of other rows."""
         return any(path.removeprefix(_DATA) in OF_TARGETS for path in self.changes)
 
 
@@ -53,7 +53,7 @@ def _decoder(name: str, label: str, published: str = "") -> Row:
 
 
 _PAPER = {"pipeline.model.decoder.name": "paper"}
-"""Codes trained with the scene, by downsampler, dense features and regions: compare with row "paper"."""
+"""Changes of rows whose codes are trained with the scene, as in the row "paper", the one to compare with."""
 ROWS = (
     Row(FULL, "method", "Lang3D-XL", published="mAP .59; windows AP .69; L1 .146, PSNR 13.9"),
     Row(PAPER_METHOD, "method", "the paper's method, with regions of one color for SAM's",
@@ -106,15 +106,15 @@ ROWS = (
 )  # fmt: skip
 """All available rows."""
 SYSTEMS = (FULL, "paper", "feature3dgs", "fmgs", "langsplat", "direct", "lifting", *BOUNDS)
-"""Ways to carry features, and the bounds they are compared with."""
+"""Rows of the group "systems": the feature decoders, and the bounds to compare them with."""
 
 
 def choose_rows(names: Iterable[str], short_run: bool, has_regions: bool) -> list[Row]:
-    """The rows with these names ("systems": `SYSTEMS`), in the order of `ROWS`; by default all that differ
-    from the full method.
+    """Choose the rows with these names ("systems": `SYSTEMS`), in the order of `ROWS`; by default all but the
+    paper's method and rows that equal another.
 
-    The full method has Fourier features only in short runs, and regions only if the scene has a folder of
-    them. Raises UserError for an unknown name.
+    The full method has Fourier features in short runs only, and the row "paper" has regions only if the scene
+    has a folder of them. Raises UserError for an unknown name.
     """
     known = {row.name for row in ROWS}
     names = {part for name in names for part in (SYSTEMS if name == "systems" else (name,))}
@@ -122,6 +122,6 @@ def choose_rows(names: Iterable[str], short_run: bool, has_regions: bool) -> lis
         choices = ", ".join(row.name for row in ROWS)
         raise UserError(f"there is no row {', '.join(unknown)}: choose of systems, {choices}")
     same = {"both" if short_run else "hash", "regions" if has_regions else "no-regions"}
-    # The paper's networks take a CPU ten times as long: only on request.
+    # The paper's method takes ten times as long on a CPU, so it runs only on request.
     wanted = set(names) or {row.name for row in ROWS if row.method != PAPER_METHOD} - same
     return [row for row in ROWS if row.name in wanted]

@@ -1,4 +1,4 @@
-"""Landmarks for benchmarks, each seed with one use."""
+"""Landmarks for benchmarks: every seed serves either validation or the test."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ SEEDS: dict[Landmarks, dict[Family, tuple[int, ...]]] = {
     "validation": {"cathedral": (600, 601), "mosque": (602, 603), "hall": (604, 605)},
     "test": {"cathedral": (700, 701, 702), "mosque": (703, 704, 705), "hall": (706, 707, 708)},
 }
-"""Seeds by use and family: `validation` for decisions, `test` for published figures alone. The built-in CLIP
-was neither trained, tuned nor reported on them (its seeds are 10,000 and up, 5,000 and up, and 0 to 249)."""
+"""Seeds by use and family: `validation` for decisions, `test` for published figures only. The built-in CLIP
+was not trained, tuned or reported on them (its seeds are 10,000 and up, 5,000 and up, and 0 to 249)."""
 
 
 def landmark_scenes(use: Landmarks, folder: Path, photos: int = 48, test_views: int = 24) -> list[Path]:
-    """Scenes of all landmarks for a use, named by family and seed, in `folder`; existing ones are kept."""
+    """Write the scenes of a use into `folder`, named by family and seed, unless they exist. Return them."""
     scenes = []
     for family, seeds in SEEDS[use].items():
         for seed in seeds:

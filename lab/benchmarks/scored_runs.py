@@ -1,4 +1,4 @@
-"""Training and scoring of a variant on a scene with ground truth, with results kept on disk."""
+"""Training and scoring of a row of a comparison on a scene with ground truth, with results kept on disk."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.scene.photo import Photo
 
 _LIBRARIES = ("lang3dxl_ns.plugin.trainer_config", "lang3dxl_ns.methods")
-"""Imports of a run's process, preloaded because they take ten seconds."""
+"""Modules that a run's process imports. They are preloaded because the imports take ten seconds."""
 _TIMED_PHOTOS = 3
 _UNWANTED = ("num_rays_per_sec", "fps")
 _BESIDE = (
@@ -52,7 +52,7 @@ _BESIDE = (
     "clip_l1",
     "clip_cosine",
 )
-"""Figures beyond those of the held-out photos, besides every category's average precision."""
+"""Figures kept of test views and seen photos, besides every category's average precision."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class RunSettings:
     """Name or folder of SAM 3."""
 
     def segmenter(self, row: str) -> tuple[str, str]:
-        """Name or folder of the network that finds words in a segmenter's row, and of its SAM, if any."""
+        """Return the names or folders of a segmenter row's network and of its SAM ("" if it has none)."""
         return {CLIPSEG: (self.clipseg, ""), LANGSAM: self.langsam, SAM3: (self.sam3, "")}[row]
 
 
@@ -95,7 +95,7 @@ class Run:
 
 
 class ScoredRuns:
-    """Runs of a comparison; finished ones are on disk, with the settings that made them."""
+    """Runs of a comparison. Finished ones are on disk, with the settings that they were made with."""
 
     def __init__(self, folder: Path, settings: RunSettings) -> None:
         self.folder, self.settings = folder, settings
@@ -109,7 +109,7 @@ class ScoredRuns:
         return clip if clip == "none" else find_model(clip, CLIP_OPTION).identity
 
     def finished(self, run: Run) -> dict[str, float] | None:
-        """Figures of a run already made with these settings; None if it has to be made."""
+        """Load the figures of a run made with these settings; return None if it has yet to be made."""
         path = self._path(run)
         if not path.is_file():
             return None
@@ -117,8 +117,8 @@ class ScoredRuns:
         return found["figures"] if found["made_with"] == self._made_with(run) else None
 
     def make(self, run: Run) -> dict[str, float]:
-        """Train and score in a separate process, so that its peak memory can be measured; its output goes to
-        a log beside the result.
+        """Train and score in a separate process, so that its peak memory can be measured. Its output goes to
+        a log next to the result.
 
         Raises UserError with the reason if the run fails.
         """
@@ -152,7 +152,7 @@ class ScoredRuns:
 
 
 def in_process_of_its_own(work: Callable[..., dict[str, float]], *args: Any) -> dict[str, float]:
-    """Figures of `work(*args)`, whose last argument is its log. Raises UserError with the reason."""
+    """Run `work(*args)`, whose last argument is its log. Raises UserError with the reason if it fails."""
     try:
         return in_own_process(work, *args, preload=_LIBRARIES)
     except BrokenProcessPool as error:
@@ -162,7 +162,7 @@ def in_process_of_its_own(work: Callable[..., dict[str, float]], *args: Any) -> 
 
 
 def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
-    """A short unique name per scene: its folder's name, or the parent's if two agree.
+    """Give every scene a short unique name: its folder's, preceded by its parent's if that is taken.
 
     Raises UserError for a scene that is missing, has no ground truth, or is given twice.
     """
@@ -181,7 +181,7 @@ def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
 
 
 def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTrainerConfig:
-    """The configuration of a run."""
+    """Build the configuration of a run."""
     import tyro
 
     from lang3dxl_ns.methods import run_config
@@ -195,7 +195,7 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
         config = tyro.cli(type(config), args=shlex.split(settings.flags), default=config)
         data = config.pipeline.datamanager
     if run.row.own_targets:
-        # A cache per run: rows would overwrite each other's targets. Made anew in every run, and timed.
+        # With a shared cache, rows would overwrite each other's targets. The run makes its own, and is timed.
         data.cache_dir = work / "targets"
     config.machine.seed = run.seed
     data.train_cameras_sampling_seed = run.seed
@@ -205,7 +205,7 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
 
 
 def apply_changes(config: Any, changes: Mapping[str, Any]) -> None:
-    """Set values by their dotted path. Raises AttributeError or KeyError for a path that doesn't exist."""
+    """Set values by their dotted path. Raises AttributeError or KeyError for a path that does not exist."""
     for path, value in changes.items():
         *owners, name = path.split(".")
         owner = config
@@ -225,7 +225,7 @@ def _in_process(run: Run, settings: RunSettings, work: Path, log: Path) -> dict[
 
 
 def write_output_to(log: Path) -> None:
-    """Everything that this process prints goes to a file from now on."""
+    """Redirect everything that this process prints from now on to a file."""
     with open(log, "w") as file:
         sys.stdout.flush()
         os.dup2(file.fileno(), 1)
@@ -263,8 +263,8 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
 
 
 def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
-    """Figures of the scene's test views, `test_…`, and of the labeled training photos, `seen_…`, if there
-    are any; both are far more numerous than the held-out photos."""
+    """Compute the figures of test views (`test_…`) and of labeled training photos (`seen_…`), if there are
+    any. Both are far more numerous than the held-out photos."""
     from lang3dxl_ns.evaluation.aggregate import PREFIXES, average
 
     scorer, photos = pipeline.evaluation.scorer, pipeline.datamanager.train_dataset.photos
@@ -287,13 +287,13 @@ def _reset_peak() -> None:
 
 
 def _peak() -> float:
-    """Of the GPU if there is one, otherwise of the process, libraries included."""
+    """Return the peak memory in bytes: of the GPU if there is one, else of the process with libraries."""
     return torch.cuda.max_memory_allocated() if torch.cuda.is_available() else host_peak()
 
 
 @torch.no_grad()
 def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
-    """Median milliseconds to render a held-out view, and a view that answers all prompts."""
+    """Measure the median milliseconds to render a held-out view, and to answer all prompts in it."""
     scorer = pipeline.evaluation.scorer
     if scorer is None:
         return {}
@@ -310,8 +310,8 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
 
 
 def _now() -> float:
-    """Seconds: wall-clock with a GPU, otherwise processor time (all threads), which excludes other programs
-    and concurrent runs."""
+    """Return the time in seconds: wall-clock with a GPU, otherwise processor time (all threads), which
+    excludes other programs and concurrent runs."""
     if not torch.cuda.is_available():
         return time.process_time()
     torch.cuda.synchronize()
@@ -319,7 +319,7 @@ def _now() -> float:
 
 
 def _score_segmenter(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
-    """AP of a segmenter in the very pictures that are scored, by the same rules."""
+    """Score a segmenter on the scored pictures themselves, by the same rules as trained rows."""
     from lang3dxl_ns.evaluation.scores import MapScorer
     from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 
@@ -341,7 +341,7 @@ def _segmenter_maps(
 
 
 def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
-    """AP of the pictures' own fine targets, as those that the field gathers are made from training photos."""
+    """Score the pictures' own fine targets, made in the way that training photos' targets are."""
     from lang3dxl_ns.evaluation.language import open_scorer
     from lang3dxl_ns.preparation.prepare import prepare
     from lang3dxl_ns.preparation.store import FeatureStore
@@ -366,14 +366,14 @@ def _crop_maps(scorer: LanguageScorer, targets: TargetReader, photo: Photo, size
 
 
 def _colors_alone(config: Lang3DXLTrainerConfig) -> Lang3DXLDataManager:
-    """The data of a configuration that makes no targets."""
+    """Set up the data manager of a configuration without encoders, so that it makes no targets."""
     data = config.pipeline.datamanager
     data.clip = data.dense = "none"
     return data.setup(device="cpu", test_mode="test")
 
 
 def _pictures(run: Run, data: Lang3DXLDataManager) -> Iterator[tuple[str, GroundTruth, list[Photo]]]:
-    """Held-out photos and test views, each with their truth and the prefix of their figures."""
+    """Yield held-out photos and test views, each with the prefix of their figures and their truth."""
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
     yield "", GroundTruth(run.scene / "ground_truth"), data.eval_dataset.photos
@@ -388,7 +388,7 @@ def _score_pictures(
     photos: Sequence[Photo],
     maps_of: Callable[[Photo, tuple[int, int]], Maps],
 ) -> dict[str, float]:
-    """Mean figures of photos, whose maps are made at a given size."""
+    """Compute the mean figures of photos. `maps_of` makes a photo's maps at a given size."""
     from lang3dxl_ns.evaluation.aggregate import average
 
     scored = []

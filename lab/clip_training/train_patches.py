@@ -1,9 +1,9 @@
-"""Training of the patch head of the small CLIP: a linear reading of its patch tokens as texts are read.
+"""Training of the small CLIP's patch head: a linear map from its patch tokens to the space of its texts.
 
     python -m lab.clip_training.train_patches --cache DIR --photos FACADES --out lang3dxl_ns/demo/clip
 
-Both towers stay as they are. A token of a crop sees all of it, and stands for a sixteenth of it: its reading
-is four times as fine as the crop's own embedding. About three minutes on one core.
+Both towers are frozen. A patch token sees the whole crop and stands for a sixteenth of its area, so a map of
+tokens is four times as fine as one of crop embeddings. Training takes about five minutes on one core.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.patch_head import FILE
 
 SIDES = (26, 140)
-"""Range of the crops' sides in pixels of a stored view: those that training photos are read at."""
+"""Range of the crops' sides in pixels of a stored view, the same as for a scene's training photos."""
 PHOTO_SHARE = 0.1
-"""Share of the photos in the loss: a linear head can't serve both worlds equally."""
+"""Weight of the photos in the loss. It is small, because a linear head cannot serve both worlds equally."""
 _AT_ONCE = 256
-_SCALE = 10.0  # of the cosines in the softmax: a learned one grows, and domes and portals lose
+_SCALE = 10.0  # scale of the cosines in the softmax; a learned one grows, which harms domes and portals
 World = tuple[Float[Tensor, "n d"], Float[Tensor, "n k"]]
-"""Tokens, and the share of every class in each patch."""
-_DOUBT = 0.12  # share of a patch that may show a class unnamed, above which the class is left out of the loss
+"""Patch tokens, and the share of every class in each patch."""
+_DOUBT = 0.12  # share of a patch that may show a class without its label; above it the loss skips the class
 
 
 @dataclass(kw_only=True)
@@ -44,19 +44,19 @@ class PatchTraining:
     """Train the patch head."""
 
     out: Path
-    """Folder for the head's file."""
+    """Folder in which the head is saved."""
     cache: Path
     """Folder for rendered views."""
     photos: Path | None = None
-    """Folder of labeled photos: a quarter as many crops are cut from them."""
+    """Folder of labeled photos, which give a quarter as many crops as landmarks; none without it."""
     landmarks: int = 100
-    """Training landmarks, two views each."""
+    """Number of training landmarks, with two views each."""
     crops: int = 26_000
-    """Crops of landmarks to fit on."""
+    """Number of crops from landmarks to train on."""
     steps: int = 900
-    """Training steps, of 2,048 patches of each world."""
+    """Training steps, each with 2,048 patches from landmarks and as many from photos."""
     seed: int = 0
-    """Seed of crops and batches."""
+    """Random seed of crops and batches."""
 
     def main(self) -> None:
         torch.manual_seed(self.seed)
@@ -90,7 +90,7 @@ def _unit(x: Tensor) -> Tensor:
 
 @torch.no_grad()
 def read_patches(clip: Any, views: list[LandmarkViews], count: int, seed: int) -> World:
-    """Tokens of random crops' patches, as the head reads them, and the share of every class in each patch."""
+    """Compute the patch tokens of random crops, the head's inputs, and the share of every class in each."""
     rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     tokens, shares = [], []
     for _ in range(count // _AT_ONCE):
@@ -108,14 +108,14 @@ def fit(
     start: Float[Tensor, "c d"],
     steps: int,
 ) -> dict[str, Tensor]:
-    """Weight and bias whose readings fit the texts of what patches show: soft cross entropy, rare classes
-    weighted by the root of their rarity. Classes that a patch may show unnamed don't count against it.
+    """Fit a weight and a bias that map tokens to the texts of the classes that patches show, by soft cross
+    entropy in which classes weigh 1 / √frequency. Classes that may be there without a label are ignored.
 
     Args:
-        worlds: patches of landmarks, of photos, each with its share of the loss.
-        texts: a vector for every class.
-        start: the weight to begin with, the CLIP's own projection.
-        steps: of the optimizer.
+        worlds: the patches of landmarks and of photos, each with its weight in the loss.
+        texts: unit vector of every class.
+        start: initial weight, the CLIP's own projection.
+        steps: number of optimizer steps.
     """
     weight, bias = start.clone().requires_grad_(), torch.zeros(len(start), requires_grad=True)
     optimizer = torch.optim.Adam([weight, bias], lr=2e-3)

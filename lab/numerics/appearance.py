@@ -19,12 +19,12 @@ from lang3dxl_ns.rendering import Gaussians
 COUNT = 200
 BOUNDS = {"float32": Bounds(2e-5, 5e-6, 1e-3, 1e-4), "float64": EXACT}
 HALF = {"bf16": Bounds(3e-2, 1e-2, 0.5, 0.2), "fp16": Bounds(1e-3, 5e-4, 0.1, 0.04)}
-"""A ReLU that rounding opens or closes changes a whole row's gradient: over 16 draws of the numbers, half of
-them with the finer grid of before, fp16 had 1e-3 to .08, RMS .001 to .036."""
+"""Bounds of mixed precision: a ReLU that rounding opens or closes changes a whole row's gradient. In 16 draws
+of the numbers, half of them with an earlier, finer grid, fp16 had errors of 1e-3 to .08, RMS .001 to .036."""
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """Colors, and opacities with the opacity shift, under a photo's look."""
+    """Yield cases of colors, and of opacities with the opacity shift, under a photo's look."""
     cell = "a rounded place may lie in the next cell of the grid"
     catalog: dict[str, tuple[Callable[[], Problem], str]] = {
         "usual": (_problem, ""),
@@ -104,7 +104,7 @@ def _problem(
 
 
 def appearance_reference(field: AppearanceField, given: Maps, rows: Tensor) -> Maps:
-    """The field as documented: contract space, look up, three layers, shift and clamp."""
+    """Compute the field as documented: contract space, look up, apply three layers, shift and clamp."""
     x = (given["means"][rows] - field.center.double()) / field.radius.double()
     distance = x.norm(dim=1, keepdim=True).clamp_min(1)
     places = 0.5 + 0.25 * (x / distance) * (2 - 1 / distance)

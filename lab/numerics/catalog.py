@@ -8,10 +8,10 @@ from lab.numerics import appearance, decoder, downsampler, hash_grid, losses, ra
 from lab.numerics.measure import Case
 
 GROUPS = (rasterizer, relevancy, appearance, hash_grid, decoder, downsampler, losses)
-"""Modules of cases: rendering, answers, and what training uses."""
+"""Modules of cases, for rendering, queries and training."""
 
 
 def all_cases(quick: bool, device: str) -> Iterator[Case]:
-    """All cases; `quick` shrinks those where size is not the point."""
+    """Yield all cases; `quick` shrinks those that do not test size."""
     for group in GROUPS:
         yield from group.cases(quick, device)

@@ -1,4 +1,4 @@
-"""`lang3dxl numerics`: error and run time of components on hard cases, with pass or miss."""
+"""`lang3dxl numerics`: error and run time of components on hard cases, with a verdict for each."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_
 
 HEADER = "component", "case", "mode", "output", "gradient", "bounds", "flipped", "ms", "verdict"
 SMALLEST = 1e-18
-"""Errors below are drawn here."""
+"""Smallest error in the plot; lower ones are drawn here."""
 
 
 @dataclass(kw_only=True)
 class Numerics:
-    """Measure error and time on stiff and extreme cases of rendering, training and answering.
+    """Measure error and time on stiff and extreme cases of rendering, training and queries.
 
     Exits 1 if a case misses its bound.
     """
 
     out: Path
-    """Folder for numerics.md and numerics.png."""
+    """Folder in which numerics.md and numerics.png are written."""
     quick: bool = False
-    """Smaller cases in single precision only, about a minute: for continuous integration."""
+    """Run smaller cases and skip float64: about a minute, for continuous integration."""
     device: str = "auto"
-    """Device: auto (a GPU if there is one), cpu, cuda."""
+    """Device to measure on: auto (a GPU if there is one), cpu or cuda."""
 
     def main(self) -> None:
         """Measure, write the report, and exit with an error if a case missed its bound."""
@@ -61,8 +61,8 @@ class Numerics:
 
 
 def measure_all(cases: Sequence[Case], quick: bool, device: str, repeats: int = 0) -> list[Row]:
-    """A row for every case and mode; `quick` skips float64 where there is another mode. repeats: see
-    `measure`."""
+    """Measure every case in every mode; `quick` skips float64 where there is another mode. repeats: number of
+    timed repetitions, as in `measure`."""
     pairs = [
         (case, mode)
         for case in cases
@@ -117,7 +117,7 @@ def _verdict(row: Row | optimization.Run) -> str:
 
 
 def _plot(rows: Sequence[Row]) -> bytes:
-    """PNG: error against time, for outputs and gradients; a color per component."""
+    """Plot error against time as a PNG, for outputs and gradients, with a color per component."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
 

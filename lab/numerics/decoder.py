@@ -24,16 +24,16 @@ HALF = {"bf16": Bounds(2e-2, 1e-2, 0.2, 5e-2), "fp16": Bounds(3e-3, 2e-3, 0.1, 2
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """All presets with usual codes, the short preset with hard ones and in mixed precision."""
+    """Yield the presets with usual codes, and the short preset with hard codes and in mixed precision."""
     tf32 = {"tf32": Bounds(1e-2, 5e-3, 0.1, 2e-2)} if device == "cuda" else {}
     presets = ("short", "paper") if quick else ("short", "paper", "default", "official")
     for preset in presets:
         note = "rounding may choose the next cell, whose slope differs" if preset != "short" else ""
         config = SemanticFieldConfig(preset=preset, log2_table_size=12, code_std=None)  # type: ignore[arg-type]
-        # Unbounded codes reach eight times as far as a sigmoid's coordinates, with as much more rounding.
+        # Unbounded codes reach eight times as far as a sigmoid's coordinates, so rounding grows as much.
         bounds = CROSSING if preset == "official" else FINE
         yield Case("decoder", f"preset {preset}", partial(_problem, _codes, config), bounds, note)
-    # Proof that the cell crossing is the cause: with exact coordinates the error is gone.
+    # This shows that crossing into another cell is the cause: with exact coordinates there is no error.
     exact = SemanticFieldConfig(preset="official", log2_table_size=12, code_std=None)
     held = "codes are multiples of 1/64: their coordinates are exact in float32"
     yield Case("decoder", "preset official, no crossing", partial(_problem, _held_codes, exact), HELD, held)
@@ -82,7 +82,7 @@ def _problem(codes: Callable[[], Tensor], config: SemanticFieldConfig, outputs_o
 
 
 def decode_reference(field: SemanticField, leaves: Maps) -> Maps:
-    """The decoder as documented: bound, look up, layer after layer, undo the whitening."""
+    """Compute the decoder as documented: bound, look up, apply the layers, undo the whitening."""
     s, codes = field.settings, leaves["codes"]
     sigmoid = s.bounding == "sigmoid"
     x = codes.sigmoid() if sigmoid else codes.clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT)

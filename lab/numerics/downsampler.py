@@ -20,7 +20,7 @@ HALF = {"bf16": Bounds(2e-2, 1e-2, 3e-2, 2e-2), "fp16": Bounds(3e-3, 2e-3, 5e-3,
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """Logits of any size, by the path for free logits and, where it differs, that for bounded ones."""
+    """Yield cases of shapes and masks with bounded logits, and of extreme logits, free and bounded."""
     shapes: dict[str, dict[str, Any]] = {
         "usual": {},
         "size that doesn't divide": {"grid": (5, 7)},
@@ -68,14 +68,14 @@ def _normal(scale: float) -> Callable[[tuple[int, int]], Tensor]:
 
 
 def _half_mask(size: tuple[int, int]) -> Tensor:
-    """1 on the left third."""
+    """Build a mask that is 1 on the left third and 0 elsewhere."""
     mask = torch.zeros(size, dtype=torch.float64)
     mask[:, : size[1] // 3] = 1
     return mask
 
 
 class _Given(nn.Module):
-    """Replaces the network with the case's logits."""
+    """Replacement of the network that returns the case's logits."""
 
     def __init__(self, logits: Tensor):
         super().__init__()
@@ -113,14 +113,14 @@ def _problem(
         used = torch.ones(size, dtype=torch.float64) if chosen is None else chosen
         return downsample_reference(values, weights, used.to(values.device), grid, sides)
 
-    # With one pixel in a window, or one that outweighs all, the gradient by the logits nearly vanishes.
+    # If a window holds one pixel, or one outweighs all others, the gradient of the logits nearly vanishes.
     return Problem(leaves, compute, reference, gradient_scale=0.1)
 
 
 def downsample_reference(
     features: Tensor, logits: Tensor, mask: Tensor, grid: tuple[int, int], sides: tuple[float, ...]
 ) -> Maps:
-    """Σ K m exp(w) f / Σ K m exp(w), window by window, each with its own largest logit subtracted."""
+    """Compute Σ K m exp(w) f / Σ K m exp(w) window by window, with each one's largest logit subtracted."""
     h, w, _ = features.shape
     rows, columns = separable_kernel("pyramid", (h, w), grid, sides, torch.float64, features.device)
     out = features.new_zeros(*grid, features.shape[2])

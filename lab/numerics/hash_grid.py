@@ -17,11 +17,11 @@ from lang3dxl_ns.common.kernels import numba_works
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, HASH_PRIMES, HashGrid
 
 LARGE = 512.0
-"""Table values are a thousand times larger than a new grid's, as after training."""
+"""Factor by which table values exceed a new grid's, which makes them as large as after training."""
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """Coordinates, tables and number types; in torch operations, and on the CPU by the compiled kernels."""
+    """Yield cases of coordinates, tables and number types, in torch and, on the CPU, in compiled kernels."""
     yield from _cases("hash grid", "torch")
     if device == "cpu" and numba_works():
         yield from _cases("hash grid, numba", "numba")
@@ -43,7 +43,7 @@ def _cases(component: str, kernels: str) -> Iterator[Case]:
     yield Case(component, "four dimensions", partial(_problem, lambda: _uniform(4), kernels), bounds)
     few = partial(_problem, _uniform, kernels, log2_table=3)
     yield Case(component, "collisions: 8 entries a level", few, bounds)
-    if kernels == "numba":  # which is for float32 and float64 alone
+    if kernels == "numba":  # these kernels support float32 and float64 only
         return
     yield Case(
         component,
@@ -67,7 +67,7 @@ def _uniform(dimensions: int = 3) -> Tensor:
 
 
 def _borders() -> Tensor:
-    """Vertices of every level with a power of two of cells: exact in any number type."""
+    """Compute vertices of every level; they are exact in any type, since cells are powers of two."""
     cells = 2.0 ** torch.arange(4, 12, dtype=torch.float64).repeat_interleave(24)[:, None]
     vertex = (_uniform()[: len(cells)] * (cells - 1)).floor()
     return (vertex + 0.5) / cells
@@ -94,7 +94,7 @@ def _problem(
     constants: frozenset[str] = frozenset(),
 ) -> Problem:
     x = points()
-    # A growth of exactly 2, from 16 + 2 to 2048 + 2 vertices, so that numbers of cells are powers of two.
+    # The levels grow by exactly 2, from 16 + 2 to 2048 + 2 vertices, so that cells are powers of two.
     grid = HashGrid(x.shape[1], 8, 4, log2_table, 18, 2050, generator=torch.Generator().manual_seed(0))
     grid.kernels = kernels
     cells = 2.0 ** torch.arange(4, 12)
@@ -121,7 +121,7 @@ def interpolate_reference(
     x: Float[Tensor, "n d"],
     level_weights: Float[Tensor, " levels"] | None = None,
 ) -> Float[Tensor, "n out"]:
-    """Hash grid interpolation level by level and corner by corner; gradients by autograd."""
+    """Interpolate a hash grid level by level and corner by corner; autograd gives the gradients."""
     x = x.clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT)
     capacity, offset, levels = grid.hash_mask + 1, 0, []
     for cells in grid.cells.tolist():

@@ -23,7 +23,7 @@ HALF_NOTE = "a prediction rounded to 16 bits may cross its target: the sign of t
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """Color, CLIP, dense and region losses."""
+    """Yield cases of the color, CLIP, dense and region losses."""
     yield from _color_cases()
     yield from _feature_cases()
     yield from _region_cases(quick)
@@ -77,7 +77,7 @@ def _color(
 
 
 def color_reference(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    """½ L1 + ½ (1 − SSIM), window by window with two-pass variances."""
+    """Compute ½ L1 + ½ (1 − SSIM), window by window, with two-pass variances."""
     if mask is not None and not mask.any():
         return 0 * prediction.sum()
     weight = torch.ones_like(prediction[..., 0]) if mask is None else mask.to(prediction)
@@ -154,7 +154,7 @@ def _feature(
 
 
 def _resized(values: Tensor, grid: torch.Size) -> Tensor:
-    """Triangle filter as wide as a cell of the coarser grid, as two dense matrices."""
+    """Resize with a triangle filter as wide as a cell of the coarser grid, as two dense matrices."""
     for axis, cells in enumerate(grid):
         size = values.shape[axis]
         scale = size / cells
@@ -203,7 +203,7 @@ def _region(features: Tensor, labels: Tensor, narrow: bool = False) -> Callable[
             return {"loss": 0 * values.sum()}
         _, region = torch.unique(label[valid], return_inverse=True)
         values = values[valid]
-        values = values - values.detach().mean(0)  # a shift changes no variance
+        values = values - values.detach().mean(0)  # a shift does not change the variance
         count = torch.bincount(region)
         sums = torch.zeros(len(count), values.shape[1]).to(values).index_add(0, region, values)
         deviations = values - (sums / count[:, None])[region]

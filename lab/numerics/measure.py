@@ -19,9 +19,9 @@ Maps = dict[str, Tensor]
 Function = Callable[[Maps], Mapping[str, Tensor]]
 
 AUTOCAST = {"bf16": torch.bfloat16, "fp16": torch.float16}
-"""Mixed-precision modes: inputs in float32, the component under autocast."""
+"""Number types of the mixed-precision modes: inputs are float32, and the component runs under autocast."""
 FLIP = 1e-4
-"""A pixel off by more than this share of the largest value has a pair across a threshold."""
+"""Error, as a share of the largest value, above which a pixel counts as flipped across a threshold."""
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,16 @@ class Bounds:
     gradient_max: float = 1e-4
     gradient_rms: float = 1e-5
     flipped: float = 0.0
-    """Share of pixels allowed to fall on the other side of a threshold than the reference's."""
+    """Share of pixels that may fall on another side of a threshold than the reference's."""
 
     def times(self, factor: float) -> Bounds:
-        """The same with all errors multiplied by a factor."""
+        """Return bounds whose errors are multiplied by a factor."""
         names = ("output_max", "output_rms", "gradient_max", "gradient_rms")
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 
 
 EXACT = Bounds(1e-9, 1e-9, 1e-7, 1e-7)
-"""In float64, rounding is negligible and only the formula could be wrong."""
+"""Bounds in float64, where rounding is negligible and only the formula could be wrong."""
 
 
 @dataclass
@@ -53,15 +53,15 @@ class Problem:
     compute: Function
     """The component, in the precision and on the device of its leaves."""
     reference: Function
-    """The same in float64, written for clarity. Not finite where the component need not be."""
+    """Reference in float64, written for clarity. It may be infinite or NaN where the component may be too."""
     thresholds: bool = False
-    """Count pixels that flip across a threshold separately, and exclude them from the gradient."""
+    """Whether pixels that flip across a threshold are counted, and excluded from the gradient."""
     constants: frozenset[str] = frozenset()
     """Leaves without a gradient."""
     output_scale: float = 0.0
-    """Smallest denominator of relative output errors, for answers that nearly vanish."""
+    """Smallest denominator of relative output errors, for outputs that nearly vanish."""
     gradient_scale: float = 0.0
-    """The same for gradients."""
+    """Smallest denominator of relative gradient errors."""
 
 
 @dataclass(frozen=True)
@@ -72,14 +72,14 @@ class Case:
     name: str
     build: Callable[[], Problem]
     bounds: Mapping[str, Bounds] = field(default_factory=lambda: {"float32": Bounds(), "float64": EXACT})
-    """By mode: float32, float64, bf16 and fp16 (autocast), tf32 (on a GPU)."""
+    """Bounds by mode: float32, float64, bf16 and fp16 (autocast), tf32 (on a GPU)."""
     note: str = ""
-    """Reason for the bound, where it isn't obvious."""
+    """Reason for the bounds, where it is not obvious."""
 
 
 @dataclass
 class Row:
-    """Measured figures; errors are relative, `ms` is one forward and backward."""
+    """Measured figures of a case in a mode: relative errors, and `ms` of one forward and backward pass."""
 
     component: str
     case: str
@@ -111,7 +111,7 @@ class Row:
 
 
 def measure(case: Case, mode: str, device: torch.device | str = "cpu", repeats: int = 0) -> Row:
-    """Run a case in one mode: errors against the reference, whether all is finite and, with repeats, time."""
+    """Measure a case in one mode: errors, whether all is finite, and the time if `repeats` is not 0."""
     problem = case.build()
     dtype = torch.float64 if mode == "float64" else torch.float32
     leaves = _leaves(problem, {n: v.to(device, dtype) for n, v in problem.leaves.items()})
@@ -165,11 +165,11 @@ class _Error:
     max: float
     rms: float
     finite: bool
-    """Finite wherever the reference is."""
+    """Whether the component is finite wherever the reference is."""
 
 
 def _errors(found: Tensor, expected: Tensor, scale: float = 0.0) -> _Error:
-    """Errors relative to the reference's largest value and RMS (at least `scale`), where it is finite.
+    """Compute errors relative to the reference's largest value and RMS (at least `scale`).
 
     Where the reference is not finite, the component may be anything; where it is all zero, errors are
     absolute.
@@ -190,7 +190,7 @@ def _errors(found: Tensor, expected: Tensor, scale: float = 0.0) -> _Error:
 
 
 def _rms(values: Tensor) -> float:
-    """Root mean square; scaled first, so that nothing under- or overflows."""
+    """Compute the root mean square, of scaled values so that nothing under- or overflows."""
     largest = values.abs().max()
     if not largest > 0 or not bool(largest.isfinite()):
         return float(largest)
@@ -198,7 +198,7 @@ def _rms(values: Tensor) -> float:
 
 
 def _worst(values: Iterable[float]) -> float:
-    """The largest; NaN if there is any (`max` would lose it)."""
+    """Return the largest value, or NaN if any is NaN (`max` could lose it)."""
     listed = list(values)
     return math.nan if any(math.isnan(value) for value in listed) else max(listed, default=0.0)
 
@@ -208,7 +208,7 @@ def _leaves(problem: Problem, values: Maps) -> Maps:
 
 
 def _settled(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> Maps:
-    """By map [h, w, 1]: the pixels in which no map flips across a threshold."""
+    """Return for each map the mask [h, w, 1] of the pixels in which no map flips across a threshold."""
     flipped = [
         (found[name].detach().double() - true.detach()).abs().amax(2, keepdim=True)
         > FLIP * float(true.detach().abs().max())
@@ -236,7 +236,7 @@ def _upstream(expected: Mapping[str, Tensor], settled: Maps) -> Maps:
 
 
 def _gradients(outputs: Mapping[str, Tensor], leaves: Maps, upstream: Maps) -> Maps:
-    """Gradients of Σ output · upstream with respect to all leaves; zero for leaves without influence."""
+    """Compute the gradients of Σ output · upstream for all leaves; zero for leaves without influence."""
     wanted = {name: leaf for name, leaf in leaves.items() if leaf.requires_grad}
     attached = {name: value for name, value in outputs.items() if value.requires_grad}
     if not attached:
@@ -254,13 +254,13 @@ def _gradients(outputs: Mapping[str, Tensor], leaves: Maps, upstream: Maps) -> M
 
 
 def narrowed(values: Tensor) -> Tensor:
-    """Rounded to autocast's number type, like the output of a layer; unchanged outside autocast."""
+    """Round to autocast's number type, like a layer's output; return values unchanged outside autocast."""
     device = values.device.type
     return values.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else values
 
 
 def _precision(mode: str, device: torch.device | str) -> AbstractContextManager[Any]:
-    """The context of a mode: autocast, TF32, or nothing."""
+    """Create the context of a mode: autocast, TF32, or none."""
     if mode in AUTOCAST:
         return torch.autocast(torch.device(device).type, AUTOCAST[mode])
     return _tf32() if mode == "tf32" else nullcontext()
@@ -268,7 +268,7 @@ def _precision(mode: str, device: torch.device | str) -> AbstractContextManager[
 
 @contextmanager
 def _tf32() -> Iterator[None]:
-    """TF32 matrix products, on GPUs that have them."""
+    """Use TF32 for matrix products inside the context, on GPUs that support it."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
     try:

@@ -14,17 +14,17 @@ from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldCo
 
 PIXELS, BATCH, CHANNELS, KINDS = 1024, 64, 32, 12
 NOISE = 0.3
-"""Deviation of the targets around their cluster's mean, like crops of the same thing."""
+"""Standard deviation of the targets around their cluster's mean, similar to crops of one thing."""
 PARTS = 10
 LARGEST_CODE = 25.0
-"""At 17 float32's sigmoid is 1 with zero slope: a code stops there, once its momentum is spent."""
+"""Largest code that passes. From 17, float32's sigmoid has zero slope, so only momentum moves a code."""
 DRIFT = 1.05
-"""The last part's loss may exceed the lowest part's by this factor."""
+"""Factor by which the last part's loss may exceed the lowest part's."""
 
 
 @dataclass
 class Run:
-    """An optimization, in tenths of its steps."""
+    """An optimization and its figures in ten equal parts."""
 
     case: str
     steps: int
@@ -32,9 +32,9 @@ class Run:
     """Whether its loss must converge; its numbers must be finite in any case."""
     seconds: float = 0.0
     losses: list[float] = field(default_factory=list)
-    """Mean over the part."""
+    """Mean loss over each part."""
     codes: list[float] = field(default_factory=list)
-    """Largest code at the part's end."""
+    """Largest code at the end of each part."""
     finite: bool = True
     """Whether all parameters and moments are finite at the end of every part."""
 
@@ -54,7 +54,7 @@ class Run:
 
 
 def runs(quick: bool) -> list[Run]:
-    """Runs the catalog of optimizations (on the CPU: the steps are too small for a GPU)."""
+    """Run the catalog of optimizations, on the CPU, since the steps are too small for a GPU."""
     long = 1_000 if quick else 100_000
     steps = 200 if quick else 1_000
     return [
@@ -67,7 +67,7 @@ def runs(quick: bool) -> list[Run]:
 def optimize(
     case: str, steps: int, code_rate: float, grid_rate: float, decoder_rate: float, converges: bool = True
 ) -> Run:
-    """Adam as in training (epsilon 1e-15) at constant rates, on pixels of a few kinds of things."""
+    """Run Adam as in training (epsilon 1e-15), at constant rates, on pixels of a few kinds of things."""
     generator = torch.Generator().manual_seed(0)
     # A small table keeps a step to a millisecond or two.
     config = SemanticFieldConfig(preset="short", log2_table_size=9)

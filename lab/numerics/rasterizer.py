@@ -19,13 +19,13 @@ from lang3dxl_ns.scene.camera import Camera
 
 NEAR = 0.01
 MODES = {"float32": Bounds(8e-3, 3e-4, 1e-3, 1e-3, flipped=0.02), "float64": Bounds(1e-8, 1e-8, 1e-6, 1e-6)}
-"""One pair that flips across 1/255 changes a pixel by up to 1/255; the stop at 1e-4 adds a little."""
+"""Bounds: one pair that flips across 1/255 changes a pixel by up to 1/255; the stop at 1e-4 adds a little."""
 GSPLAT = {"float32": Bounds(0.1, 1e-2, 0.5, 0.1, flipped=1.0)}
-"""gsplat cuts a Gaussian at three standard deviations, where alpha may still be 0.011."""
+"""Bounds of gsplat, which cuts a Gaussian at three standard deviations, where alpha may still be 0.011."""
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """All cases, by the torch backend, on the CPU by the compiled kernels, on a GPU by gsplat."""
+    """Yield all cases for the torch backend, the compiled kernels (on the CPU) and gsplat (on a GPU)."""
     yield from _cases("rasterizer, torch", "torch", MODES, quick)
     if device == "cpu" and numba_works():
         yield from _cases("rasterizer, numba", "numba", MODES, quick)
@@ -43,7 +43,7 @@ def _cases(component: str, backend: Backend, modes: Mapping[str, Bounds], quick:
 
 
 class Scene:
-    """Named float64 tensors and a camera; the methods change it and return it."""
+    """Named float64 tensors and a camera. The methods change the scene and return it."""
 
     def __init__(self, count: int = 300, width: int = 48, height: int = 36, seed: int = 0):
         generator = torch.Generator().manual_seed(seed)
@@ -76,7 +76,7 @@ class Scene:
         return self
 
     def seen_with(self, focal: tuple[float, float], center: tuple[float, float] | None = None) -> Scene:
-        """Another lens; the Gaussians spread over its field of view."""
+        """Change the lens, and spread the Gaussians over its field of view."""
         spread = torch.tensor([self.focal[0] / focal[0], self.focal[1] / focal[1], 1.0])
         center = center or self.center
         self.leaves["means"] *= spread
@@ -88,7 +88,7 @@ class Scene:
         return self
 
     def in_world(self, scale: float = 1.0, offset: float = 0.0) -> Scene:
-        """Another world frame: rotated, scaled (the near plane too) and moved; the image stays the same."""
+        """Rotate, scale (the near plane too) and move the world frame; the image stays the same."""
         rotation = _rotation(torch.tensor([0.4, -0.7, 0.2], dtype=torch.float64))
         origin = offset * torch.tensor([0.48, 4.6, 0.1], dtype=torch.float64)  # eastings, northings, height
         self.leaves["means"] = scale * self.leaves["means"] @ rotation + origin
@@ -101,14 +101,14 @@ class Scene:
         return self
 
     def opaque(self) -> Scene:
-        """Ignore the gradient of the background."""
+        """Exclude the gradient of the background."""
         self.constants = frozenset({"background"})
         self.note = "without the background's gradient, which is 1 − alpha: at an alpha near 1, its rounding"
         return self
 
 
 def _catalog(quick: bool) -> dict[str, Callable[[], Scene]]:
-    """Scenes by name."""
+    """Return functions that build the scenes, by name."""
     many = 4_000 if quick else 20_000
     stack = 10_000 if quick else 100_000
     return {
@@ -142,7 +142,7 @@ def _catalog(quick: bool) -> dict[str, Callable[[], Scene]]:
 
 
 def _focal(degrees: float, width: int = 48) -> tuple[float, float]:
-    """Pixels, for a field of view across the width."""
+    """Compute the focal lengths in pixels for a field of view across the width."""
     focal = width / (2 * math.tan(math.radians(degrees) / 2))
     return focal, focal
 
@@ -155,7 +155,7 @@ def _scales_of_every_size() -> Scene:
     scene = Scene()
     spread = torch.linspace(math.log(1e-8), math.log(1e5), 900, dtype=torch.float64)
     order = torch.randperm(900, generator=torch.Generator().manual_seed(1))
-    # Mostly transparent: otherwise the large ones hide everything else.
+    # They are mostly transparent, or the large ones would hide everything else.
     return scene.set(log_scales=spread[order].view(300, 3), logits=scene.leaves["logits"] - 3).opaque()
 
 
@@ -191,7 +191,7 @@ def _near_plane() -> Scene:
 
 
 def _pile(count: int, opacity: float) -> Scene:
-    """Gaussians on top of each other over a few pixels."""
+    """Build Gaussians on top of each other over a few pixels."""
     scene = Scene(count, 8, 6)
     scene.leaves["means"][:, :2] *= 0.2
     scene.leaves["log_scales"] += math.log(2.0 / 0.08)
@@ -226,13 +226,13 @@ def _problem(scene: Callable[[], Scene], backend: Backend) -> Problem:
 
 
 def _gaussians(leaves: Maps) -> Gaussians:
-    """Activated as in the model."""
+    """Build the Gaussians, activated as in the model."""
     scales = leaves["log_scales"].clamp_max(MAX_LOG_SCALE).exp()
     return Gaussians(leaves["means"], leaves["quats"], scales, leaves["logits"].sigmoid())
 
 
 def _seen(leaves: Maps, near: float) -> Maps:
-    """The Gaussians kept by the rules: finite, in front of the near plane, identity for a zero quaternion."""
+    """Select the finite Gaussians beyond the near plane, with the identity in place of a zero quaternion."""
     properties = ("means", "quats", "log_scales", "logits", "channels")
     with torch.no_grad():
         depths = leaves["means"] @ leaves["view_matrix"][2, :3] + leaves["view_matrix"][2, 3]
@@ -245,7 +245,7 @@ def _seen(leaves: Maps, near: float) -> Maps:
 
 
 def _quaternion(vector: Tensor) -> Tensor:
-    """The quaternion of a rotation vector."""
+    """Compute the quaternion of a rotation vector."""
     angle = vector.norm()
     return torch.cat([(angle / 2).cos()[None], (angle / 2).sin() * vector / angle])
 
@@ -257,7 +257,7 @@ def _rotation(vector: Tensor) -> Tensor:
 
 
 def _multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Quaternion product of one with many."""
+    """Multiply one quaternion with many."""
     w, v = b[:, :1], b[:, 1:]
     cross = torch.linalg.cross(a[1:].expand_as(v), v)
     return torch.cat([a[0] * w - v @ a[1:, None], a[0] * v + w * a[1:] + cross], dim=1)

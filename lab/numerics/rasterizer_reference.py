@@ -1,6 +1,6 @@
-"""Reference rasterizer, written for clarity: every Gaussian against every pixel, gradients by autograd.
+"""Reference rasterizer, written for clarity: every Gaussian at every pixel, with gradients by autograd.
 
-It shares no arithmetic with the tiled one, which is tested and measured against it. Use float64.
+It shares no arithmetic with the tiled rasterizer, which is tested and measured against it. Use float64.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def rasterize_reference(
     near: float = 0.01,
     eps2d: float = 0.3,
 ) -> Raster:
-    """As `rasterize`, in time proportional to Gaussians × pixels; all values finite, `info` stays empty."""
+    """Rasterize finite values like `rasterize`, in time ∝ Gaussians × pixels. `info` stays empty."""
     means2d, axes, depths = project_reference(gaussians, camera)
     whitening = whitening_reference(axes, eps2d)
     opacities = gaussians.opacities
@@ -55,7 +55,7 @@ def rasterize_reference(
 def project_reference(
     gaussians: Gaussians, camera: Camera
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
-    """Pixel centers, axes A with screen covariance A Aᵀ (pixels), and depths, by textbook formulas."""
+    """Compute pixel centers, axes A with screen covariance A Aᵀ (pixels), and depths by textbook formulas."""
     q = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True)
     identity = torch.eye(3).to(q).expand(len(q), 3, 3)
     cross = torch.linalg.cross(q[:, None, 1:].expand(-1, 3, 3), identity).mT
@@ -79,10 +79,10 @@ def project_reference(
 
 
 def whitening_reference(axes: Float[Tensor, "n 2 3"], eps2d: float) -> Float[Tensor, "n 2 2"]:
-    """W with W Wᵀ the inverse of the blurred covariance A Aᵀ + ε.
+    """Compute W, for which W Wᵀ is the inverse of the blurred covariance A Aᵀ + ε.
 
-    By QR, which never squares the axes: for a needle a million pixels long the covariance itself has too many
-    digits for float64.
+    QR is used because it never squares the axes: the covariance of a needle that is a million pixels long has
+    too many digits for float64.
     """
     blur = eps2d**0.5 * torch.eye(2).to(axes).expand(len(axes), 2, 2)
     _, triangle = torch.linalg.qr(torch.cat([axes.mT, blur], dim=1))
@@ -128,7 +128,7 @@ def pixel_weights(
     whitening: Float[Tensor, "n 2 2"],
     opacities: Float[Tensor, " n"],
 ) -> Float[Tensor, "p n"]:
-    """Alpha × transmittance; 0 from the first Gaussian that would bring transmittance to 1e-4 or below."""
+    """Compute alpha × transmittance; 0 from the first Gaussian that would lower transmittance to ≤ 1e-4."""
     alphas = pixel_alphas(pixels, means2d, whitening, opacities)
     after = torch.cumprod(1 - alphas, dim=1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
@@ -141,7 +141,7 @@ def pixel_alphas(
     whitening: Float[Tensor, "n 2 2"],
     opacities: Float[Tensor, " n"],
 ) -> Float[Tensor, "p n"]:
-    """Opacity × Gaussian, at most 0.999, 0 below 1/255."""
+    """Compute opacity × Gaussian, at most 0.999, and 0 below 1/255."""
     x, y = pixels[:, :1] - means2d[:, 0], pixels[:, 1:] - means2d[:, 1]
     first, second = (x * column[:, 0] + y * column[:, 1] for column in whitening.unbind(2))
     alphas = opacities * torch.exp(-0.5 * (first.square() + second.square()))

@@ -14,13 +14,13 @@ from lang3dxl_ns.query.relevancy import relevancy
 CHANNELS = 64
 BOUNDS = {"float32": Bounds(2e-6, 1e-6, 1e-5, 5e-6), "float64": EXACT}
 FAR = {"float32": Bounds(4e-6, 2e-6, 1e-5, 5e-6), "float64": EXACT}
-"""Small relevancy is e^(−10 d), so its relative error is ten times the error of d, the difference of two
-cosines near 1: rounding of each is 6e-8, and that of the two lengths as much again."""
+"""Bounds for small relevancy, e^(−10 d). Its relative error is ten times the error of d, the difference of
+two cosines near 1: each is rounded by 6e-8, and the rounding of the two lengths adds as much again."""
 HALF = {"bf16": Bounds(3e-2, 2e-2, 1.0, 0.3), "fp16": Bounds(5e-3, 2e-3, 0.3, 5e-2)}
 
 
 def cases(quick: bool, device: str) -> Iterator[Case]:
-    """Features of any length and direction, temperatures from 0 to 1e4."""
+    """Yield cases with features of any length and direction, and temperatures from 0 to 1e4."""
     features: dict[str, tuple[Callable[[], Maps], str]] = {
         "usual": (_vectors, ""),
         "antipodal to the prompt": (lambda: _vectors(features=-_vectors()["queries"]), ""),
@@ -52,7 +52,7 @@ def _vectors(scale: float = 1.0, features: Tensor | None = None) -> Maps:
     def normal(count: int) -> Tensor:
         return torch.randn(count, CHANNELS, generator=generator, dtype=torch.float64)
 
-    # As from one encoder: all share a direction, so cosines lie close together.
+    # As in the output of one encoder, all share a direction, so cosines lie close together.
     shared = 2 * normal(1)
     queries, canonical = shared + normal(3), shared + normal(4)
     usual = scale * (shared + normal(200))
@@ -99,7 +99,7 @@ def _problem(vectors: Callable[[], Maps], temperature: float = 10.0, outputs_onl
 
 
 def relevancy_reference(features: Tensor, queries: Tensor, canonical: Tensor, temperature: float) -> Tensor:
-    """The smallest softmax of a prompt against each canonical phrase, prompt by prompt."""
+    """Compute the smallest softmax of a prompt against each canonical phrase, prompt by prompt."""
 
     def cosine(phrase: Tensor) -> Tensor:
         lengths = features.norm(dim=1) * phrase.norm()

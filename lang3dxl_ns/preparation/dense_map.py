@@ -1,4 +1,4 @@
-"""A photo's map of patch features from overlapping windows at two sizes, for small things as well."""
+"""Map of a photo's patch features, from overlapping windows at several sizes, so that small things show."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from torch import Tensor
 from lang3dxl_ns.common.memory import with_less_memory
 
 RULE = 1
-"""Increased when maps are made in another way, so that older ones are made again."""
+"""Increased when the way maps are made changes, so that older ones are made again."""
 Grid = tuple[int, int]
 """Rows and columns of patches."""
 EncodePatches = Callable[[Float[Tensor, "n 3 h w"]], Float[Tensor, "n rows columns c"]]
 
 _FINER = 1.75
-"""Ratio of the second size to the first: two windows, a quarter of which overlaps."""
+"""Ratio of the fine size to the coarse one: two windows that overlap by a quarter cover 1.75."""
 _OVERLAP = 0.25
 
 
 def map_grids(height: int, width: int, tokens: int, least: int) -> tuple[Grid, Grid]:
-    """The patches of a photo at both sizes, coarse and fine.
+    """Compute the grids of a photo's patches at two sizes, coarse and fine.
 
-    At the coarse size the photo's shorter side is one window; the fine one has 1.75 times as many patches, or
-    `least` along the longer side if those are more.
+    At the coarse size one window spans the photo's shorter side. The fine grid has 1.75 times as many patches
+    along each side, or `least` along the longer one if those are more.
 
     Args:
         tokens: patches per side of a window.
-        least: patches along the longer side.
+        least: minimum number of patches along the longer side of the fine grid.
     """
     longer = tokens * max(height, width) / min(height, width)
     factors = (1.0, max(_FINER, least / longer))
@@ -42,11 +42,11 @@ def map_grids(height: int, width: int, tokens: int, least: int) -> tuple[Grid, G
 
 
 def fine_grid(height: int, width: int, tokens: int, side: int) -> Grid:
-    """The patches of a photo that is read in windows of `side` of its pixels.
+    """Compute the grid of patches of a photo that is read in windows of `side` × `side` pixels.
 
     Args:
         tokens: patches per side of a window.
-        side: pixels of a window's side; a window is no larger than the photo.
+        side: a window's side in pixels of the photo; reduced where it exceeds the photo.
     """
     rows, columns = (max(round(tokens * length / side), tokens) for length in (height, width))
     return rows, columns
@@ -61,12 +61,12 @@ def build_dense_map(
     patch_size: int,
     batch_size: int,
 ) -> Float[Tensor, "rows columns c"]:
-    """Mean over the sizes of the unit patch features, on the finest grid.
+    """Build the map: patch features of unit length, blended at each size, averaged on the last grid.
 
     Args:
         photo: RGB in 0…1.
-        grids: the patches of each size, the last one the finest: `map_grids`.
-        encode: features of windows of `tokens` patches per side, of `patch_size` pixels: `encode_patches`.
+        grids: grid of patches of each size, the finest last (`map_grids`, `fine_grid`).
+        encode: encodes windows of `tokens` patches per side, each of `patch_size` pixels (`encode_patches`).
         batch_size: windows encoded at once; fewer if memory runs out.
     """
     total = torch.zeros(())
@@ -85,7 +85,7 @@ def _one_size(
     patch_size: int,
     batch_size: int,
 ) -> Float[Tensor, "c rows columns"]:
-    """The map at one size: windows that overlap, each weighing less towards its edge."""
+    """Build the map at one size from overlapping windows, whose weight falls towards their edges."""
     pixels = (grid[0] * patch_size, grid[1] * patch_size)
     planes = photo.permute(2, 0, 1)[None]
     image = F.interpolate(planes, pixels, mode="bicubic", antialias=True).clamp(0, 1)[0]
@@ -106,7 +106,7 @@ def _one_size(
 
 
 def window_starts(length: int, tokens: int) -> Int[Tensor, " n"]:
-    """First patches of windows that cover `length` patches evenly and overlap by a quarter or more."""
+    """Compute the first patches of evenly spaced windows over `length` patches, overlapping by ≥ 1/4."""
     shared = round(_OVERLAP * tokens)
     count = max(math.ceil((length - shared) / (tokens - shared)), 1)
     return torch.linspace(0, max(length - tokens, 0), count).round().long()

@@ -1,7 +1,7 @@
 """Preparation of a scene's targets: CLIP grids, dense features and regions, photo by photo.
 
-Every entry carries the settings that made it. A second run makes only what is missing or was made with other
-settings, so an interrupted run is simply repeated.
+Every entry stores the settings that it was made with. A second run makes only entries that are missing or
+were made with other settings, so an interrupted run can simply be repeated.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ _CROP_RULE = 4
 _READERS = 2
 """Threads that read photos while others are encoded."""
 _ANNOUNCED_CROPS = 5_000
-"""Fewer are encoded in seconds: no duration is measured."""
+"""Smallest number of crops whose duration is measured and announced. Fewer are encoded in seconds."""
 _MEASURED_S = 3.0
-"""Seconds in which noise is encoded, to announce a duration."""
+"""Seconds after which the measurement with noise ends, which is the basis of the announced duration."""
 _PATCHES_PER_CROP = 6
-"""As many patches as this, for each crop of a batch, are encoded at once: they hold more than crops do."""
+"""Patches encoded at once per crop of a batch. Windows are fewer than crops, since they take more memory."""
 _LONG_S = 1800.0
-"""Seconds on a CPU from which the remedies are named."""
+"""Duration on a CPU, in seconds, above which ways to shorten it are suggested."""
 
 
 @dataclass
@@ -71,40 +71,40 @@ class PreparedTargets:
     reader: TargetReader
     """Reader for the photos whose targets are complete, in the order given."""
     left_out: dict[str, str]
-    """Photos that could not be read, with reasons."""
+    """Reason for each photo that could not be read, by name."""
     encoded: int
-    """Number of photos for which this run made something."""
+    """Number of photos for which this run made an entry."""
 
 
 @dataclass
 class _Task:
-    """A photo, and what of its targets is to be made."""
+    """A photo, its targets, and those that are still to be made."""
 
     photo: Photo
     crops: Crops
     fast: int
-    """Crops that `--quality fast` would take."""
+    """Number of crops with `--quality fast`."""
     grids: tuple[Grid, ...] | None
-    """Grids of a map of patch features, if there is one."""
+    """Grids of the map of patch features, coarse to fine; None without a map."""
     with_crops: bool
-    """Whether there are crops; beside a map, their mean is taken."""
+    """Whether crops are encoded. If there is a map as well, the target is the mean of both."""
     kinds: set[str]
-    """All targets that the photo has."""
+    """Kinds of all the photo's targets."""
     missing: dict[str, dict[str, Any]]
-    """Settings of those to make."""
+    """Settings of the targets to make, by kind."""
 
     @property
     def clip(self) -> str | None:
-        """Kind of CLIP target to make."""
+        """Kind of CLIP target to make; None if it is complete."""
         return next((kind for kind in (CLIP, FINE) if kind in self.missing), None)
 
     @property
     def count(self) -> int:
-        """Number of crops."""
+        """Number of the photo's crops."""
         return self.crops.count(self.photo.height, self.photo.width)
 
     def bytes(self, clip: ImageTextEncoder | None, dense: DenseEncoder | None) -> int:
-        """Size of the entries to make: two bytes per number."""
+        """Compute the size of the entries to make, at two bytes per number."""
         height, width, numbers = self.photo.height, self.photo.width, 0
         if self.clip and clip:
             grid = self.grids[-1] if self.grids else self.crops.grid(height, width)
@@ -126,15 +126,16 @@ def prepare(
     regions: RegionSource | None = None,
     fine: Collection[str] = (),
 ) -> PreparedTargets:
-    """Makes the missing targets of all photos and says beforehand how many, and how much disk they take.
+    """Make the missing targets of all photos. The work ahead and the disk it needs are logged first.
 
     pixel_sizes: world units per pixel *of the photo as it is read* (its `width`), by photo name; None for
     relative scales. scales: crop sides in world units, or in photo widths without pixel sizes.
-    regions: where label maps come from; None for none. fine: photos that get small crops alone
-    (`fine_crops`), the smallest a third of their side apart; if there are some, only they get dense features.
+    regions: source of label maps, or None. fine: names of photos that get small crops alone (`fine_crops`),
+    the smallest a third of their side apart, or half if the encoder has a head for patches or there would be
+    too many. If any photo is fine, only fine ones get dense features.
 
-    Photos that can't be read are left out with a warning. Raises UserError when none can be read, a model
-    can't be loaded, or the disk is too small.
+    Photos that cannot be read are left out with a warning. Raises UserError if none can be read, a model
+    cannot be loaded, or the disk is too small.
     """
     tasks, left_out = _plan(photos, pixel_sizes, config, scales, store, regions, frozenset(fine))
     missing = [task for task in tasks if task.missing]
@@ -169,7 +170,7 @@ def _plan(
     regions: RegionSource | None,
     fine: Collection[str],
 ) -> tuple[list[_Task], dict[str, str]]:
-    """A task per photo, and reasons for the photos that can't be read."""
+    """Plan a task per photo, and collect the reasons for photos that cannot be read."""
     clip_model = find_model(config.clip, CLIP_OPTION)
     patches = patch_reading(config.clip, config.clip_features)
     input_pixels = getattr(read_config(clip_model).vision_config, "image_size", USUAL_INPUT)
@@ -199,7 +200,7 @@ def _plan(
         elif patches is not None and is_fine:
             descending = reversed(crops.sides)
             grids = tuple(fine_grid(photo.height, photo.width, patches.tokens, side) for side in descending)
-            crops = replace(crops, steps=HALF)  # the map is finer, and takes as long as the crops between
+            crops = replace(crops, steps=HALF)  # the map is finer, and costs as much as the crops in between
             clip |= {"steps": HALF, "patches": patches.recipe, "grids": grids, "map_rule": RULE}
         settings = {FINE if is_fine else CLIP: clip}
         if dense_model is not None and (is_fine or not fine):
@@ -216,7 +217,7 @@ def _plan(
 
 
 def _source(photo: Photo, content: str) -> dict[str, Any]:
-    """Everything that determines the photo as it is read. The camera matters only if it undistorts."""
+    """Collect everything that determines the photo's pixels. The lens matters only if it is undistorted."""
     source = {
         "photo": content,
         "size": [photo.width, photo.height],
@@ -226,7 +227,7 @@ def _source(photo: Photo, content: str) -> dict[str, Any]:
 
 
 class _ReadAhead:
-    """Reads the photos of tasks in threads, a few before their turn."""
+    """Reader of the tasks' photos in background threads, a few ahead of their turn."""
 
     def __init__(self, read: Callable[[Photo], UInt8[Tensor, "h w 3"]], tasks: Sequence[_Task]) -> None:
         self._read, self._waiting = read, deque(tasks)
@@ -234,7 +235,7 @@ class _ReadAhead:
         self._read_by_name: dict[str, Future[UInt8[Tensor, "h w 3"]]] = {}
 
     def get(self, photo: Photo) -> UInt8[Tensor, "h w 3"]:
-        """The photo's pixels. Raises UserError if it can't be read."""
+        """Return the photo's pixels. Raises UserError if it cannot be read."""
         while self._waiting and len(self._read_by_name) <= _READERS:
             ahead = self._waiting.popleft().photo
             self._read_by_name[ahead.name] = self._pool.submit(self._read, ahead)
@@ -258,11 +259,11 @@ class _Maker:
         self._models: tuple[ImageTextEncoder | None, DenseEncoder | None] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # A process loads its own networks, and doesn't know which photos it gets.
+        # A process loads its own networks, and does not know which photos it will get.
         return {**self.__dict__, "_tasks": [], "_models": None}
 
     def models(self, device: str) -> tuple[ImageTextEncoder | None, DenseEncoder | None]:
-        """The encoders needed; loaded once."""
+        """Load the encoders that are needed, on the first call only."""
         if self._models is None:
             c = self._config
             clip = load_image_text_encoder(c.clip, device) if self._with_clip else None
@@ -271,7 +272,7 @@ class _Maker:
         return self._models
 
     def start(self, device: str) -> Callable[[_Task], str | None]:
-        """As `workers.Maker.start`. The work returns why a photo can't be used, or None."""
+        """Implement `workers.Maker.start`. The work returns why a photo cannot be read, or None."""
         self.models(device)
         photos = _ReadAhead(WorkingPhotos(self._store).read, self._tasks)
 
@@ -280,7 +281,7 @@ class _Maker:
                 pixels = photos.get(task.photo)
             except UserError as error:
                 return str(error)
-            image = pixels.to(device).float() / 255  # a quarter of the bytes travel to a GPU
+            image = pixels.to(device).float() / 255  # as bytes, a quarter of the data is copied to a GPU
             for kind, settings in task.missing.items():
                 self._store.write(kind, task.photo.name, self._made(kind, task, image), settings)
             return None
@@ -288,7 +289,7 @@ class _Maker:
         return work
 
     def _made(self, kind: str, task: _Task, image: Float[Tensor, "h w 3"]) -> dict[str, Tensor]:
-        """The tensors of an entry."""
+        """Make the tensors of an entry."""
         assert self._models is not None
         clip, dense = self._models
         if kind == REGIONS:
@@ -316,7 +317,7 @@ class _Maker:
         return {"features": mean, "valid": valid[..., 0]}
 
     def announce(self, photos: int, device: str) -> None:
-        """Log the work ahead, and the disk, memory and time it needs. Raises UserError if the disk is too
+        """Log the work ahead and the disk, memory and time it needs. Raises UserError if the disk is too
         small."""
         (clip, dense), store, config, tasks = self.models(device), self._store, self._config, self._tasks
         needed, crop_size = sum(task.bytes(clip, dense) for task in tasks), clip.crop_size if clip else 0
@@ -328,8 +329,8 @@ class _Maker:
                 f"{_gigabytes(free)} are free: free some space, or use a larger smallest crop "
                 f"(scale range) or fewer dense tokens"
             )
-        # Per process: the largest photo in float32, thrice (as read, padded, in windows), and a batch of
-        # crops with the first layers' activations, a dozen times its size.
+        # A process holds the largest photo in float32 three times (as read, padded, in windows), and a batch
+        # of crops with the first layers' activations, which take a dozen times its size.
         largest = max(task.photo.width * task.photo.height for task in tasks)
         memory = config.workers * 3 * 4 * (3 * largest + 12 * config.crop_batch * crop_size**2)
         say(
@@ -345,7 +346,7 @@ class _Maker:
     def _announce_duration(
         self, clip: ImageTextEncoder, dense: DenseEncoder | None, device: torch.device
     ) -> None:
-        """Log how many crops are encoded, and for how long, by the time that noise takes."""
+        """Log how many crops will be encoded and an estimate of the duration, measured with noise."""
         config, tasks = self._config, [task for task in self._tasks if task.clip and task.with_crops]
         crops = sum(task.count for task in tasks)
         if crops < _ANNOUNCED_CROPS:
@@ -374,9 +375,9 @@ class _Maker:
 
 
 def _seconds_each(work: Callable[[int], Tensor], most: int) -> float:
-    """Seconds that one of a batch takes, once all is warm. Batches grow up to `most` while that is quick: on
-    a busy machine threads wait for each other in every layer, which costs a small batch as much as a large
-    one."""
+    """Measure the seconds per item of a batch, after a warm-up. Batches grow up to `most` while they are
+    quick, since a small batch can take as long as a large one on a busy machine, where threads wait for each
+    other in every layer."""
     size, taken = 1, 0.0
     work(size).cpu()  # waits for a GPU
     while True:
@@ -390,6 +391,6 @@ def _seconds_each(work: Callable[[int], Tensor], most: int) -> float:
 
 
 def _gigabytes(size: int) -> str:
-    """A size in a suitable unit."""
+    """Format a size in bytes in a suitable unit, kB to GB."""
     unit, name = next(((u, n) for u, n in ((1e9, "GB"), (1e6, "MB")) if size >= u), (1e3, "kB"))
     return f"{size / unit:.2f} {name}"

@@ -1,8 +1,8 @@
-"""Doubt about a prompt: how many words for things that are surely absent fit the scene as well.
+"""Doubt about a prompt: the share of words for absent things that match the scene as well as the prompt.
 
-A relevancy above 0.5 somewhere proves little: among many Gaussians a few fit any text, nonsense too. So the
-scene is also asked for unrelated things, and a prompt is ranked among them by its best Gaussians. Nothing
-here depends on the encoder or the scene (conformal p-values: Vovk, Gammerman & Shafer 2005).
+A relevancy above 0.5 somewhere proves little, since among many Gaussians a few match any text, even nonsense.
+So unrelated words are queried too, and a prompt is ranked among them by its best Gaussians. The rule does not
+depend on the encoder or the scene (conformal p-values: Vovk, Gammerman & Shafer 2005).
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ UNRELATED = (
     "watermelon", "balloon", "lipstick", "tuxedo", "iceberg", "thermometer", "stethoscope", "bowling ball",
     "calculator",
 )  # fmt: skip
-"""Things that photos of a building hardly show. The built-in CLIP has learned none of them: those of its own
-training's absent things would be told apart more easily than what people ask for."""
+"""Things that rarely appear in photos of buildings. The built-in CLIP was trained on none of them, since it
+would reject absent things from its training more easily than the words that users enter."""
 DOUBTFUL = 0.1
-"""A prompt with more doubt than this is reported as doubtful: so are nine in ten absent things."""
+"""Prompts above this are reported as doubtful. Nine in ten absent things are."""
 LEAST_PEAK = 0.012
-"""A prompt that fits no place better than this is in doubt whatever the unrelated words do: all of them may
-fit even less. Present things reach 0.3 and more."""
+"""Prompts whose peak is below this are doubtful even if all unrelated words match less. Present things reach
+0.3 and more."""
 BEST = 0.005
-"""Share of the Gaussians that a prompt's fit is read from."""
+"""Share of the Gaussians that a prompt's peak is the mean of."""
 _AT_A_TIME = 4
-"""Unrelated words asked together."""
+"""Number of unrelated words that are queried together."""
 
 
 class Doubts:
     """Doubt about prompts in one scene.
 
     Args:
-        relevancy: of every Gaussian to queries, 0 where unknown: `QueryEngine.of_gaussians`.
-        queries: of texts as they are, without synonyms: `TextEncoder.plain_queries`.
+        relevancy: computes every Gaussian's relevancy, 0 where unknown (`QueryEngine.of_gaussians`).
+        queries: encodes texts as they are, without synonyms (`TextEncoder.plain_queries`).
     """
 
     def __init__(
@@ -56,9 +56,9 @@ class Doubts:
         self._relevancy, self._queries = relevancy, queries
 
     def of(self, relevancy: Float[Tensor, "q n"]) -> list[float]:
-        """For each prompt, from the relevancy of all Gaussians to it, the share of texts, itself among them,
-        that fit the scene at least as well: (1 + #{u ≥ prompt}) / (1 + 60). At most x with a probability of x
-        for an absent thing. 1 for a prompt that fits nowhere (`LEAST_PEAK`)."""
+        """Compute each prompt's doubt from the Gaussians' relevancy: the share of texts, itself among
+        them, that match the scene at least as well, (1 + #{u ≥ prompt}) / (1 + 60), or 1 below `LEAST_PEAK`.
+        For an absent thing, a doubt of at most x has a probability of at most x."""
         unrelated = self.unrelated
         return [
             (1 + int((unrelated >= peak).sum())) / (1 + len(unrelated)) if peak >= LEAST_PEAK else 1.0
@@ -67,23 +67,23 @@ class Doubts:
 
     @cached_property
     def unrelated(self) -> Float[Tensor, " u"]:
-        """How well the unrelated words fit: `peaks`. A few are asked at a time, since all of them to millions
-        of Gaussians would take gigabytes."""
-        self._queries(UNRELATED)  # encodes them together
+        """Peaks of the unrelated words (`peaks`). A few words are queried at a time, since the relevancy of
+        millions of Gaussians to all of them would take gigabytes."""
+        self._queries(UNRELATED)  # encodes all of them in one batch
         parts = [UNRELATED[i : i + _AT_A_TIME] for i in range(0, len(UNRELATED), _AT_A_TIME)]
         return torch.cat([peaks(self._relevancy(self._queries(part))) for part in parts])
 
 
 def peaks(relevancy: Float[Tensor, "q n"]) -> Float[Tensor, " q"]:
-    """How well each prompt fits where it fits best: the mean relevancy of the best 0.5 % of the Gaussians.
-    0 without Gaussians."""
+    """Compute each prompt's peak, the mean relevancy of the best 0.5 % of the Gaussians; 0 without Gaussians.
+    The share is rounded up, to one Gaussian at least."""
     if relevancy.shape[1] == 0:
         return relevancy.new_zeros(len(relevancy))
     return relevancy.topk(math.ceil(BEST * relevancy.shape[1]), dim=1).values.mean(1)
 
 
 def doubtful(text: str, doubt: float, taught: bool = False) -> str | None:
-    """A sentence about a doubtful prompt; None for the others. taught: whether it was taught by example."""
+    """Describe a doubtful prompt; return None for the others. taught: whether it was taught by example."""
     if doubt <= DOUBTFUL:
         return None
     if taught:

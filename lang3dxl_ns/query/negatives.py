@@ -1,5 +1,5 @@
-"""Negatives that prompts compete with: phrases that fit anything, other contents of building photos, and
-other parts of buildings."""
+"""Negatives that prompts compete with: phrases that match anything, other contents of photos of buildings,
+and parts of buildings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SURROUNDINGS: dict[str, tuple[str, ...]] = {
     "fence": ("railing", "gate"),
     "bridge": ("viaduct", "aqueduct"),
 }  # fmt: skip
-"""Each phrase with synonyms: prompts that use one of them don't compete with the phrase."""
+"""Phrases with synonyms. A prompt that uses a synonym does not compete with the phrase."""
 _PARTS: dict[str, tuple[str, ...]] = {
     "window": ("glass", "pane", "oculus", "lancet", "dormer", "tracery"),
     "door": ("portal", "doorway", "entrance", "entry", "gate", "gateway", "archway"),
@@ -35,25 +35,25 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "spire": ("steeple", "fleche", "pinnacle", "finial"),
     "dome": ("cupola",),
 }  # fmt: skip
-"""The same for parts of buildings; a part doesn't compete with its whole: windows and doors not with
-towers."""
+"""Parts of buildings with synonyms. A part does not compete with its whole either: prompts for windows and
+doors do not compete with "tower"."""
 _NAMED = {
     phrase: frozenset((*_SURROUNDINGS.get(phrase, ()), *_PARTS.get(phrase, ())))
     for phrase in (*_SURROUNDINGS, *_PARTS)
 }
 NEGATIVES = (*CANONICAL, *_NAMED)
-"""The default."""
+"""Default negatives of a scene."""
 NOTHING = ("sky", *CANONICAL)
-"""Phrases that fit best where there is nothing to name."""
+"""Phrases that match best at places with nothing to name."""
 CLEAR = 0.6
-"""Relevancy from which a word names a place that one of them fits best."""
+"""Relevancy above which a word still names a place where one of `NOTHING` is the closest negative."""
 
 
 def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:
-    """Indices of the phrases that a prompt competes with: those not named by it or its synonyms.
+    """Return the indices of the phrases that a prompt competes with: those that it does not name.
 
-    words: the prompt and its synonyms. A phrase is named by any of its words or their synonyms, in singular
-    or plural. If that leaves none, all phrases compete.
+    words: the prompt and its synonyms. A phrase is named by any of its words or their synonyms, singular or
+    plural. If all phrases are named, all compete.
     """
     named = {form for text in words for word in text.lower().split() for form in _singulars(word)}
     chosen = [i for i, phrase in enumerate(phrases) if not named & _meanings(phrase)]
@@ -66,7 +66,7 @@ def _meanings(phrase: str) -> set[str]:
 
 
 def _singulars(word: str) -> list[str]:
-    """A word, and what it may be the plural of."""
+    """Return a word and the words that it may be the plural of."""
     endings = (("s", ""), ("es", ""), ("ies", "y"), ("ves", "f"))
     word = word.strip(".,;:!?'\"()")
     return [word, *(word.removesuffix(plural) + one for plural, one in endings if word.endswith(plural))]

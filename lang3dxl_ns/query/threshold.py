@@ -1,4 +1,4 @@
-"""The relevancy from which a place matches a prompt, read off the scene itself."""
+"""Match threshold: the relevancy above which a place matches a prompt, derived from the scene itself."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from torch import Tensor
 from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 
 EVEN = 0.5
-"""Relevancy where prompt and negatives fit equally well."""
+"""Relevancy where prompt and negatives match equally well."""
 SHARE = 0.3
-"""Of the way from the median Gaussian's relevancy to a prompt's peak, where matches begin; chosen on
-landmarks for decisions (docs/lab/words.md)."""
+"""Where matches begin, as a fraction of the way from the median Gaussian's relevancy to a prompt's peak.
+Tuned on the validation landmarks (docs/lab/words.md)."""
 COVERED = 0.3
-"""Share of a pixel that matching Gaussians must cover: most matches are small, and edges blend."""
+"""Share of a pixel that matching Gaussians must cover; under half, as most are small and edges blend."""
 
 
 def match_thresholds(
     relevancy: Float[Tensor, "q n"], doubts: Sequence[float], named: Sequence[bool]
 ) -> tuple[float, ...]:
-    """For each prompt the relevancy above which Gaussians match.
+    """Compute for each prompt the relevancy above which Gaussians match.
 
-    Small and thin things blur with their surroundings in the crops that CLIP sees, and seldom beat every
-    negative there. So what stands out in the scene matches: at most `EVEN` is asked for, and that of doubtful
-    prompts, whose peaks mean nothing.
+    Small and thin things blur with their surroundings in CLIP's crops, and seldom beat every negative there.
+    So the threshold is relative to the scene, and never above `EVEN`. Doubtful prompts use `EVEN`, because
+    their peaks carry no information.
 
     Args:
-        relevancy: of all Gaussians to the prompts.
-        doubts: about the prompts, as `Doubts.of` tells.
-        named: whether a prompt names negatives of its own, which have to be beaten: `EVEN` again.
+        relevancy: relevancy of all Gaussians to the prompts.
+        doubts: the prompts' doubts (`Doubts.of`).
+        named: whether each prompt has negatives of its own. It then has to beat them, so it uses `EVEN`.
     """
     if relevancy.shape[1] == 0:
         return (EVEN,) * len(relevancy)
@@ -41,5 +41,5 @@ def match_thresholds(
 
 
 def matching(maps: Float[Tensor, "q ..."], thresholds: Sequence[float]) -> Bool[Tensor, "q ..."]:
-    """Where each prompt matches."""
+    """Return where each prompt's relevancy exceeds its threshold."""
     return maps > maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))
