@@ -1,13 +1,15 @@
-"""Training of the small CLIP's patch head: a linear map from its patch tokens to the space of its texts.
+"""Training of the small CLIP's patch head, which reads patch tokens as texts are read.
 
     python -m lab.clip_training.train_patches --cache DIR --photos FACADES --out lang3dxl_ns/demo/clip
 
-Both towers are frozen. A patch token sees the whole crop and stands for a sixteenth of its area, so a map of
-tokens is four times as fine as one of crop embeddings. Training takes about five minutes on one core.
+Both towers are frozen. The head sees every patch in windows of several sizes. Nearly all of the time goes to
+rendering landmarks (a second each) and reading views (half a second each); the fit takes three minutes.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,27 +18,42 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 import tyro
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from numpy import ndarray as Array
 from safetensors.torch import save_file
 from torch import Tensor
 
 from lab.clip_training.captions import CLASSES, MAY_BE, words_of
-from lab.clip_training.crops import augment, draw_crops, patch_labels
+from lab.clip_training.crops import augment, class_map
 from lab.clip_training.photos import store_photos
-from lab.clip_training.small_clip import GRID, IMAGE_SIZE, as_encoder, load_clip, normalize
-from lab.clip_training.views import SPLITS, LandmarkViews, ViewFolder, background_rendering
+from lab.clip_training.small_clip import GRID, PATCH, as_encoder, load_clip, normalize
+from lab.clip_training.views import COLOR, ELEMENT, PART, SPLITS, ViewFolder, background_rendering
+from lang3dxl_ns.preparation.dense_map import build_dense_map, nested_grids
+from lang3dxl_ns.preparation.families import patch_tokens
 from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model
-from lang3dxl_ns.preparation.patch_head import FILE
+from lang3dxl_ns.preparation.patch_head import FILE, PatchHead
 
-SIDES = (26, 140)
-"""Range of the crops' sides in pixels of a stored view, the same as for a scene's training photos."""
+SIDES = (20, 90)
+"""Range of the smallest windows' sides in pixels of a stored view, as in scenes of 480 to 1,024 pixels."""
+SIZES = 5
+"""Number of window sizes; the largest is 16 times as wide as the smallest, often the whole view."""
+HIDDEN = 256
+"""Width of the head's hidden layer."""
 PHOTO_SHARE = 0.1
-"""Weight of the photos in the loss. It is small, because a linear head cannot serve both worlds equally."""
-_AT_ONCE = 256
+"""Weight of the photos in the loss."""
+_PER_VIEW = 250  # patches kept of a view
+_AT_ONCE = 256  # windows encoded at once
+_BATCH = 2_048
+_RATE, _DECAY = 2e-3, 1e-4
 _SCALE = 10.0  # scale of the cosines in the softmax; a learned one grows, which harms domes and portals
-World = tuple[Float[Tensor, "n d"], Float[Tensor, "n k"]]
-"""Patch tokens, and the share of every class in each patch."""
 _DOUBT = 0.12  # share of a patch that may show a class without its label; above it the loss skips the class
+_LEAST_KNOWN = 0.3  # labeled share of a patch that is used
+_LEAST_SEEN = (
+    30  # number of patches below which a class of a view is as likely to be drawn as one with so many
+)
+Patches = tuple[Float[Tensor, "sizes n d"], Float[Tensor, "n k"]]
+"""Unit patch tokens, coarse to fine, and the share of every class in each patch."""
+View = UInt8[Array, "6 h w"]
 
 
 @dataclass(kw_only=True)
@@ -48,15 +65,17 @@ class PatchTraining:
     cache: Path
     """Folder for rendered views."""
     photos: Path | None = None
-    """Folder of labeled photos, which give a quarter as many crops as landmarks; none without it."""
-    landmarks: int = 100
+    """Folder of labeled photos; none without it."""
+    landmarks: int = 900
     """Number of training landmarks, with two views each."""
-    crops: int = 26_000
-    """Number of crops from landmarks to train on."""
-    steps: int = 900
+    most_photos: int = 800
+    """Most pictures of photos, each of which counts as taken and by daylight."""
+    steps: int = 4_000
     """Training steps, each with 2,048 patches from landmarks and as many from photos."""
+    processes: int = 1
+    """Processes that render landmarks."""
     seed: int = 0
-    """Random seed of crops and batches."""
+    """Random seed of patches and batches."""
 
     def main(self) -> None:
         torch.manual_seed(self.seed)
@@ -64,20 +83,24 @@ class PatchTraining:
         clip, tokenizer = load_clip(find_model(BUILTIN, CLIP_OPTION).folder, 0)
         clip.eval().requires_grad_(False)
         seeds = SPLITS["train"][100 : 100 + self.landmarks]
-        with background_rendering(self.cache / "patches", seeds, 2, 1) as tasks:
+        with background_rendering(self.cache / "patches", seeds, 2, self.processes) as tasks:
             for task in tasks:
                 task.result()
-        landmarks = ViewFolder(self.cache / "patches").landmarks
+        landmarks = ViewFolder(self.cache / "patches").landmarks[: self.landmarks]
         photos = store_photos(self.photos, self.cache / "photos", "train") if self.photos else []
-        worlds = [(read_patches(clip, landmarks, self.crops, self.seed), 1.0)]
+        rng = np.random.default_rng(self.seed)
+        worlds = [(read_patches(clip, [v for m in landmarks for v in m.views], rng), 1.0)]
         if photos:
-            of_photos = read_patches(clip, photos, self.crops // 4, self.seed + 1)
+            views = [view for photo in photos for view in photo.views]
+            chosen = [views[i] for i in rng.permutation(len(views))[: self.most_photos]]
+            of_photos = read_patches(clip, chosen, rng)
             worlds = [(worlds[0][0], 1 - PHOTO_SHARE), (of_photos, PHOTO_SHARE)]
         encoder = as_encoder(clip, tokenizer)
         texts = torch.stack([_unit(_unit(encoder.encode_texts(words_of(k)[:2])).mean(0)) for k in _classes()])
-        head = fit(worlds, texts, clip.visual_projection.weight, self.steps)
+        head = PatchHead(worlds[0][0][0].shape[-1], texts.shape[1], SIZES, HIDDEN)
+        fit(head, worlds, texts, self.steps)
         self.out.mkdir(parents=True, exist_ok=True)
-        save_file(head, self.out / FILE)
+        save_file({name: tensor.half() for name, tensor in head.state_dict().items()}, self.out / FILE)
 
 
 def _classes() -> range:
@@ -88,47 +111,68 @@ def _unit(x: Tensor) -> Tensor:
     return F.normalize(x, dim=-1)
 
 
-@torch.no_grad()
-def read_patches(clip: Any, views: list[LandmarkViews], count: int, seed: int) -> World:
-    """Compute the patch tokens of random crops, the head's inputs, and the share of every class in each."""
-    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    tokens, shares = [], []
-    for _ in range(count // _AT_ONCE):
-        crops = draw_crops(views, _AT_ONCE, 4, IMAGE_SIZE, rng, SIDES)
-        pixels = normalize(augment(crops.images, torch.from_numpy(crops.inside), generator))
-        hidden = clip.vision_model(pixel_values=pixels).last_hidden_state[:, 1:]
-        tokens.append(clip.vision_model.post_layernorm(hidden).flatten(0, 1))
-        shares.append(torch.from_numpy(patch_labels(crops, GRID)).float().flatten(0, 1))
-    return torch.cat(tokens), torch.cat(shares)
+def read_patches(clip: Any, views: Sequence[View], rng: np.random.Generator) -> Patches:
+    """Compute the head's inputs at random patches of views, and the share of every class in each. Views are
+    mirrored, their light and sharpness varied, and read at random sizes."""
+    generator = torch.Generator().manual_seed(int(rng.integers(2**31)))
+    tokens, shares, start = [], [], time.monotonic()
+    for number, view in enumerate(views):
+        found = _read_view(clip, view if rng.random() < 0.5 else view[..., ::-1], rng, generator)
+        tokens.append(found[0])
+        shares.append(found[1])
+        if (number + 1) % 100 == 0:
+            left = (time.monotonic() - start) / (number + 1) * (len(views) - number - 1)
+            print(f"{number + 1} of {len(views)} views read, {left / 60:.0f} min left", flush=True)
+    return torch.cat(tokens, 1), torch.cat(shares)
+
+
+def _read_view(clip: Any, view: View, rng: np.random.Generator, generator: torch.Generator) -> Patches:
+    colors = torch.from_numpy(view[COLOR].copy())[None]
+    everywhere = torch.ones(1, 1, 1, dtype=torch.bool)
+    photo = augment(colors, everywhere, generator)[0].permute(1, 2, 0)
+    side = round(float(np.exp(rng.uniform(*np.log(SIDES)))))
+    height, width = photo.shape[:2]
+    grids = nested_grids(height, width, GRID, side, SIZES)
+
+    def encode(windows: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n rows columns d"]:
+        return patch_tokens(clip, normalize(windows)).unflatten(1, (GRID, GRID))
+
+    maps = build_dense_map(photo, grids, encode, GRID, PATCH, _AT_ONCE, lambda sizes: sizes)
+    labels = torch.from_numpy(class_map(view[PART], view[ELEMENT]).astype(np.int64))
+    shown = F.one_hot(labels, len(CLASSES) + 1)[..., :-1].permute(2, 0, 1)[None].float()
+    shares = F.interpolate(shown, grids[-1], mode="area")[0].permute(1, 2, 0).flatten(0, 1)
+    most = shares.argmax(1)
+    known = shares.sum(1) > _LEAST_KNOWN
+    counts = most[known].bincount(minlength=len(CLASSES))
+    likely = known * (counts[most] + _LEAST_SEEN).rsqrt()
+    chosen = torch.multinomial(likely, min(_PER_VIEW, int(known.sum())), generator=generator)
+    return maps.flatten(1, 2)[:, chosen], shares[chosen]
 
 
 def fit(
-    worlds: list[tuple[World, float]],
-    texts: Float[Tensor, "k c"],
-    start: Float[Tensor, "c d"],
-    steps: int,
-) -> dict[str, Tensor]:
-    """Fit a weight and a bias that map tokens to the texts of the classes that patches show, by soft cross
-    entropy in which classes weigh 1 / √frequency. Classes that may be there without a label are ignored.
+    head: PatchHead, worlds: Sequence[tuple[Patches, float]], texts: Float[Tensor, "k c"], steps: int
+) -> None:
+    """Fit the head to map tokens to the texts of the classes that patches show, by soft cross entropy in
+    which classes weigh 1 / √frequency. Classes that may be there without a label are ignored.
 
     Args:
+        head: the head, which is trained in place.
         worlds: the patches of landmarks and of photos, each with its weight in the loss.
         texts: unit vector of every class.
-        start: initial weight, the CLIP's own projection.
         steps: number of optimizer steps.
     """
-    weight, bias = start.clone().requires_grad_(), torch.zeros(len(start), requires_grad=True)
-    optimizer = torch.optim.Adam([weight, bias], lr=2e-3)
+    optimizer = torch.optim.AdamW(head.parameters(), lr=_RATE, weight_decay=_DECAY)
     may_be = torch.from_numpy(MAY_BE[: len(CLASSES)]).float()
     found = [(*world, share, world[1].sum(0)) for world, share in worlds]
+    head.train()
     mean = 0.0
     for step in range(steps):
-        optimizer.param_groups[0]["lr"] = 2e-3 * (1 - step / steps)
+        optimizer.param_groups[0]["lr"] = _RATE * (1 - step / steps)
         loss = torch.zeros(())
         for tokens, shares, share, number in found:
-            batch = torch.randint(len(tokens), (2_048,))
+            batch = torch.randint(len(shares), (_BATCH,))
             shown = shares[batch]
-            logits = _SCALE * _unit(tokens[batch] @ weight.T + bias) @ texts.T
+            logits = _SCALE * _unit(head(tokens[:, batch])) @ texts.T
             hidden = ((shown @ may_be > _DOUBT) & (shown == 0)) | (number == 0)
             wanted = shown * (number.clamp_min(50) / number.sum()).rsqrt() * (number > 0)
             fits = (wanted * logits.masked_fill(hidden, -1e4).log_softmax(1)).sum() / wanted.sum()
@@ -137,9 +181,9 @@ def fit(
         loss.backward()
         optimizer.step()
         mean = loss.item() if not step else mean + 0.02 * (loss.item() - mean)
-        if (step + 1) % 100 == 0:
+        if (step + 1) % 500 == 0:
             print(f"step {step + 1}: loss {mean:.3f}", flush=True)
-    return {"weight": weight.detach(), "bias": bias.detach()}
+    head.eval()
 
 
 if __name__ == "__main__":

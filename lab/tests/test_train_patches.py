@@ -1,29 +1,42 @@
-"""The patch head's fit: patches are read as the texts of what they show, whatever their world's share."""
+"""The patch head's fit: patches are read as the texts of what they show, also where only their context tells."""
 
 from __future__ import annotations
 
+import pytest
 import torch
 import torch.nn.functional as F
 
 from lab.clip_training.captions import CLASSES, MAY_BE
 from lab.clip_training.train_patches import fit
+from lang3dxl_ns.preparation.patch_head import PatchHead
+
+WIDTH, CHANNELS, COUNT = 24, 32, 6_000
 
 
-def test_patches_are_read_as_the_texts_of_what_they_show():
+@pytest.mark.parametrize("told_by", ["patch", "context", "both"])
+def test_patches_are_read_as_the_texts_of_what_they_show(told_by):
+    """`both`: neither the patch nor its context tells alone what is shown, only their combination."""
     torch.manual_seed(0)
-    number, width, channels, count = len(CLASSES), 40, 32, 6_000
-    texts = F.normalize(torch.randn(number, channels), dim=-1)
-    centers = 3 * torch.randn(number, width)
+    number = len(CLASSES)
+    texts = F.normalize(torch.randn(number, CHANNELS), dim=-1)
     free = [k for k in range(number) if MAY_BE[k, :number].sum() <= MAY_BE[k, k]]  # may show nothing unnamed
-    assert len(free) > 2
-    shown = torch.tensor(free)[torch.randint(len(free), (count,))]
-    tokens = centers[shown] + 0.3 * torch.randn(count, width)
-    world = tokens, F.one_hot(shown, number).float()
-    start = 0.1 * torch.randn(channels, width)
-    head = fit([(world, 1.0)], texts, start, 300)
+    assert len(free) >= 4
+    free = free[:4]
+    kind = torch.randint(4, (COUNT,))
+    fine, coarse = {"patch": (kind, kind * 0), "context": (kind * 0, kind), "both": (kind % 2, kind // 2)}[
+        told_by
+    ]
+    centers = 3 * torch.randn(2, 4, WIDTH)
+    tokens = torch.stack([centers[0, coarse], centers[1, fine]]) + 0.3 * torch.randn(2, COUNT, WIDTH)
+    tokens = F.normalize(tokens, dim=-1)
+    shown = torch.tensor(free)[kind]
+    head = PatchHead(WIDTH, CHANNELS, 2, 16)
 
-    def right(weight: torch.Tensor, bias: torch.Tensor) -> float:
-        found = (F.linear(tokens, weight, bias) @ texts.T)[:, free].argmax(1)
-        return float((torch.tensor(free)[found] == shown).float().mean())
+    def right() -> float:
+        with torch.no_grad():
+            found = (head(tokens) @ texts.T)[:, free].argmax(1)
+        return float((found == kind).float().mean())
 
-    assert right(start, torch.zeros(channels)) < 0.6 < 0.95 < right(head["weight"], head["bias"])
+    before = right()
+    fit(head, [((tokens, F.one_hot(shown, number).float()), 1.0)], texts, 300)
+    assert before < 0.6 < 0.95 < right()

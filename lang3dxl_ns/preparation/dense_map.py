@@ -13,11 +13,12 @@ from torch import Tensor
 
 from lang3dxl_ns.common.memory import with_less_memory
 
-RULE = 1
+RULE = 2
 """Increased when the way maps are made changes, so that older ones are made again."""
 Grid = tuple[int, int]
 """Rows and columns of patches."""
 EncodePatches = Callable[[Float[Tensor, "n 3 h w"]], Float[Tensor, "n rows columns c"]]
+JoinSizes = Callable[[Float[Tensor, "sizes rows columns c"]], Float[Tensor, "rows columns f"]]
 
 _FINER = 1.75
 """Ratio of the fine size to the coarse one: two windows that overlap by a quarter cover 1.75."""
@@ -41,15 +42,24 @@ def map_grids(height: int, width: int, tokens: int, least: int) -> tuple[Grid, G
     return (a, b), (c, d)
 
 
-def fine_grid(height: int, width: int, tokens: int, side: int) -> Grid:
-    """Compute the grid of patches of a photo that is read in windows of `side` × `side` pixels.
+def nested_grids(height: int, width: int, tokens: int, side: int, sizes: int) -> tuple[Grid, ...]:
+    """Compute the grids of a photo's patches in windows of `side` pixels, twice that, and so on, coarse to
+    fine.
 
     Args:
         tokens: patches per side of a window.
-        side: a window's side in pixels of the photo; reduced where it exceeds the photo.
+        side: side of the smallest windows in pixels of the photo. A window is at most as large as the photo.
+        sizes: number of grids.
     """
-    rows, columns = (max(round(tokens * length / side), tokens) for length in (height, width))
-    return rows, columns
+    sides = [side * 2**n for n in reversed(range(sizes))]
+    return tuple(
+        (max(round(tokens * height / s), tokens), max(round(tokens * width / s), tokens)) for s in sides
+    )
+
+
+def mean_of_sizes(features: Float[Tensor, "sizes rows columns c"]) -> Float[Tensor, "rows columns c"]:
+    """Average the maps of all sizes."""
+    return features.mean(0)
 
 
 @torch.no_grad()
@@ -60,21 +70,23 @@ def build_dense_map(
     tokens: int,
     patch_size: int,
     batch_size: int,
-) -> Float[Tensor, "rows columns c"]:
-    """Build the map: patch features of unit length, blended at each size, averaged on the last grid.
+    join: JoinSizes = mean_of_sizes,
+) -> Float[Tensor, "rows columns f"]:
+    """Build the map: patch features of unit length, blended at each size, joined on the last grid.
 
     Args:
         photo: RGB in 0…1.
-        grids: grid of patches of each size, the finest last (`map_grids`, `fine_grid`).
+        grids: grid of patches of each size, the finest last (`map_grids`, `nested_grids`).
         encode: encodes windows of `tokens` patches per side, each of `patch_size` pixels (`encode_patches`).
         batch_size: windows encoded at once; fewer if memory runs out.
+        join: makes one map of those of all sizes, which are in the order of `grids`.
     """
-    total = torch.zeros(())
+    maps = []
     for grid in grids:
         one_size = partial(_one_size, photo, grid, encode, tokens, patch_size)
         features = with_less_memory(one_size, batch_size)
-        total = total + F.interpolate(features[None], grids[-1], mode="bilinear", align_corners=False)[0]
-    return (total / len(grids)).permute(1, 2, 0).contiguous()
+        maps.append(F.interpolate(features[None], grids[-1], mode="bilinear", align_corners=False)[0])
+    return join(torch.stack(maps).permute(0, 2, 3, 1)).contiguous()
 
 
 def _one_size(

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.families import FAMILIES, Family, input_side, vision_inputs
+from lang3dxl_ns.preparation.dense_map import mean_of_sizes
+from lang3dxl_ns.preparation.families import FAMILIES, Family, input_side, patch_tokens, vision_inputs
 from lang3dxl_ns.preparation.light import in_known_light
 from lang3dxl_ns.preparation.model_files import (
     BUILTIN,
@@ -69,7 +70,7 @@ class ImageTextEncoder:
         self.crop_size, self.patch_size = input_side(vision), int(vision.patch_size)
         self.identity, self.brightness = identity, brightness
         self._family: Family = FAMILIES[model.config.model_type]
-        self._patches = self._family.patches if head is None else head.patches
+        self._head = head
         self._model, self._tokenizer, self._resample = model, tokenizer, resample
         self._device = next(model.parameters()).device
         self._mean, self._std = _channels(mean, self._device), _channels(std, self._device)
@@ -93,13 +94,20 @@ class ImageTextEncoder:
 
     @torch.no_grad()
     def encode_patches(self, windows: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n rows columns c"]:
-        """Features of patches that can be compared with texts, of windows whose sides are whole patches. RGB
-        in 0…1; on the encoder's device."""
+        """Features of patches that `join_sizes` makes comparable with texts, of windows whose sides are whole
+        patches. RGB in 0…1; on the encoder's device."""
         rows, columns = (side // self.patch_size for side in windows.shape[-2:])
         windows = windows.to(self._device, torch.float32)
+        read = self._family.patches if self._head is None else patch_tokens
         with _precision_of_images(self._device):
-            patches = self._patches(self._model, (windows - self._mean) / self._std)
+            patches = read(self._model, (windows - self._mean) / self._std)
         return patches.float().unflatten(1, (rows, columns))
+
+    @torch.no_grad()
+    def join_sizes(self, features: Float[Tensor, "sizes rows columns d"]) -> Float[Tensor, "rows columns c"]:
+        """Make one map of those of windows of several sizes, coarse to fine: their mean, or what the head
+        reads in them."""
+        return mean_of_sizes(features) if self._head is None else self._head(features)
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Float[Tensor, "n c"]:
@@ -121,13 +129,15 @@ class ImageTextEncoder:
 
 @dataclass(frozen=True)
 class PatchReading:
-    """How an encoder makes a map of a photo, known from its configuration alone."""
+    """How an encoder makes a map of a photo, known from its files alone."""
 
     recipe: str
     tokens: int
     """Patches per side of its own input."""
-    beside_crops: bool
-    """Whether the map is averaged with the crops of training photos; otherwise it replaces all crops."""
+    sizes: int | None
+    """Number of window sizes that its head reads, each twice as large as the one before; None without one."""
+    fine_alone: bool
+    """Whether only training photos are read as maps. The crops of the others are the 2-D teacher."""
 
 
 def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
@@ -141,7 +151,8 @@ def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> Pat
     if features == "crops" or (by_crops and head is None):
         return None
     vision = read_config(files).vision_config
-    return PatchReading(head or family.recipe, input_side(vision) // vision.patch_size, by_crops)
+    recipe, sizes = head or (family.recipe, None)
+    return PatchReading(recipe, input_side(vision) // vision.patch_size, sizes, by_crops)
 
 
 def _family(files: ModelFiles) -> Family:

@@ -27,6 +27,12 @@ def own_patches(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Float[Tensor,
     return tokens[:, 1 + model.config.vision_config.num_register_tokens :]  # two class tokens come first
 
 
+def patch_tokens(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n p d"]:
+    """Compute a CLIPModel's patch tokens after the tower's last normalization, which a head reads."""
+    tower = model.vision_model
+    return tower.post_layernorm(tower(**vision_inputs(model, pictures)).last_hidden_state[:, 1:])
+
+
 def value_value_patches(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n p c"]:
     """Compute CLIP's patches with a last block that attends from values to values (CLIP Surgery, Li et al.
     2023), without its residual connection and feed-forward layer (ClearCLIP, Lan et al. 2024)."""

@@ -12,20 +12,18 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.image import resize
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation.crop_budget import USUAL_INPUT, Crops, choose_crops
-from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, fine_grid, map_grids
+from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids, nested_grids
 from lang3dxl_ns.preparation.encoders import (
     DenseEncoder,
     ImageTextEncoder,
@@ -41,7 +39,7 @@ from lang3dxl_ns.preparation.model_files import (
     read_config,
     spoken,
 )
-from lang3dxl_ns.preparation.pyramid import HALF, THIRD, build_clip_target
+from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -85,9 +83,7 @@ class _Task:
     fast: int
     """Number of crops with `--quality fast`."""
     grids: tuple[Grid, ...] | None
-    """Grids of the map of patch features, coarse to fine; None without a map."""
-    with_crops: bool
-    """Whether crops are encoded. If there is a map as well, the target is the mean of both."""
+    """Grids of the map of patch features, coarse to fine; None if crops are encoded instead."""
     kinds: set[str]
     """Kinds of all the photo's targets."""
     missing: dict[str, dict[str, Any]]
@@ -131,8 +127,8 @@ def prepare(
     pixel_sizes: world units per pixel *of the photo as it is read* (its `width`), by photo name; None for
     relative scales. scales: crop sides in world units, or in photo widths without pixel sizes.
     regions: source of label maps, or None. fine: names of photos that get small crops alone (`fine_crops`),
-    the smallest a third of their side apart, or half if the encoder has a head for patches or there would be
-    too many. If any photo is fine, only fine ones get dense features.
+    the smallest a third of their side apart, or half if there would be too many; or, if the encoder has a
+    head for patches, the map that it reads. If any photo is fine, only fine ones get dense features.
 
     Photos that cannot be read are left out with a warning. Raises UserError if none can be read, a model
     cannot be loaded, or the disk is too small.
@@ -188,20 +184,20 @@ def _plan(
         )
         grids: tuple[Grid, ...] | None = None
         source = _source(photo, content)
-        clip = {**source, "encoder": clip_model.identity, "crop_sides": crops.sides, "rule": _CROP_RULE}
-        if is_fine and crops.steps != THIRD:
-            clip["steps"] = crops.steps
-        with_crops = patches is None or patches.beside_crops
-        if patches is not None and not with_crops:
-            grids = map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
-            sides = sorted(math.ceil(photo.width / columns) for _, columns in grids)
-            clip = {**source, "encoder": clip_model.identity, "crop_sides": sides}
+        clip = {**source, "encoder": clip_model.identity}
+        if patches is not None and (is_fine or not patches.fine_alone):
+            if patches.sizes is None:
+                grids = map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
+            else:
+                side = crops.sides[0]
+                grids = nested_grids(photo.height, photo.width, patches.tokens, side, patches.sizes)
+            cells = grids if patches.sizes is None else grids[-1:]
+            clip["crop_sides"] = sorted(math.ceil(photo.width / columns) for _, columns in cells)
             clip |= {"patches": patches.recipe, "grids": grids, "rule": RULE}
-        elif patches is not None and is_fine:
-            descending = reversed(crops.sides)
-            grids = tuple(fine_grid(photo.height, photo.width, patches.tokens, side) for side in descending)
-            crops = replace(crops, steps=HALF)  # the map is finer, and costs as much as the crops in between
-            clip |= {"steps": HALF, "patches": patches.recipe, "grids": grids, "map_rule": RULE}
+        else:
+            clip |= {"crop_sides": crops.sides, "rule": _CROP_RULE}
+            if is_fine and crops.steps != THIRD:
+                clip["steps"] = crops.steps
         settings = {FINE if is_fine else CLIP: clip}
         if dense_model is not None and (is_fine or not fine):
             settings[DENSE] = {**source, "encoder": dense_model, "tokens": config.dense_tokens}
@@ -209,7 +205,7 @@ def _plan(
             settings[REGIONS] = {**source, **labels}
         missing = {kind: s for kind, s in settings.items() if not store.is_current(kind, photo.name, s)}
         fast_count = fast.count(photo.height, photo.width)
-        tasks.append(_Task(photo, crops, fast_count, grids, with_crops, set(settings), missing))
+        tasks.append(_Task(photo, crops, fast_count, grids, set(settings), missing))
     without = [task.photo.name for task in tasks if REGIONS not in task.kinds]
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
@@ -299,22 +295,18 @@ class _Maker:
             assert dense is not None
             return {"features": dense.encode(image)}
         assert clip is not None
-        lit, batch, crops = clip.in_known_light(image), self._config.crop_batch, task.crops
-        size, of_crops = clip.crop_size, None
-        if task.with_crops:
-            of_crops = build_clip_target(lit, crops.sides, clip.encode_images, size, batch, crops.steps)
-            if not task.grids:
-                return {"features": of_crops.features, "valid": of_crops.valid}
-        assert task.grids is not None
-        tokens = size // clip.patch_size
+        lit, batch, size = clip.in_known_light(image), self._config.crop_batch, clip.crop_size
+        if not task.grids:
+            crops = build_clip_target(
+                lit, task.crops.sides, clip.encode_images, size, batch, task.crops.steps
+            )
+            return {"features": crops.features, "valid": crops.valid}
+        tokens, patch = size // clip.patch_size, clip.patch_size
         windows = max(_PATCHES_PER_CROP * batch // tokens**2, 1)
-        patches = build_dense_map(lit, task.grids, clip.encode_patches, tokens, clip.patch_size, windows)
-        if of_crops is None:
-            return {"features": patches, "valid": torch.ones_like(patches[..., 0])}
-        grid = task.grids[-1]
-        features, valid = (resize(x, grid) for x in (of_crops.features, of_crops.valid[..., None]))
-        mean = (F.normalize(features, dim=-1) + F.normalize(patches, dim=-1)) / 2
-        return {"features": mean, "valid": valid[..., 0]}
+        features = build_dense_map(
+            lit, task.grids, clip.encode_patches, tokens, patch, windows, clip.join_sizes
+        )
+        return {"features": features, "valid": torch.ones_like(features[..., 0])}
 
     def announce(self, photos: int, device: str) -> None:
         """Log the work ahead and the disk, memory and time it needs. Raises UserError if the disk is too
@@ -347,7 +339,7 @@ class _Maker:
         self, clip: ImageTextEncoder, dense: DenseEncoder | None, device: torch.device
     ) -> None:
         """Log how many crops will be encoded and an estimate of the duration, measured with noise."""
-        config, tasks = self._config, [task for task in self._tasks if task.clip and task.with_crops]
+        config, tasks = self._config, [task for task in self._tasks if task.clip and not task.grids]
         crops = sum(task.count for task in tasks)
         if crops < _ANNOUNCED_CROPS:
             return

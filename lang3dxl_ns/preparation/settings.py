@@ -46,8 +46,8 @@ class PreparationConfig:
     clip_features: ClipFeatures = "auto"
     """How the image-text encoder reads photos. crops: one vector for each of thousands of crops. dense: a map
     of patch features in about ten passes. auto: dense if its patches were trained to match texts (TIPSv2),
-    otherwise crops; training photos are the mean of crops and patches if the encoder has a head for patches,
-    as the built-in one does."""
+    otherwise crops; training photos are read as maps if the encoder has a head for patches, as the built-in
+    one does."""
     dense: str = "auto"
     """Vision transformer whose patch tokens sharpen the features that crops blur: a name, a folder, or "none"
     to do without. auto: facebook/dinov2-small, or the built-in one with the built-in CLIP."""

@@ -225,7 +225,9 @@ def test_the_built_in_clip_can_be_read_densely():
     reading = patch_reading("builtin", "dense")
     assert reading is not None and reading.recipe.startswith("head ")
     encoder = load_image_text_encoder("builtin", "cpu")
-    assert encoder.encode_patches(torch.rand(1, 3, 48, 60)).shape == (1, 4, 5, 96)
+    assert reading.sizes is not None
+    tokens = encoder.encode_patches(torch.rand(reading.sizes, 3, 48, 60))
+    assert encoder.join_sizes(tokens).shape == (4, 5, 96)
 
 
 def test_a_tokenizer_that_cannot_be_read_names_what_to_install(folders, monkeypatch):

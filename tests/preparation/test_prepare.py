@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import errno
+import math
 import os
 import re
 import shutil
@@ -12,18 +13,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from PIL import Image
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 from lang3dxl_ns.common import console as progress
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.image import resize
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation import prepare as module
-from lang3dxl_ns.preparation.dense_map import build_dense_map, fine_grid, map_grids
+from lang3dxl_ns.preparation.dense_map import build_dense_map, map_grids, nested_grids
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
-from lang3dxl_ns.preparation.patch_head import FILE
+from lang3dxl_ns.preparation.patch_head import FILE, PatchHead
 from lang3dxl_ns.preparation.prepare import TargetReader, prepare
 from lang3dxl_ns.preparation.pyramid import build_clip_target
 from lang3dxl_ns.preparation.regions import FelzenszwalbRegions, FolderRegions, stored_labels
@@ -316,28 +315,26 @@ def test_dense_clip_features_take_the_place_of_crops(photos, config, store, call
     assert run(photos, replace(dense, dense_tokens=12), store).encoded == 3
 
 
-def test_training_photos_are_the_mean_of_crops_and_of_the_map_by_the_clips_patch_head(
-    photos, config, store, models
-):
+def test_training_photos_are_maps_by_the_clips_patch_head_and_others_crops(photos, config, store, models):
     from safetensors.torch import save_file
     from transformers import CLIPModel
 
-    weight = CLIPModel.from_pretrained(models["clip"]).visual_projection.weight.detach()
+    channels, width = CLIPModel.from_pretrained(models["clip"]).visual_projection.weight.shape
     folder = store.root.parent / "with_head"
     shutil.copytree(models["clip"], folder)
-    save_file({"weight": weight.clone(), "bias": torch.zeros(len(weight))}, folder / FILE)
+    save_file(PatchHead(width, channels, 3, 8).state_dict(), folder / FILE)
+    fine = prepare(photos, None, config, SCALES, store, "cpu", fine=[NAMES[1]]).reader
+    side, others = round(100 * fine.clip(NAMES[1]).crop_fractions[0]), fine.clip(NAMES[0])
     own = replace(config, clip=str(folder))
     reader = prepare(photos, None, own, SCALES, store, "cpu", fine=[NAMES[1]]).reader
     clip, found = load_image_text_encoder(folder, "cpu"), reader.clip(NAMES[1])
-    sides, photo = [round(share * 100) for share in found.crop_fractions], photos[1].read()
-    grids = [fine_grid(80, 100, 4, side) for side in reversed(sides)]
-    patches = build_dense_map(photo, grids, clip.encode_patches, 4, clip.patch_size, 1)
-    crops = build_clip_target(photo, sides, clip.encode_images, clip.crop_size, 8).features
-    crops = F.normalize(resize(crops, patches.shape[:2]), dim=-1)
-    expected = (crops + F.normalize(patches, dim=-1)) / 2
-    torch.testing.assert_close(found.features, expected.half(), atol=2e-3, rtol=2e-3)
-    others = prepare(photos, None, config, SCALES, store, "cpu", fine=[NAMES[1]]).reader
-    assert torch.equal(reader.clip(NAMES[0]).features, others.clip(NAMES[0]).features)  # as the 2-D teacher
+    grids = nested_grids(80, 100, 4, side, 3)
+    tokens = build_dense_map(
+        photos[1].read(), grids, clip.encode_patches, 4, clip.patch_size, 1, lambda sizes: sizes
+    )
+    torch.testing.assert_close(found.features, clip.join_sizes(tokens).half(), atol=2e-3, rtol=2e-3)
+    assert found.crop_fractions == [math.ceil(100 / grids[-1][1]) / 100]
+    assert torch.equal(reader.clip(NAMES[0]).features, others.features)  # as the 2-D teacher
 
 
 def test_without_dense_features_no_dense_entry_is_made_or_read(photos, config, store):
