@@ -48,8 +48,8 @@ class Ablation:
     seed are made before any of the next."""
     clip: str = "builtin"
     """CLIP to use: "builtin", a Hugging Face name or a folder."""
-    dense: str = "builtin"
-    """Dense encoder: "builtin", a Hugging Face name, a folder or "none"."""
+    dense: str = "auto"
+    """Dense encoder: "auto", "builtin", a Hugging Face name, a folder or "none"."""
     foreground: str = "none"
     """Foreground, with the choices of `lang3dxl prepare`; "none" uses the whole photo."""
     scale: float = 0.5

@@ -1,4 +1,4 @@
-"""The patch head's fit: patches are read as the texts of what they show, also where only their context tells."""
+"""The patch head's fit: patches are read as the texts of what they show, also if only their context tells."""
 
 from __future__ import annotations
 

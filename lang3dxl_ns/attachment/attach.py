@@ -81,8 +81,8 @@ def attach(
         raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
     if data is None and place is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
-    preparation = settled(config.preparation)
     option_prefix.set("--")
+    preparation = settled(config.preparation)
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
     stages = Stages(_SHARES if found is None else _SHARES | {"segment": 0.3})

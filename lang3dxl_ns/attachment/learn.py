@@ -20,10 +20,10 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.preparation.collection import prepare_collection
-from lang3dxl_ns.preparation.encoders import BUILTIN, CLIP_OPTION, find_model
+from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
-from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.rendering.render import composite
@@ -36,12 +36,8 @@ LONGER_SIDE = 800
 
 
 def settled(config: PreparationConfig) -> PreparationConfig:
-    """Return the settings for gathering features: fine crops, and the dense encoder that belongs to the
-    CLIP."""
-    dense = config.dense
-    if dense == "auto":
-        dense = BUILTIN if config.clip == BUILTIN else DENSE_MODEL
-    return replace(config, dense=dense, regions="none", crops="fine")
+    """Return the settings for gathering features: fine crops, and the dense encoder that the CLIP needs."""
+    return replace(config, dense=usual_dense(config, False), regions="none", crops="fine")
 
 
 def prepare_photos(

@@ -64,8 +64,8 @@ class Demo:
     """Take a third of the time, with fewer photos, views and iterations. Words are less accurate."""
     clip: str = "builtin"
     """CLIP to use: "builtin", a Hugging Face name, a folder, or "none" for colors only."""
-    dense: str = "builtin"
-    """Dense encoder to use, with the same choices."""
+    dense: str = "auto"
+    """Dense encoder to use, with the same choices, or "auto", which takes the one that the CLIP needs."""
     ns_train: str = ""
     """Extra flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.sky-gaussians 0"."""
 

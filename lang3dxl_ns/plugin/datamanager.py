@@ -38,14 +38,15 @@ from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, re
 from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
 from lang3dxl_ns.preparation.collection import CropPlan, plan_crops, prepare_collection
+from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.handover import Batch, SceneFacts
-from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model
+from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, Sources, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
-from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
@@ -95,10 +96,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
             self.crops = "fine" if gathered else "pyramid"
         if not learned or self.clip == "none":
             self.regions = "none"
-        if self.clip == "none":
-            self.dense = "none"
-        elif self.dense == "auto":
-            self.dense = BUILTIN if self.clip == BUILTIN else DENSE_MODEL
+        self.dense = "none" if self.clip == "none" else usual_dense(self, learned)
 
 
 _IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regions": torch.int64}

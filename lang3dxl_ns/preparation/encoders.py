@@ -33,6 +33,7 @@ from lang3dxl_ns.preparation.model_files import (
     whole,
 )
 from lang3dxl_ns.preparation.patch_head import PatchHead, head_recipe, read_patch_head
+from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _NORMALIZE_THEMSELVES = ("radio",)
@@ -153,6 +154,28 @@ def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> Pat
     vision = read_config(files).vision_config
     recipe, sizes = head or (family.recipe, None)
     return PatchReading(recipe, input_side(vision) // vision.patch_size, sizes, by_crops)
+
+
+def usual_dense(config: PreparationConfig, learned: bool) -> str:
+    """Resolve the dense encoder "auto" of a configuration.
+
+    Args:
+        config: settings; another name than "auto" is returned as it is.
+        learned: whether the semantics learn dense features, as in the paper, instead of sharpening by them.
+    """
+    if config.dense != "auto":
+        return config.dense
+    if not learned and _has_head(config):
+        return "none"
+    return BUILTIN if config.clip == BUILTIN else DENSE_MODEL
+
+
+def _has_head(config: PreparationConfig) -> bool:
+    try:
+        reading = patch_reading(config.clip, config.clip_features)
+    except UserError:  # `check_encoders` reports a missing CLIP, together with a missing dense encoder
+        return False
+    return reading is not None and reading.sizes is not None
 
 
 def _family(files: ModelFiles) -> Family:

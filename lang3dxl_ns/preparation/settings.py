@@ -49,8 +49,9 @@ class PreparationConfig:
     otherwise crops; training photos are read as maps if the encoder has a head for patches, as the built-in
     one does."""
     dense: str = "auto"
-    """Vision transformer whose patch tokens sharpen the features that crops blur: a name, a folder, or "none"
-    to do without. auto: facebook/dinov2-small, or the built-in one with the built-in CLIP."""
+    """Vision transformer whose patch tokens sharpen what crops blur; the paper's method learns them. A name,
+    a folder, or "none" to do without. auto: facebook/dinov2-small, or the built-in one with the built-in
+    CLIP; none where a head for patches reads the photos, since nothing is blurred then."""
     scale_range: tuple[float, float] | None = None
     """Sides of the smallest and largest crop, in COLMAP units ("physical") or in photo widths ("relative").
     Default: proposed from the scene."""
