@@ -15,14 +15,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lang3dxl_ns.common.console import progress
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
-from lang3dxl_ns.demo.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
-from lang3dxl_ns.demo.landmark.landmark import Landmark
-from lang3dxl_ns.demo.landmark.novel_cameras import choose_cameras
-from lang3dxl_ns.demo.landmark.photography import (
+from lab.landmark.demo_scene import DemoScene
+from lab.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
+from lab.landmark.landmark import Landmark
+from lab.landmark.novel_cameras import choose_cameras
+from lab.landmark.photography import (
     Shot,
     View,
     plain_view,
@@ -30,8 +27,8 @@ from lang3dxl_ns.demo.landmark.photography import (
     random_view,
     take_photo,
 )
-from lang3dxl_ns.demo.landmark.raycast import Camera
-from lang3dxl_ns.demo.landmark.sparse_model import (
+from lab.landmark.raycast import Camera
+from lab.landmark.sparse_model import (
     POINTS,
     Similarity,
     TakenPhoto,
@@ -39,6 +36,9 @@ from lang3dxl_ns.demo.landmark.sparse_model import (
     sample_points,
     write_model,
 )
+from lang3dxl_ns.common.console import progress
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 from lang3dxl_ns.scene.novel_views import FOLDER, write_novel_cameras
