@@ -54,7 +54,7 @@ def score_scene(
             of_published = None if scorer.smooths else published
             variants = scorer.variants(raw, keep, scene.engine.temperature, of_published)
             truths = truths_of(truth, photo.photo(), map_size(raw))
-            figures[photo.name] = scorer.scores_of(photo.name, variants, truths)
+            figures[photo.name] = scorer.scores(photo.name, variants, truths)
     masked = sum(photo.mask is not None for photo in photos)
     mask = f"predictions are 0 outside the foreground masks of {masked} of {len(photos)} photos"
     protocol = {

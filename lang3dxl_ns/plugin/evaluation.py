@@ -228,7 +228,7 @@ class Evaluation:
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
         evaluated.maps = inside(raw, keep)
         truths = truths_of(scorer.truth, photo, map_size(raw))
-        evaluated.metrics |= scorer.scores_of(photo.name, variants | {"teacher_": teacher}, truths)
+        evaluated.metrics |= scorer.scores(photo.name, variants | {"teacher_": teacher}, truths)
         evaluated.metrics |= bounds(inside(resized(limit(to_rasterizer(camera)), size), keep), truths)
 
     @torch.no_grad()

@@ -70,17 +70,12 @@ def write_novel_cameras(folder: Path, cameras: Sequence[TrackedPhoto], same_ligh
 
 
 def _tracked(view: dict) -> TrackedPhoto:
-    fx, fy, cx, cy = (float(value) for value in view["intrinsics"])
+    fx, fy, cx, cy = map(float, view["intrinsics"])
     lens = Lens(int(view["width"]), int(view["height"]), fx, fy, cx, cy)
     lens.check()
-    points = np.array(view["points"], dtype=np.float64).reshape(-1, 3)
     check_pose(view["camera_from_world"])
     pose = np.array(view["camera_from_world"], dtype=np.float64).reshape(3, 4)
-    x, y, z = pose @ np.column_stack([points, np.ones(len(points))]).T
-    return TrackedPhoto(
-        name=f"{FOLDER}/{view['name']}",
-        lens=lens,
-        camera_from_world=pose,
-        points=points,
-        pixels=np.column_stack([fx * x / z + cx, fy * y / z + cy]),
-    )
+    points = np.array(view["points"], dtype=np.float64).reshape(-1, 3)
+    x, y, z = pose[:, :3] @ points.T + pose[:, 3:]
+    pixels = np.column_stack([fx * x / z + cx, fy * y / z + cy])
+    return TrackedPhoto(f"{FOLDER}/{view['name']}", lens, pose, points, pixels)

@@ -39,11 +39,8 @@ def find_photos(data: Path) -> PhotoFolder:
     """
     if not data.is_dir():
         raise UserError(f"{data} is not a folder: give the folder with your photos, or a video")
-    for folder in (*(data / f for f in IMAGE_FOLDERS), data):
-        names = tuple(photos_below(folder))
-        if names:
-            return PhotoFolder(folder, names)
-    return PhotoFolder(data, ())
+    found = (PhotoFolder(f, tuple(photos_below(f))) for f in (*map(data.joinpath, IMAGE_FOLDERS), data))
+    return next((photos for photos in found if photos.names), PhotoFolder(data, ()))
 
 
 def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
