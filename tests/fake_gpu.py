@@ -430,7 +430,7 @@ def gsplat_stand_in(
 ):  # fmt: skip
     """gsplat.rasterization (1.4) of one camera, by the torch backend; asserts what gsplat's kernels want."""
     from lang3dxl_ns.rendering import Gaussians, rasterize
-    from lang3dxl_ns.rendering.ellipses import ALPHA_MIN
+    from lang3dxl_ns.rendering.gaussians import ALPHA_MIN
     from lang3dxl_ns.scene.camera import Camera
 
     given = means, quats, scales, opacities, colors, viewmats, Ks

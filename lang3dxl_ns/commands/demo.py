@@ -23,7 +23,7 @@ from lang3dxl_ns.common.stages import Stages
 
 if TYPE_CHECKING:
     from lang3dxl_ns.demo.picture import PictureRow
-    from lang3dxl_ns.evaluation.evaluated_photo import EvaluatedPhoto
+    from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
     from lang3dxl_ns.query.match import Match

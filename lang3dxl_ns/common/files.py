@@ -74,11 +74,9 @@ def read_array(path: Path) -> Any:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write to a temporary file beside `path`, then rename it, so that readers never see a partial file.
-
-    If the process is killed, the old content remains, beside a leftover .tmp file. A link stays a link. A
-    device (/dev/stdout) or a pipe is written to, and never replaced by a file.
-    """
+    """Write to a temporary file beside `path`, then rename it, so that readers never see a partial file. If
+    the process is killed, the old content remains, beside a leftover .tmp file. A link stays a link. A device
+    (/dev/stdout) or a pipe is written to, and never replaced by a file."""
     make_folder(path.parent)
     content = content.encode() if isinstance(content, str) else content
     if path.exists() and not path.is_file():

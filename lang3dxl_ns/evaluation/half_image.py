@@ -46,7 +46,7 @@ class HalfImage:
 
 @dataclass(frozen=True)
 class HalfImageProtocol:
-    """Half-image protocol for photos of one scene, whose Gaussians and looks are not changed."""
+    """Half-image protocol for photos of one scene, which is not changed."""
 
     splats: Splats
     field: AppearanceField
@@ -63,10 +63,8 @@ class HalfImageProtocol:
     def measure(
         self, camera: Camera, photo: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None
     ) -> HalfImage:
-        """Fit the look on a photo's left half (its foreground, given a mask), and score its right half.
-
-        The camera has the photo's size; colors are 0…1.
-        """
+        """Fit the look on a photo's left half (its foreground, given a mask), and score its right half. The
+        camera has the photo's size; colors are 0…1."""
         middle = photo.shape[1] // 2
         start = perf_counter()
         vector = self.fit(camera, photo[:, :middle], None if mask is None else mask[:, :middle])
@@ -86,9 +84,8 @@ class HalfImageProtocol:
         steps: int = STEPS,
     ) -> Float[Tensor, " v"]:
         """Fit the appearance vector to the leftmost columns of a photo, from the vector of an unseen view.
-
-        The loss is the color loss of training, on the mask's foreground. 0 steps return the initial vector.
-        """
+        The loss is the color loss of training, on the mask's foreground. 0 steps return the initial
+        vector."""
         camera = camera.to(self.splats.means.device)
         vector = Looks(self.field).of_view(camera).vector.clone().requires_grad_()
         view = Camera(camera.view_matrix, camera.intrinsics, left.shape[1], left.shape[0])

@@ -1,21 +1,48 @@
-"""Metrics of one photo: PSNR and LPIPS of its rendering; L1, PSNR and cosine of its decoded features."""
+"""Evaluated photo: PSNR and LPIPS of its rendering; L1, PSNR and cosine of its decoded features."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor, nn
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig
+from lang3dxl_ns.evaluation.scores import Maps
 
 ALEXNET = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
 """Address of the AlexNet weights that LPIPS uses, as torchvision publishes them."""
+
+
+@dataclass
+class EvaluatedPhoto:
+    """Figures of a photo, and the pictures behind them."""
+
+    name: str
+    metrics: dict[str, float]
+    """Figures of the photo: psnr etc., `render_seconds`, and with appearance `half_psnr` etc. With ground
+    truth also `query_seconds`, and `ap_{category}` etc. with the prefixes of `evaluation.aggregate`."""
+    images: dict[str, Tensor]
+    """Pictures by name: `img` (photo beside rendering, [H, 2W, 3]), with semantics `bottleneck`, and with
+    appearance `fitted`, the rendering in the look of the half-image protocol."""
+    maps: Maps
+    """Relevancy by category, as queries show it, at the size of scoring; empty without ground truth."""
+    masked: bool = False
+    """Whether the maps are restricted to a foreground mask."""
+
+    def write_pictures(self, folder: Path) -> None:
+        """Write every picture to `folder` as a JPEG named after the photo."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, image in self.images.items():
+            pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
+            Image.fromarray(pixels).save(folder / f"{self.name.replace('/', '_')}.{name}.jpg")
 
 
 def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
@@ -24,11 +51,9 @@ def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) ->
 
 
 class Lpips:
-    """LPIPS (AlexNet), loaded at first use.
-
-    It is skipped unless its weights are in torch's cache, because nothing is downloaded without a request. It
-    is not an nn.Module, so that AlexNet stays out of checkpoints.
-    """
+    """LPIPS (AlexNet), loaded at first use. It is skipped unless its weights are in torch's cache, because
+    nothing is downloaded without a request. It is not an nn.Module, so that AlexNet stays out of
+    checkpoints."""
 
     @cached_property
     def _metric(self) -> nn.Module | None:

@@ -30,11 +30,9 @@ _VOTERS = 7
 
 
 def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"]) -> float | None:
-    """Compute AP = Σ (R_n − R_{n−1}) P_n over all pixels as scikit-learn does; None without a positive.
-
-    Equal scores form one step, so the order of pixels does not matter. Raises ValueError on NaN or on shapes
-    that differ.
-    """
+    """Compute AP = Σ (R_n − R_{n−1}) P_n over all pixels as scikit-learn does; None without a positive. Equal
+    scores form one step, so the order of pixels does not matter. Raises ValueError on NaN or on shapes that
+    differ."""
     from sklearn.metrics import average_precision_score
 
     if score.shape != truth.shape:
@@ -182,10 +180,8 @@ def score_maps(
 
 def bounds(labels: Maps, truths: Mapping[str, Truth]) -> dict[str, float]:
     """Compute average precision by chance and at best, for every category in the photo.
-
     `chance_ap_{category}` is that of a map without information, the share of positives. `limit_ap_{category}`
-    is that of `labels`, the exact labels after lifting and rendering (`label_limit`).
-    """
+    is that of `labels`, the exact labels after lifting and rendering (`label_limit`)."""
     found: dict[str, float] = {}
     for category, truth in truths.items():
         best = average_precision(labels[category].cpu().numpy(), truth.mask)
@@ -234,9 +230,7 @@ class MapScorer:
         self, photo: str, variants: Mapping[str, Maps], truths: Mapping[str, Truth] | None = None
     ) -> dict[str, float]:
         """Compute `{prefix}{measure}_{category}` of maps by prefix, for every labeled category in the photo.
-
-        `truths` are the photo's labels at the size of the maps; by default they are read from the files.
-        """
+        `truths` are the photo's labels at the size of the maps; by default they are read from the files."""
         if truths is None:
             truths = self.truth.truths(photo, map_size(next(iter(variants.values()))))
         for category, truth in truths.items():

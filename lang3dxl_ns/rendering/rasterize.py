@@ -13,8 +13,7 @@ from torch import Tensor
 import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
-from lang3dxl_ns.rendering.ellipses import ALPHA_MIN, Ellipses
-from lang3dxl_ns.rendering.gaussians import Gaussians, Raster
+from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Ellipses, Gaussians, Raster
 from lang3dxl_ns.rendering.gsplat_backend import composite_with_gsplat
 from lang3dxl_ns.rendering.projection import project
 from lang3dxl_ns.rendering.torch_rasterizer import Compositing
@@ -83,26 +82,22 @@ def rasterize(
         detach_features = False  # spares a second pass
     gaussians, channels, features = _without_broken(gaussians, channels, features)
     camera, place = camera.at_origin(gaussians.means)
-    attached, detached = channels, channels[:, :0]
+    attached, detached, sizes = channels, channels[:, :0], [channels.shape[1]]
     if features is not None and detach_features:
         detached = features
     elif features is not None:
         attached = torch.cat([channels, features], dim=1)
+        sizes.append(features.shape[1])
     maps, detached_map, alpha, info = composite(
         gaussians.moved(-place), camera, attached, detached,
         depth=render_depth, antialiased=antialiased, absgrad=absgrad, near=near, eps2d=eps2d,
     )  # fmt: skip
-    count = channels.shape[1]
-    image, feature_map, depth = maps.split([count, attached.shape[1] - count, int(render_depth)], dim=2)
-    if features is None or detach_features:
-        feature_map = detached_map
-    return Raster(
-        image=image + (1 - alpha) * background,
-        features=None if features is None else feature_map,
-        alpha=alpha,
-        depth=depth / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None,
-        info=info,
-    )
+    image, *others = maps.split([*sizes, 1] if render_depth else sizes, dim=2)
+    depth = others.pop() / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None
+    feature_map = None
+    if features is not None:
+        feature_map = detached_map if detach_features else others[0]
+    return Raster(image + (1 - alpha) * background, feature_map, alpha, depth, info)
 
 
 def _best_backend(means: Tensor) -> Backend:

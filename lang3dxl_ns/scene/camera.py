@@ -88,6 +88,22 @@ class Lens:
         return Camera(view_matrix, self.matrix.float(), self.width, self.height)
 
 
+class HasLens:
+    """Base of what was taken with a lens."""
+
+    lens: Lens
+
+    @property
+    def width(self) -> int:
+        """Width in pixels."""
+        return self.lens.width
+
+    @property
+    def height(self) -> int:
+        """Height in pixels."""
+        return self.lens.height
+
+
 def check_pose(rows: Any) -> None:
     """Check a pose from a file: a [3, 4] or [4, 4] nested list of finite numbers, whose rotation changes no
     volume more than eightfold. Raises ValueError otherwise."""
@@ -164,10 +180,8 @@ def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
 
 @torch.no_grad()
 def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Return which Gaussians may be visible: all that are, and some that aren't.
-
-    The ball of 3.5 standard deviations around each is tested against the planes through the image's edges.
-    """
+    """Return which Gaussians may be visible: all that are, and some that aren't. The ball of 3.5 standard
+    deviations around each is tested against the planes through the image's edges."""
     points = means @ camera.view_matrix[:3, :3].T + camera.view_matrix[:3, 3]
     reach = 3.5 * scales.amax(dim=1)
     seen = points[:, 2] > 0
@@ -190,10 +204,8 @@ def resized(camera: Camera, longer_side: int) -> Camera:
 
 
 def with_longer_side(camera: Camera, pixels: int) -> Camera:
-    """Return the view at another resolution.
-
-    Raises UserError for a side below 1 or above `LONGEST_SIDE`, and if over half of the memory is needed.
-    """
+    """Return the view at another resolution. Raises UserError for a side below 1 or above `LONGEST_SIDE`, and
+    if over half of the memory is needed."""
     if not (isinstance(pixels, int) and 1 <= pixels <= LONGEST_SIDE):
         raise UserError(f"a picture of {pixels} pixels can't be rendered: give 1 to {LONGEST_SIDE}")
     width, height = scaled_size(camera.width, camera.height, pixels / max(camera.width, camera.height))
@@ -208,10 +220,8 @@ def with_longer_side(camera: Camera, pixels: int) -> Camera:
 
 
 def with_field_of_view(camera: Camera, degrees: float) -> Camera:
-    """Return the view through a centered lens with another vertical field of view and square pixels.
-
-    Raises UserError unless the field of view lies between 1 and 170 degrees.
-    """
+    """Return the view through a centered lens with another vertical field of view and square pixels. Raises
+    UserError unless the field of view lies between 1 and 170 degrees."""
     if not (isinstance(degrees, int | float) and 1 <= degrees <= 170):
         raise UserError(f"the field of view is {degrees}: give 1 to 170 degrees")
     focal = camera.height / 2 / math.tan(math.radians(degrees) / 2)

@@ -7,8 +7,6 @@ only evaluation reads them.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 
 FOLDER = "test_views"
-_CAMERAS = "cameras.json"
+CAMERAS = "cameras.json"
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,7 @@ class NovelViews:
 
 def read_novel_views(scene: Path) -> NovelViews | None:
     """Read a scene's test views; None if it has none. Raises UserError for a damaged cameras.json."""
-    path = scene / FOLDER / _CAMERAS
+    path = scene / FOLDER / CAMERAS
     if not path.is_file():
         return None
     try:
@@ -50,23 +48,6 @@ def read_novel_views(scene: Path) -> NovelViews | None:
         return NovelViews(path.parent, cameras, bool(content["same_light"]))
     except DAMAGE as error:
         raise UserError(f"{path} is damaged ({error!r}): make the scene again, or remove the file") from error
-
-
-def write_novel_cameras(folder: Path, cameras: Sequence[TrackedPhoto], same_light: bool) -> None:
-    """Write test_views/cameras.json into a scene's `folder`; views are named after their files."""
-    views = [
-        {
-            "name": g.name,
-            "width": g.width,
-            "height": g.height,
-            "intrinsics": [g.lens.fx, g.lens.fy, g.lens.cx, g.lens.cy],
-            "camera_from_world": g.camera_from_world.tolist(),
-            "points": g.points.round(6).tolist(),
-        }
-        for g in cameras
-    ]
-    content = {"same_light": same_light, "views": views}
-    (folder / FOLDER / _CAMERAS).write_text(json.dumps(content) + "\n")
 
 
 def _tracked(view: dict) -> TrackedPhoto:

@@ -45,10 +45,8 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
 
 def upright(tracked: TrackedPhoto, size: tuple[int, int], quarters: int) -> TrackedPhoto:
     """Turn a model's photo upright, whose file has a `size` (width, height) and `quarter_turns` as stored.
-
     Lens, pose and tracks are turned with the pixels. If the program that made the model had turned the photos
-    already, the shape of the model's camera differs from the stored pixels', and all are kept.
-    """
+    already, the shape of the model's camera differs from the stored pixels', and all are kept."""
     width, height = size
     fits_stored = (tracked.width > tracked.height) == (width > height)
     lens, pixels, camera = tracked.lens, tracked.pixels, tracked.camera_from_world

@@ -42,10 +42,8 @@ class MatchedPair:
 def doubtful_placements(
     rotations: Mapping[int, Float[Array, "3 3"]], pairs: Iterable[MatchedPair]
 ) -> dict[int, str]:
-    """Find photos that are doubtfully placed, with reasons; rotations: world → camera in the model.
-
-    Either more matches contradict a photo's placement than support it, or only one other photo supports it.
-    """
+    """Find photos that are doubtfully placed, with reasons; rotations: world → camera in the model. Either
+    more matches contradict a photo's placement than support it, or only one other photo supports it."""
     reasons: dict[int, str] = {}
     judged = [(pair, _apart(rotations, pair) > APART) for pair in pairs]
     while True:  # the most contradicted first, since its pairs would accuse its neighbors

@@ -49,12 +49,9 @@ _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min
 def reconstruct(
     photos: PhotoFolder, work: Path, model: Path, settings: ReconstructionSettings | None = None
 ) -> ReconstructionReport:
-    """Reconstruct photos, or resume an earlier attempt with the same photos and settings.
-
-    The largest model is written to `model`/0, others to `model`/1 …, and intermediate results to `work`.
-    Raises UserError for fewer than two photos, if `model` already exists, and if the photos do not make a
-    scene; the message says what to do.
-    """
+    """Reconstruct photos, or resume an earlier attempt with the same photos and settings (in `work`). The
+    largest model is written to `model`/0, others to `model`/1 …. Raises UserError that says what to do for
+    fewer than two photos, if `model` already exists, and if the photos do not make a scene."""
     settings = settings or ReconstructionSettings()
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
@@ -97,11 +94,8 @@ def reconstruct(
 def reconstruct_scene(
     data: Path, cache_dir: Path | None = None, settings: ReconstructionSettings | None = None
 ) -> tuple[Path, Path]:
-    """Reconstruct a folder of photos or a video, log the result, and return the scene's folder and model.
-
-    The model is written to sparse/0 in the scene's folder or, if sparse is taken or the folder is read-only,
-    to the cache. Raises UserError like `reconstruct` and `extract_frames`.
-    """
+    """Reconstruct a folder of photos or a video, and return the scene's folder and model: sparse/0 in it or,
+    if sparse is taken or the folder is read-only, in the cache. Raises UserError as `reconstruct` does."""
     data = expanded(data).absolute()
     if is_video(data):
         data = extract_frames(data)
@@ -123,7 +117,6 @@ def model_in(folder: Path) -> bool:
 
 def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     """Separate the readable photos, without duplicate files, from the others, for which reasons are given.
-
     Raises UserError if fewer than two photos are usable."""
     good, left_out = readable(photos)
     first: dict[bytes, str] = {}
@@ -155,7 +148,6 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
 
 def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     """Link the photos under numbers, in their order; formats that COLMAP can't read become converted copies.
-
     COLMAP separates names by spaces, so "photo 1.jpg" would be two names."""
     folder = work / "photos"
     shutil.rmtree(folder, ignore_errors=True)

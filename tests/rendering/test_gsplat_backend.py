@@ -5,7 +5,7 @@ import torch
 from splat_clouds import gradients, make_cloud, maps, relative_error
 
 from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.ellipses import ALPHA_MIN
+from lang3dxl_ns.rendering.gaussians import ALPHA_MIN
 from lang3dxl_ns.scene.camera import Camera
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
