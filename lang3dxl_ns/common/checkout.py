@@ -12,11 +12,8 @@ LAB = Path(__file__).parents[2] / "lab"
 
 
 def lab_module(name: str) -> ModuleType:
-    """Import a module of the laboratory, such as `lab.landmark.scene_writer`.
-
-    Raises:
-        UserError: the package is installed without it.
-    """
+    """Import a module of the laboratory, such as `lab.landmark.scene_writer`. Raises UserError where the
+    package is installed without it."""
     if not (LAB / "README.md").is_file():
         raise UserError(
             "this command comes with a checkout of the repository, not with the package: clone it, "

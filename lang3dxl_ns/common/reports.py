@@ -59,16 +59,13 @@ def command_line(command: str, settings: Any) -> str:
         elif isinstance(value, str) and value.startswith("-"):  # would be parsed as a flag
             words.append(f"--{name}={shlex.quote(value)}")
         else:
-            words += [f"--{name}", *(shlex.quote(str(item)) for item in _flatten(value))]
+            words += [f"--{name}", *_quoted(value)]
     return " ".join(words)
 
 
-def _flatten(value: Any) -> Iterable[Any]:
-    if isinstance(value, tuple | list):
-        for item in value:
-            yield from _flatten(item)
-    else:
-        yield value
+def _quoted(value: Any) -> list[str]:
+    nested = isinstance(value, tuple | list)
+    return [word for item in value for word in _quoted(item)] if nested else [shlex.quote(str(value))]
 
 
 def synchronize() -> None:
@@ -117,10 +114,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> s
 
 
 def write_report(folder: Path, name: str, markdown: str, data: Mapping[str, Any]) -> None:
-    """Write `name`.json and `name`.md into `folder` (created if missing), each atomically.
-
-    Raises:
-        ValueError: a figure is NaN or infinite, which JSON cannot hold.
-    """
+    """Write `name`.json and `name`.md into `folder` (created if missing), each atomically. Raises ValueError
+    for a figure that is NaN or infinite, which JSON cannot hold."""
     write_atomically(folder / f"{name}.json", json.dumps(data, indent=2, allow_nan=False) + "\n")
     write_atomically(folder / f"{name}.md", markdown.rstrip() + "\n")

@@ -21,10 +21,9 @@ _FIRST_ESTIMATE_S = 20.0
 class Stages:
     """Announcements of a command's stages, with an estimate of the time left for all of them.
 
-    Args:
-        shares: the stages in order, with their usual shares of the time.
-        path: file that keeps their seconds and peak memory, summed over interrupted commands. If None,
-            nothing is kept, and memory is not measured, because that resets the process's peak.
+    `shares` has the stages in order, with their usual shares of the time. The file `path` keeps their seconds
+    and peak memory, summed over interrupted commands. Without it, nothing is kept, and memory is not
+    measured, because that resets the process's peak.
     """
 
     def __init__(self, shares: Mapping[str, float], path: Path | None = None) -> None:

@@ -82,7 +82,7 @@ def _read_map(
     score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_gray(path, "map")) / 255
     if score.ndim == 3:
         score = strongest_level(score)
-    check_shape(path, score.shape, size)
+    check_shape(path, (score.shape[0], score.shape[1]), size)
     return resize_map(torch.from_numpy(score.astype(np.float32))[None], size)[0]
 
 

@@ -48,11 +48,10 @@ class Extension(NamedTuple):
 
 
 class Need(NamedTuple):
-    """A prerequisite of the build."""
+    """A prerequisite of the build; nothing was found if it is missing."""
 
     what: str
     found: str | None
-    """Description of what was found; None if it is missing."""
     remedy: str
 
 
@@ -69,7 +68,7 @@ def _package(name: str) -> list[Path]:
 
 
 def find_toolkit(cuda: str) -> Path | None:
-    """Find a toolkit of the major version of torch's CUDA ("13.2"): the environment's, else the system's."""
+    """Find a toolkit of the major version of torch's CUDA ("13.2")."""
     major = cuda.partition(".")[0]
     for home in _toolkit_places(major):
         with contextlib.suppress(OSError, subprocess.SubprocessError):
@@ -168,11 +167,8 @@ def built(folder: Path, name: str = "gsplat_cuda") -> Path | None:
 
 def build(extension: Extension, folder: Path, arch: str) -> Path:
     """Compile into a folder, with the output in build.log, and return the library. An interrupted build is
-    continued, and another process that builds there is waited for.
-
-    Raises:
-        UserError: something is missing, or the compiler failed.
-    """
+    continued, and another process that builds there is waited for. Raises UserError if something is missing,
+    or the compiler failed."""
     missing = [f"{need.what} is missing: {need.remedy}" for need in needs(folder) if need.found is None]
     if missing:
         raise UserError("gsplat's CUDA kernels can't be built here. " + ". ".join(missing))

@@ -76,15 +76,8 @@ class Splats:
         return self._mapped(lambda tensor: tensor[rows])
 
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Splats:
-        """Transform the Gaussians to another frame.
-
-        Args:
-            similarity: [[s·R, t], [0, 1]] from this frame to the other one, with a rotation R, a scale s > 0
-                and a translation t.
-
-        Raises:
-            ValueError: the matrix is not a similarity.
-        """
+        """Transform the Gaussians to another frame by [[s·R, t], [0, 1]], with a rotation R, a scale s > 0
+        and a translation t. Raises ValueError for another matrix."""
         from scipy.spatial.transform import Rotation
 
         turned = similarity[:3, :3].double().cpu()
