@@ -15,11 +15,11 @@ from difflib import get_close_matches
 from functools import reduce
 from importlib import import_module
 from importlib.metadata import version
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from lang3dxl_ns.common.checkout import lab_module
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
@@ -45,7 +45,7 @@ BENCHMARKS = {
 COMMANDS = {
     "demo": (
         "commands.demo:Demo",
-        "The full workflow in minutes, on a landmark that comes with the package.",
+        "The full workflow in minutes, on a generated landmark.",
     ),
     "reconstruct": ("commands.reconstruct:Reconstruct", "COLMAP model from photos, or a video."),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
@@ -62,7 +62,7 @@ COMMANDS = {
     "info": ("commands.info:Info", "Tell what a scene file holds, and where it comes from."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (
-        "commands.demo_scene:GenerateScene",
+        "lab.landmark.demo_scene:DemoScene",
         "Generate a demo scene: photos of a procedural landmark.",
     ),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),
@@ -160,14 +160,8 @@ def settings_of(place: str) -> Any:
         UserError: the command belongs to the lab, which is not installed here.
     """
     module, _, name = place.partition(":")
-    if not module.startswith("lab."):
-        module = f"lang3dxl_ns.{module}"
-    elif not (Path(__file__).parents[1] / "lab" / "README.md").is_file():
-        raise UserError(
-            "this command comes with a checkout of the repository, not with the package: clone it, "
-            "and install the clone with pip install -e"
-        )
-    return getattr(import_module(module), name)
+    found = lab_module(module) if module.startswith("lab.") else import_module(f"lang3dxl_ns.{module}")
+    return getattr(found, name)
 
 
 @contextlib.contextmanager

@@ -425,27 +425,30 @@ def _load_pretrained(cls, *args, **kwargs):
 
 
 def gsplat_stand_in(
-    means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane, eps2d, backgrounds,
-    packed, render_mode="RGB", rasterize_mode="classic", absgrad=False,
+    means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane, eps2d, packed,
+    render_mode="RGB", rasterize_mode="classic", absgrad=False,
 ):  # fmt: skip
     """gsplat.rasterization (1.4) of one camera, by the torch backend; asserts what gsplat's kernels want."""
     from lang3dxl_ns.rendering import Gaussians, rasterize
+    from lang3dxl_ns.rendering.gaussians import ALPHA_MIN
     from lang3dxl_ns.scene.camera import Camera
 
-    given = means, quats, scales, opacities, colors, viewmats, Ks, backgrounds
+    given = means, quats, scales, opacities, colors, viewmats, Ks
     assert all(tensor.is_cuda and tensor.dtype == torch.float32 for tensor in given)
     n, channels = colors.shape
     assert n > 0 and channels > 0 and not packed and type(width) is type(height) is int
-    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, channels), (1, 4, 4), (1, 3, 3), (1, channels)]
+    shapes = [(n, 3), (n, 4), (n, 3), (n,), (n, channels), (1, 4, 4), (1, 3, 3)]
     assert [tuple(tensor.shape) for tensor in given] == shapes
     with _uncounted():
         drawn = rasterize(
             Gaussians(means, quats, scales, opacities), Camera(viewmats[0], Ks[0], width, height), colors,
-            backgrounds[0], near=near_plane, eps2d=eps2d, antialiased=rasterize_mode == "antialiased",
-            absgrad=absgrad, render_depth=render_mode == "RGB+ED", backend="torch",
+            near=near_plane, eps2d=eps2d, antialiased=rasterize_mode == "antialiased",
+            absgrad=absgrad, render_depth=render_mode == "RGB+D", backend="torch",
         )  # fmt: skip
     _syncs["gsplat"] += 1  # the number of intersections, for which memory is allocated
-    image = drawn.image if drawn.depth is None else torch.cat([drawn.image, drawn.depth], dim=2)
+    image = drawn.image
+    if drawn.depth is not None:  # accumulated
+        image = torch.cat([image, drawn.depth * drawn.alpha.clamp_min(ALPHA_MIN / 2)], dim=2)
     return image[None], drawn.alpha[None], drawn.info
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from conftest import build_wheel
+from scenes import write_scene
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
@@ -27,10 +28,9 @@ def test_the_sdist_is_reproducible_and_makes_the_same_wheel(wheel, tmp_path):
 def test_commands_run_from_it_alone(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
-
+    write_scene(tmp_path / "scene", photos=4)
     commands = [
         "preset",
-        "demo-scene --out scene --photos 4 --test-views 0 --width 96 --height 72",
         "prepare --data scene --clip builtin --scale-range 0.5 1.5 --dense-tokens 8",
     ]
     code = "import lang3dxl_ns, sys; from lang3dxl_ns.cli import main; print(lang3dxl_ns.__file__)\n"
@@ -61,7 +61,7 @@ def test_commands_of_a_checkout_are_listed_and_tell_the_remedy(wheel, tmp_path):
     for listed, words in (("numerics", ["--help"]), ("ablation", ["benchmark", "--help"])):
         helped = lang3dxl(*words)
         assert helped.returncode == 0 and f"• {listed} " in helped.stdout
-    for words in (["numerics"], ["benchmark", "ablation"]):
+    for words in (["numerics"], ["benchmark", "ablation"], ["demo-scene"], ["demo"]):
         refused = lang3dxl(*words, "--out", "report")
         assert refused.returncode == 1
         assert refused.stderr.startswith("Error: this command comes with a checkout of the repository")

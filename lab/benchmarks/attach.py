@@ -114,5 +114,5 @@ def _scores(scene: Scene, scorer: LanguageScorer, views: list[Labeled]) -> Itera
             rendered = scene.draw(camera, channels).channels
             assert rendered is not None
             maps = scorer.named(scene.engine.maps(rendered, queries), size)
-            yield scorer.scores_of(name, {"": scorer.variants(maps)[""]})
+            yield scorer.scores(name, {"": scorer.variants(maps)[""]})
             advance()

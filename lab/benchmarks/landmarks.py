@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
+from lab.landmark.scene_writer import DemoScene, write_scene
 
 Family = Literal["cathedral", "mosque", "hall"]
 Landmarks = Literal["validation", "test"]

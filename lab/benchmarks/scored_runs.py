@@ -394,5 +394,5 @@ def _score_pictures(
     scored = []
     for photo in photos:
         maps = maps_of(photo, scorer.truth.scoring_size(photo.height, photo.width))
-        scored.append(scorer.scores_of(photo.name, scorer.variants(maps)))
+        scored.append(scorer.scores(photo.name, scorer.variants(maps)))
     return {f"{prefix}{name}": value for name, value in average(scored).items()}

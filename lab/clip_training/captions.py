@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from lang3dxl_ns.demo.landmark.labels import ELEMENTS, PARTS
-from lang3dxl_ns.demo.landmark.materials import MATERIALS
+from lab.landmark.labels import ELEMENTS, PARTS
+from lab.landmark.materials import MATERIALS
 from lang3dxl_ns.query.relevancy import CANONICAL
 
 PHOTO_CLASSES = ("facade", "road", "balcony", "fence", "shop", "sign")

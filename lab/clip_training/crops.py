@@ -13,8 +13,8 @@ from torch import Tensor
 
 from lab.clip_training.captions import CLASS, CLASSES, UNLABELED
 from lab.clip_training.views import COLOR, ELEMENT, MATERIAL, PART, LandmarkViews
-from lang3dxl_ns.demo.landmark.labels import PARTS
-from lang3dxl_ns.demo.landmark.materials import MATERIALS
+from lab.landmark.labels import PARTS
+from lab.landmark.materials import MATERIALS
 
 SIDES = (26, 320)
 """Range of the crops' sides in pixels of a stored view."""

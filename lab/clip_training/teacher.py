@@ -28,7 +28,7 @@ from lab.clip_training.views import (
     ViewFolder,
     background_rendering,
 )
-from lang3dxl_ns.demo.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, category_masks
+from lab.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, category_masks
 from lang3dxl_ns.evaluation.scores import average_precision
 from lang3dxl_ns.preparation.encoders import ImageTextEncoder, load_image_text_encoder
 from lang3dxl_ns.preparation.pyramid import build_clip_target

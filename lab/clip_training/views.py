@@ -56,8 +56,8 @@ class ViewFolder:
 
 def render_landmark(folder: Path, seed: int, views: int) -> Path:
     """Render wild views of a landmark into one file, each with its own light and weather."""
-    from lang3dxl_ns.demo.landmark.landmark import Landmark
-    from lang3dxl_ns.demo.landmark.photography import random_view, take_photo
+    from lab.landmark.landmark import Landmark
+    from lab.landmark.photography import random_view, take_photo
 
     landmark = Landmark.from_seed(seed)
     rng = np.random.default_rng((seed, 1))

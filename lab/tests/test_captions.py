@@ -15,8 +15,8 @@ from lab.clip_training.captions import (
     draw_caption,
     words_of,
 )
-from lang3dxl_ns.demo.landmark.labels import CATEGORIES
-from lang3dxl_ns.demo.landmark.materials import MATERIALS
+from lab.landmark.labels import CATEGORIES
+from lab.landmark.materials import MATERIALS
 from lang3dxl_ns.query.doubt import UNRELATED
 
 

@@ -18,8 +18,8 @@ from lab.clip_training.crops import (
     soft_labels,
 )
 from lab.clip_training.views import LandmarkViews
-from lang3dxl_ns.demo.landmark.labels import ELEMENT, PART
-from lang3dxl_ns.demo.landmark.materials import MATERIALS
+from lab.landmark.labels import ELEMENT, PART
+from lab.landmark.materials import MATERIALS
 
 TOWER, WALL, SKY, DOME = PART["tower"], PART["wall"], PART["sky"], PART["dome"]
 

@@ -9,10 +9,10 @@ from label_sets import box_object, write_labels
 
 from lab.benchmarks.kept_runs import KeptRuns
 from lab.benchmarks.published import HolyScenes, LerfOvs, PtOvs, published_figures
+from lab.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.presets import load_preset
-from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
 SMALL = {"clip": "builtin", "scale": 1.0, "ns_train": "--pipeline.model.decoder.compression.steps 40"}

@@ -13,9 +13,9 @@ from lab.clip_training.contrastive import caption_fit, contrastive_loss
 from lab.clip_training.teacher import score_teacher
 from lab.clip_training.train_clip import ClipTraining, learning_rate, train
 from lab.clip_training.views import render_landmark
+from lab.landmark.labels import CATEGORIES, ELEMENT, PART, category_masks
+from lab.landmark.materials import MATERIALS
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.landmark.labels import CATEGORIES, ELEMENT, PART, category_masks
-from lang3dxl_ns.demo.landmark.materials import MATERIALS
 from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
 
 

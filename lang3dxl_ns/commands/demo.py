@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich import get_console
 from rich.markdown import Markdown
 
+from lang3dxl_ns.common.checkout import lab_module
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
@@ -19,11 +20,10 @@ from lang3dxl_ns.common.files import expanded, read_json
 from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import Stages
-from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
 
 if TYPE_CHECKING:
     from lang3dxl_ns.demo.picture import PictureRow
-    from lang3dxl_ns.evaluation.evaluated_photo import EvaluatedPhoto
+    from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
     from lang3dxl_ns.query.match import Match
@@ -78,11 +78,15 @@ class Demo:
             sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
-        stages = Stages(SHARES, out / _STAGES)
-        if (out / "scene" / "scene.json").exists():
+        scene, stages = out / "scene", Stages(SHARES, out / _STAGES)
+        if kept := (scene / "scene.json").exists():
             say("scene: kept from an earlier command")
+        else:
+            generator = lab_module("lab.landmark.scene_writer")
         with stages.stage("scene"):
-            scene = self._scene(out)
+            if not kept:
+                settings = {"family": self.family, **self._wanted}
+                generator.write_scene(generator.DemoScene(out=scene, **settings))
         config = self._config(scene, out)
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
         trainer.stages = stages
@@ -145,15 +149,6 @@ class Demo:
         wanted["photos"] = photos if self.photos is None else self.photos
         wanted["test_views"] = views if self.test_views is None else self.test_views
         return wanted | ({} if self.family == "auto" else {"family": self.family})
-
-    def _scene(self, out: Path) -> Path:
-        """Return the scene in `out`, generating it if necessary."""
-        from lang3dxl_ns.demo.landmark.scene_writer import write_scene
-
-        folder = out / "scene"
-        if (folder / "scene.json").exists():
-            return folder
-        return write_scene(DemoScene(out=folder, **{"family": self.family, **self._wanted}))
 
     def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
         """Build the run's configuration, resuming from an earlier command's checkpoint if there is one."""

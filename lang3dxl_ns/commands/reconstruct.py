@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.scene.reconstruction_settings import ReconstructionSettings
+from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 
 @dataclass(kw_only=True)

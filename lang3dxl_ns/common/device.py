@@ -17,9 +17,8 @@ Moved = TypeVar("Moved", bound=Tensor)
 
 
 def to_device(tensor: Moved, device: torch.device | str) -> Moved:
-    """Copy a tensor to a device. Unlike `Tensor.to`, a copy to a GPU does not wait for the work that is
-    queued there. CUDA stages ordinary memory before it returns, so the source may be dropped or changed at
-    once."""
+    """Copy a tensor to a device. Unlike `Tensor.to`, a copy to a GPU does not wait for the work queued there.
+    The source may be changed at once, because CUDA stages ordinary memory before it returns."""
     return tensor.to(device, non_blocking=torch.device(device).type == "cuda")  # type: ignore[return-value]
 
 

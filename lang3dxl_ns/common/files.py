@@ -24,16 +24,11 @@ def open_file(path: Path) -> BinaryIO:
     """Open a regular file for reading. Raises OSError for anything else, because reading a pipe or a device
     may never end. The check is made on the opened file, so that it cannot be replaced in between."""
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-    file = os.fdopen(descriptor, "rb", closefd=True) if _is_regular(descriptor) else None
-    if file is None:
-        os.close(descriptor)
-        number = errno.EISDIR if path.is_dir() else errno.EINVAL
-        raise OSError(number, "it is not a regular file", str(path))
-    return file
-
-
-def _is_regular(descriptor: int) -> bool:
-    return stat.S_ISREG(os.fstat(descriptor).st_mode)
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    number = errno.EISDIR if path.is_dir() else errno.EINVAL
+    raise OSError(number, "it is not a regular file", str(path))
 
 
 def check_regular(path: Path) -> None:
@@ -64,39 +59,34 @@ def read_array(path: Path) -> Any:
     for anything else: other formats, pickles, and headers that announce more data than there is."""
     import numpy as np
 
+    form = np.lib.format
+    readers = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}
     with open_file(path) as file:
         try:
-            version = np.lib.format.read_magic(file)
-            readers = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }
-            shape, _, kind = readers[version](file)
+            shape, _, kind = readers[form.read_magic(file)](file)
             size = math.prod(shape) * kind.itemsize
         except Exception as error:  # numpy evaluates headers, which may fail in any way
             raise ValueError(f"its header is no array's: {type(error).__name__}") from error
         if kind.hasobject or size != os.fstat(file.fileno()).st_size - file.tell():
             raise ValueError("its header does not fit its size")
         file.seek(0)
-        return np.lib.format.read_array(file, allow_pickle=False)
+        return form.read_array(file, allow_pickle=False)
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write to a temporary file beside `path`, then rename it, so that readers never see a partial file.
-
-    If the process is killed, the old content remains, beside a leftover .tmp file. A link stays a link. A
-    device (/dev/stdout) or a pipe is written to, and never replaced by a file.
-    """
+    """Write to a temporary file beside `path`, then rename it, so that readers never see a partial file. If
+    the process is killed, the old content remains, beside a leftover .tmp file. A link stays a link. A device
+    (/dev/stdout) or a pipe is written to, and never replaced by a file."""
     make_folder(path.parent)
+    content = content.encode() if isinstance(content, str) else content
     if path.exists() and not path.is_file():
-        with path.open("wb") as stream:
-            stream.write(content.encode() if isinstance(content, str) else content)
+        path.write_bytes(content)
         return
     path = path.resolve()
     temporary = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())  # otherwise a crash may leave the new name without content
         os.replace(temporary, path)
@@ -110,17 +100,14 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 def replace_durably(partial: Path, path: Path) -> None:
     """Move a finished file over another one. A loss of power leaves one of the two intact."""
-    _to_disk(partial)
+    with partial.open("rb") as file:
+        os.fsync(file.fileno())
     os.replace(partial, path)
-    _to_disk(path.parent)
-
-
-def _to_disk(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+    folder = os.open(path.parent, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        os.fsync(folder)
     finally:
-        os.close(descriptor)
+        os.close(folder)
 
 
 def make_folder(folder: Path) -> None:

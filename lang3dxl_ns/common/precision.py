@@ -13,11 +13,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def in_full_precision(function: Function) -> Function:
-    """Run a function outside autocast, with 16-bit tensor arguments widened to float32.
-
-    This is for sums over thousands of pixels, differences of large numbers, and positions, which 16 bits
-    would make wrong, not just imprecise. Without autocast, it changes nothing.
-    """
+    """Run a function outside autocast, with 16-bit tensor arguments widened to float32. This is for sums over
+    thousands of pixels, differences of large numbers, and positions, which 16 bits would make wrong, not just
+    imprecise. Without autocast, it changes nothing."""
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:

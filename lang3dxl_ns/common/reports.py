@@ -23,23 +23,18 @@ if TYPE_CHECKING:  # imported where it is used, because --help does not need it
 Result = TypeVar("Result")
 
 
-# --- machine and command --------------------------------------------------------------------------------
-
-
 def describe_machine(device: torch.device | str = "cpu") -> str:
     """Describe where and when figures were measured: processor, cores, threads, versions, date."""
     import torch
 
+    gpu = [torch.cuda.get_device_name(device)] if torch.device(device).type == "cuda" else []
     parts = [
         _processor_name(),
         f"{os.cpu_count()} cores, {torch.get_num_threads()} thread(s) used",
         f"torch {torch.__version__}, Python {platform.python_version()}, {platform.system()}",
         date.today().isoformat(),
     ]
-    device = torch.device(device)
-    if device.type == "cuda":
-        parts.insert(0, torch.cuda.get_device_name(device))
-    return " · ".join(parts)
+    return " · ".join(gpu + parts)
 
 
 def _processor_name() -> str:
@@ -56,29 +51,21 @@ def command_line(command: str, settings: Any) -> str:
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         default = field.default_factory() if callable(field.default_factory) else field.default
-        if value != default:
-            words += _flag(field.name.replace("_", "-"), value)
+        name = field.name.replace("_", "-")
+        if value == default:
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{name}" if value else f"--no-{name}")
+        elif isinstance(value, str) and value.startswith("-"):  # would be parsed as a flag
+            words.append(f"--{name}={shlex.quote(value)}")
+        else:
+            words += [f"--{name}", *_quoted(value)]
     return " ".join(words)
 
 
-def _flag(name: str, value: Any) -> list[str]:
-    if isinstance(value, bool):
-        return [f"--{name}" if value else f"--no-{name}"]
-    words = [shlex.quote(str(item)) for item in _flatten(value)]
-    if isinstance(value, str) and value.startswith("-"):  # would be parsed as a flag
-        return [f"--{name}={words[0]}"]
-    return [f"--{name}", *words]
-
-
-def _flatten(value: Any) -> Iterable[Any]:
-    if isinstance(value, tuple | list):
-        for item in value:
-            yield from _flatten(item)
-    else:
-        yield value
-
-
-# --- time and memory ------------------------------------------------------------------------------------
+def _quoted(value: Any) -> list[str]:
+    nested = isinstance(value, tuple | list)
+    return [word for item in value for word in _quoted(item)] if nested else [shlex.quote(str(value))]
 
 
 def synchronize() -> None:
@@ -101,9 +88,6 @@ def host_peak(reset: bool = False) -> int:
     import resource  # absent on Windows
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
-
-
-# --- the report -----------------------------------------------------------------------------------------
 
 
 def progress_bar() -> Progress:
@@ -130,10 +114,7 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> s
 
 
 def write_report(folder: Path, name: str, markdown: str, data: Mapping[str, Any]) -> None:
-    """Write `name`.json and `name`.md into `folder` (created if missing), each atomically.
-
-    Raises:
-        ValueError: a figure is NaN or infinite, which JSON cannot hold.
-    """
+    """Write `name`.json and `name`.md into `folder` (created if missing), each atomically. Raises ValueError
+    for a figure that is NaN or infinite, which JSON cannot hold."""
     write_atomically(folder / f"{name}.json", json.dumps(data, indent=2, allow_nan=False) + "\n")
     write_atomically(folder / f"{name}.md", markdown.rstrip() + "\n")

@@ -21,10 +21,9 @@ _FIRST_ESTIMATE_S = 20.0
 class Stages:
     """Announcements of a command's stages, with an estimate of the time left for all of them.
 
-    Args:
-        shares: the stages in order, with their usual shares of the time.
-        path: file that keeps their seconds and peak memory, summed over interrupted commands. If None,
-            nothing is kept, and memory is not measured, because that resets the process's peak.
+    `shares` has the stages in order, with their usual shares of the time. The file `path` keeps their seconds
+    and peak memory, summed over interrupted commands. Without it, nothing is kept, and memory is not
+    measured, because that resets the process's peak.
     """
 
     def __init__(self, shares: Mapping[str, float], path: Path | None = None) -> None:
@@ -48,7 +47,7 @@ class Stages:
         self._current, self._start, self._tenths = name, time.perf_counter(), -1
         if self._path is not None:
             host_peak(reset=True)
-        self._announce()
+        self._announce(name)
 
     def end(self) -> None:
         """End the present stage, if there is one."""
@@ -68,7 +67,8 @@ class Stages:
         if self._current is None or int(10 * done) <= self._tenths or elapsed < _FIRST_ESTIMATE_S:
             return
         self._tenths = int(10 * done)
-        ahead = sum(self._shares[name] for name in self._later()) / self._shares[self._current]
+        shares = list(self._shares.values())[list(self._shares).index(self._current) :]
+        ahead = sum(shares[1:]) / shares[0]
         left = elapsed / done * (1 - done + ahead)
         if self._tenths < 10:
             say(f"{self._current}: {100 * done:.0f} % done; {roughly(left)} left in all")
@@ -85,17 +85,12 @@ class Stages:
             for kind in ("seconds", "peak_mb")
         }
 
-    def _later(self) -> list[str]:
-        assert self._current is not None
-        order = list(self._shares)
-        return order[order.index(self._current) + 1 :]
-
-    def _announce(self) -> None:
+    def _announce(self, name: str) -> None:
         """Say which stage begins and, from the second on, about how long everything left will take."""
-        order, later = list(self._shares), self._later()
-        place = len(order) - len(later) - 1
+        order = list(self._shares)
+        place = order.index(name)
         done = [stage for stage in order[:place] if stage in self._spent]
-        line = f"\n{place + 1} of {len(order)}: {order[place]}"
+        line = f"\n{place + 1} of {len(order)}: {name}"
         if done and self._path is not None:
             pace = sum(self._spent[s]["seconds"] for s in done) / sum(self._shares[s] for s in done)
             line += f" ({roughly(pace * sum(self._shares[s] for s in order[place:]))} left)"
@@ -103,7 +98,7 @@ class Stages:
 
 
 def _spent(path: Path) -> dict[str, dict[str, float]]:
-    """Read the figures of an earlier command; empty if damaged, because only an estimate needs them."""
+    """Read the figures of an earlier command; none if damaged, because only an estimate needs them."""
     try:
         found = read_json(path)
         return {n: {kind: float(f[kind]) for kind in ("seconds", "peak_mb")} for n, f in found.items()}

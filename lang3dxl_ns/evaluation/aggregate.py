@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -44,14 +46,12 @@ def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str
     """
     values = _by_name(photos)
     means: dict[str, Any] = {name: float(np.mean(found)) for name, found in values.items()}
-    totals: dict[str, float] = {}
-    for prefix in PREFIXES:
-        totals |= _mean_average_precision(means, prefix)
-        for measure, total in TOTALS.items():
-            start = f"{prefix}{measure}_"
-            pairs = [v for name, found in values.items() if name.startswith(start) for v in found]
-            if pairs:
-                totals[f"{prefix}{total}"] = float(np.mean(pairs))
+    totals = _mean_average_precisions(means)
+    for prefix, (measure, total) in product(PREFIXES, TOTALS.items()):
+        start = f"{prefix}{measure}_"
+        pairs = [v for name, found in values.items() if name.startswith(start) for v in found]
+        if pairs:
+            totals[f"{prefix}{total}"] = float(np.mean(pairs))
     counts = {f"{name}_photos": len(found) for name, found in values.items() if name.startswith("ap_")}
     if with_deviation:
         means |= {f"{n}_std": float(np.std(v, ddof=1)) if len(v) > 1 else 0.0 for n, v in values.items()}
@@ -59,31 +59,29 @@ def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str
 
 
 def _by_name(photos: Iterable[Figures]) -> dict[str, list[float]]:
-    values: dict[str, list[float]] = {}
+    values = defaultdict[str, list[float]](list)
     for photo in photos:
         for name, value in photo.items():
-            values.setdefault(name, []).append(value)
+            values[name].append(value)
     return values
 
 
-def _mean_average_precision(means: Figures, prefix: str) -> dict[str, float]:
-    """Compute `{prefix}map`, the unweighted mean of the categories' APs in `means`, if there are any."""
-    found = [value for name, value in means.items() if name.startswith(f"{prefix}ap_")]
-    return {f"{prefix}map": float(np.mean(found))} if found else {}
+def _mean_average_precisions(means: Figures) -> dict[str, float]:
+    """Compute `{prefix}map`, the unweighted mean of the categories' APs, for each prefix that has some."""
+    found = {p: [v for name, v in means.items() if name.startswith(f"{p}ap_")] for p in PREFIXES}
+    return {f"{prefix}map": float(np.mean(values)) for prefix, values in found.items() if values}
 
 
 def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
     """Aggregate figures of several scenes in the two ways in which a benchmark's table can be read.
 
-    `image_pooled` is `average` over the photos of all scenes, so that each photo counts alike (this matches
-    the published tables of HolyScenes). `scene_mean` is the mean over scenes of each scene's mean, so that
-    each scene with a category counts alike; its `map` is the mean of those over categories. `per_scene` has
-    means and totals of each scene.
+    In `image_pooled`, the `average` over all photos, each photo counts alike, as in the published tables of
+    HolyScenes. In `scene_mean`, the mean of the scenes' means, each scene with a category counts alike; its
+    `map` is the mean of those over categories. `per_scene` has the `average` of each scene.
     """
     per_scene = {name: average(photos) for name, photos in scenes.items()}
     values = _by_name(per_scene.values())
     means = {name: float(np.mean(v)) for name, v in values.items() if not name.endswith("_photos")}
-    for prefix in PREFIXES:
-        means |= _mean_average_precision(means, prefix)
+    means |= _mean_average_precisions(means)
     everything = [photo for photos in scenes.values() for photo in photos]
     return {"image_pooled": average(everything), "scene_mean": means, "per_scene": per_scene}

@@ -24,15 +24,13 @@ _READERS: dict[str, Callable[[Path], Annotations]] = {
 
 
 class GroundTruth:
-    """Labels of a scene's photos, by category.
+    """Labels of a scene's photos, by category. Raises UserError for a folder that is missing or holds
+    something else.
 
     Args:
-        folder: folder of one scene, which holds <category>/NNNN-gt.jpg ("holyscenes"), <photo>.json
-            ("lerf_ovs", also used by PT-OVS), or <prompt>/<photo>.png ("plain").
-        layout: one of these; "auto" detects it.
-
-    Raises:
-        UserError: the folder is missing or holds something else.
+        folder: folder of one scene.
+        layout: "holyscenes" (<category>/NNNN-gt.jpg), "lerf_ovs" (<photo>.json, also PT-OVS), or "plain"
+            (<prompt>/<photo>.png); "auto" detects it.
     """
 
     def __init__(self, folder: Path, layout: Layout | Literal["auto"] = "auto") -> None:
@@ -73,11 +71,8 @@ class GroundTruth:
         return (height, width) if self.layout == "lerf_ovs" else (max(height // 2, 1), max(width // 2, 1))
 
     def truths(self, photo: str, size: tuple[int, int]) -> dict[str, Truth]:
-        """Read the photo's labels by category, at `size` (height, width).
-
-        A category without a label in this photo was not annotated and is left out. Raises UserError for an
-        unreadable label, and for one whose aspect ratio is not the one of `size`.
-        """
+        """Read the photo's labels by category, at `size` (height, width), without categories that were not
+        annotated in it. Raises UserError for an unreadable label, and for one of another aspect ratio."""
         return {category: label.truth(size) for category, label in self._of(photo).items()}
 
     def masks(self, photo: str, size: tuple[int, int]) -> dict[str, Bool[Array, "h w"]]:
@@ -114,15 +109,10 @@ def held_out_photos(truth: GroundTruth, per_category: int = 5) -> list[str]:
     preferring those already chosen for another (Lang3D-XL's rule; its own list is not published). The rest
     are spread evenly over the category's photos, so the same labels always give the same list."""
     chosen: set[str] = set()
+    sizes = {photo: truth.scoring_size(*truth.size(photo)) for photo in truth.labeled}
     for category in sorted(truth.categories):
-        photos = [p for p in sorted(truth.photos(category)) if _shows(truth, p, category)]
-        wanted = per_category - len(chosen.intersection(photos))
+        photos = [p for p in sorted(truth.photos(category)) if truth.masks(p, sizes[p])[category].any()]
         left = [photo for photo in photos if photo not in chosen]
-        count = max(min(wanted, len(left)), 0)
+        count = max(min(per_category - (len(photos) - len(left)), len(left)), 0)
         chosen.update(left[(2 * i + 1) * len(left) // (2 * count)] for i in range(count))
     return sorted(chosen)
-
-
-def _shows(truth: GroundTruth, photo: str, category: str) -> bool:
-    size = truth.scoring_size(*truth.size(photo))
-    return bool(truth.truths(photo, size)[category].mask.any())

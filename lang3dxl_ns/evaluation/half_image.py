@@ -46,7 +46,7 @@ class HalfImage:
 
 @dataclass(frozen=True)
 class HalfImageProtocol:
-    """Half-image protocol for photos of one scene, whose Gaussians and looks are not changed."""
+    """Half-image protocol for photos of one scene, which is not changed."""
 
     splats: Splats
     field: AppearanceField
@@ -63,22 +63,15 @@ class HalfImageProtocol:
     def measure(
         self, camera: Camera, photo: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None
     ) -> HalfImage:
-        """Fit the look on a photo's left half, and score its right half.
-
-        Args:
-            camera: camera of the photo, at its size.
-            photo: colors of the photo, 0…1.
-            mask: foreground of the photo.
-        """
+        """Fit the look on a photo's left half (its foreground, given a mask), and score its right half. The
+        camera has the photo's size; colors are 0…1."""
         middle = photo.shape[1] // 2
         start = perf_counter()
         vector = self.fit(camera, photo[:, :middle], None if mask is None else mask[:, :middle])
         synchronize()
         seconds = perf_counter() - start
-        look = Look(self.field, vector)
-        rendering = render_in_look(
-            self.splats, camera, look, background=self.background, backend=self.backend
-        ).rgb
+        settings: dict[str, Any] = {"background": self.background, "backend": self.backend}
+        rendering = render_in_look(self.splats, camera, Look(self.field, vector), **settings).rgb
         scores = self.metrics(rendering[:, middle:], photo[:, middle:])
         figures = {f"half_{name}": value for name, value in scores.items()} | {"fit_seconds": seconds}
         return HalfImage(vector, rendering, figures)
@@ -90,16 +83,9 @@ class HalfImageProtocol:
         mask: Bool[Tensor, "h w"] | None = None,
         steps: int = STEPS,
     ) -> Float[Tensor, " v"]:
-        """Fit the appearance vector to the left part of a photo, from the vector of an unseen view.
-
-        The loss is the color loss of training.
-
-        Args:
-            camera: camera of the photo.
-            left: the leftmost w columns of the photo, 0…1.
-            mask: foreground of these columns.
-            steps: number of steps; 0 returns the initial vector.
-        """
+        """Fit the appearance vector to the leftmost columns of a photo, from the vector of an unseen view.
+        The loss is the color loss of training, on the mask's foreground. 0 steps return the initial
+        vector."""
         camera = camera.to(self.splats.means.device)
         vector = Looks(self.field).of_view(camera).vector.clone().requires_grad_()
         view = Camera(camera.view_matrix, camera.intrinsics, left.shape[1], left.shape[0])

@@ -30,12 +30,9 @@ def label_limit(
 ) -> Callable[[Camera], Maps]:
     """Return a function from a view to its maps by category, at the size of the rendering."""
     shares = lifted_labels(splats, views, categories, backend)
-
-    def maps(camera: Camera) -> Maps:
-        found = composite(splats, camera, shares, backend)
-        return dict(zip(categories, found.permute(2, 0, 1), strict=True))
-
-    return maps
+    return lambda camera: dict(
+        zip(categories, composite(splats, camera, shares, backend).permute(2, 0, 1), strict=True)
+    )
 
 
 def lifted_labels(

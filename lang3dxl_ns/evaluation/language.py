@@ -14,11 +14,8 @@ from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextConfig, TextEncoder
 
 
 class LanguageScorer(MapScorer):
-    """Scorer of relevancy maps for a scene's categories, which treats the 3D field and its 2D teacher alike.
-
-    The prompts are the category names. The teacher is the photo's own CLIP target, from which the field would
-    have learned if the photo had been used in training.
-    """
+    """Scorer of relevancy maps for a scene's categories, whose names are the prompts. It treats the 3D field
+    and its 2D teacher, the photo's own CLIP target, alike."""
 
     def __init__(self, truth: GroundTruth, encode_texts: EncodeTexts) -> None:
         super().__init__(truth)

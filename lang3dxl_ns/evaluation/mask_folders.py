@@ -15,13 +15,7 @@ import numpy as np
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.evaluation.annotations import (
-    PICTURES,
-    Annotations,
-    Truth,
-    check_shape,
-    read_gray,
-)
+from lang3dxl_ns.evaluation.annotations import PICTURES, Annotations, Truth, check_shape, read_gray
 
 _MASK, _PHOTO = "-gt", "-img"
 
@@ -58,10 +52,8 @@ def is_holyscenes(folder: Path) -> bool:
 
 
 def read_holyscenes(folder: Path) -> Annotations:
-    """Read the masks of a scene in HolyScenes' layout.
-
-    Raises UserError for a folder without masks, a category without any, and a photo without its mask.
-    """
+    """Read the masks of a scene in HolyScenes' layout. Raises UserError for a folder without masks, also a
+    category's, and for a photo without its mask."""
     if not is_holyscenes(folder):
         deeper = next(folder.glob(f"**/*{_MASK}.*"), None)
         hint = f"; there are masks in {deeper.parent}: pass the folder above that" if deeper else ""
@@ -71,10 +63,8 @@ def read_holyscenes(folder: Path) -> Annotations:
         )
     found = {}
     for category, pictures in _categories(folder):
-        masks = [path for path in pictures if path.stem.endswith(_MASK)]
-        found[category.name] = _by_photo(
-            category, [(path.stem.removesuffix(_MASK), MaskFile(path, dark=True)) for path in masks]
-        )
+        masks = [(p.stem.removesuffix(_MASK), p) for p in pictures if p.stem.endswith(_MASK)]
+        found[category.name] = _by_photo(category, masks, dark=True)
         for path in pictures:
             if path.stem.endswith(_PHOTO) and path.stem.removesuffix(_PHOTO) not in found[category.name]:
                 mask = path.with_name(path.name.replace(_PHOTO, _MASK))
@@ -83,15 +73,12 @@ def read_holyscenes(folder: Path) -> Annotations:
 
 
 def read_plain(folder: Path) -> Annotations:
-    """Read the plain masks of a scene.
-
-    Raises UserError for a folder without masks, and for a prompt without any.
-    """
+    """Read the plain masks of a scene. Raises UserError for a folder without masks, also a prompt's."""
     found = {}
     for category, pictures in _categories(folder):
         if category.name != "images":
-            named = [(path.relative_to(category).with_suffix("").as_posix(), path) for path in pictures]
-            found[category.name] = _by_photo(category, [(name, MaskFile(path)) for name, path in named])
+            masks = [(path.relative_to(category).with_suffix("").as_posix(), path) for path in pictures]
+            found[category.name] = _by_photo(category, masks)
     if not found:
         raise UserError(
             f"{folder} holds no ground truth: make a folder for each prompt, and in it a mask for each photo "
@@ -108,12 +95,12 @@ def _categories(folder: Path) -> Iterator[tuple[Path, list[Path]]]:
             yield category, sorted(p for p in found if p.is_file() and not p.name.startswith("."))
 
 
-def _by_photo(category: Path, masks: list[tuple[str, MaskFile]]) -> dict[str, MaskFile]:
+def _by_photo(category: Path, masks: list[tuple[str, Path]], dark: bool = False) -> dict[str, MaskFile]:
     if not masks:
         raise UserError(f"{category} holds no mask: add one, or remove this category's folder")
     found: dict[str, MaskFile] = {}
-    for photo, mask in masks:
+    for photo, path in masks:
         if photo in found:
-            raise UserError(f"{found[photo].path} and {mask.path} label the same photo: remove one")
-        found[photo] = mask
+            raise UserError(f"{found[photo].path} and {path} label the same photo: remove one")
+        found[photo] = MaskFile(path, dark)
     return found

@@ -57,7 +57,7 @@ def score_predictions(
             size = truth.scoring_size(*truth.size(key))
             truths = truth.truths(key, size)
             found: Maps = {c: _read_map(maps, (c, folders[c]), key, size) for c in truths}
-            figures[key] = scorer.scores_of(key, scorer.variants(found, keeps[key], temperature), truths)
+            figures[key] = scorer.scores(key, scorer.variants(found, keeps[key], temperature), truths)
     masked = sum(keep is not None for keep in keeps.values())
     statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"
     protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(
@@ -82,8 +82,7 @@ def _read_map(
     score = _read_array(path) if path.suffix == ".npy" else np.asarray(read_gray(path, "map")) / 255
     if score.ndim == 3:
         score = strongest_level(score)
-    height, width = score.shape
-    check_shape(path, (height, width), size)
+    check_shape(path, (score.shape[0], score.shape[1]), size)
     return resize_map(torch.from_numpy(score.astype(np.float32))[None], size)[0]
 
 

@@ -23,10 +23,8 @@ _OTHERS = (
 
 
 def read_results(path: Path) -> tuple[str, dict[str, Any]]:
-    """Read scene and results of a report, also one in the form of `ns-eval`.
-
-    Raises UserError for another file, and for figures that are not numbers.
-    """
+    """Read scene and results of a report, also one in the form of `ns-eval`. Raises UserError for another
+    file, and for figures that are not numbers."""
     try:
         content = read_json(path)
         results = content["results"]

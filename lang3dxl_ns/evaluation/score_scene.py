@@ -23,20 +23,9 @@ SceneSplit = Literal["held-out", "seen", "all"]
 def score_scene(
     scene: Scene, truth: GroundTruth, split: SceneSplit = "all"
 ) -> tuple[dict[str, dict[str, float]], dict[str, Any]]:
-    """Render the labeled photos' views and score the words in them, as `ns-eval` does.
-
-    Args:
-        scene: the scene.
-        truth: labels of its photos.
-        split: photos held out of training, photos used in it, or both.
-
-    Returns:
-        The figures of each photo (`ap_{category}` etc., see `evaluation.aggregate`), and the protocol that
-            explains them.
-
-    Raises:
-        UserError: the scene has colors only, or no photo of the split has a label.
-    """
+    """Render the labeled views of a split and score the words in them, as `ns-eval` does. Return the figures
+    of each photo (`ap_{category}` etc., see `evaluation.aggregate`), and the protocol that explains them.
+    Raises UserError for a scene of colors only, and if no photo of the split has a label."""
     photos = labeled_photos(scene, truth, split)
     scorer = LanguageScorer(truth, scene.text.vectors)
     words = [scene.words.get(known_word(category)) for category in truth.categories]
@@ -54,7 +43,7 @@ def score_scene(
             of_published = None if scorer.smooths else published
             variants = scorer.variants(raw, keep, scene.engine.temperature, of_published)
             truths = truths_of(truth, photo.photo(), map_size(raw))
-            figures[photo.name] = scorer.scores_of(photo.name, variants, truths)
+            figures[photo.name] = scorer.scores(photo.name, variants, truths)
     masked = sum(photo.mask is not None for photo in photos)
     mask = f"predictions are 0 outside the foreground masks of {masked} of {len(photos)} photos"
     protocol = {

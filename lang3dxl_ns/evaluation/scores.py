@@ -29,15 +29,10 @@ SMOOTH_THRESHOLD = 0.4
 _VOTERS = 7
 
 
-# ── one map ─────────────────────────────────────────────────────────────────────────────────────────────
-
-
 def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"]) -> float | None:
-    """Compute AP = Σ (R_n − R_{n−1}) P_n over all pixels as scikit-learn does; None without a positive.
-
-    Equal scores form one step, so the order of pixels does not matter. Raises ValueError on NaN or on shapes
-    that differ.
-    """
+    """Compute AP = Σ (R_n − R_{n−1}) P_n over all pixels as scikit-learn does; None without a positive. Equal
+    scores form one step, so the order of pixels does not matter. Raises ValueError on NaN or on shapes that
+    differ."""
     from sklearn.metrics import average_precision_score
 
     if score.shape != truth.shape:
@@ -109,9 +104,6 @@ def strongest_level(levels: Float[Array, "l h w"]) -> Float[Array, "h w"]:
     return levels[int(np.argmax(peaks))]
 
 
-# ── all maps of a photo ─────────────────────────────────────────────────────────────────────────────────
-
-
 def resize_map(image: Float[Tensor, "n H W"], size: tuple[int, int]) -> Float[Tensor, "n h w"]:
     """Resize maps or feature channels to (height, width), bilinearly."""
     if tuple(image.shape[-2:]) == size:
@@ -145,7 +137,7 @@ def inside(maps: Maps, keep: Bool[Tensor, "H W"] | None) -> Maps:
 
 def as_published(maps: Maps) -> Maps:
     """Process every (masked) map as Lang3D-XL does: 0 up to 0.5, the rest stretched to 0…1 by the photo's
-    maximum, then blurred. Except for the blur, all rejected pixels tie."""
+    maximum, then blurred. So all rejected pixels tie, but for the blur."""
 
     def process(score: Float[Array, "h w"]) -> Float[Array, "h w"]:
         floor = max(float(score.min()), THRESHOLD)
@@ -188,18 +180,14 @@ def score_maps(
 
 def bounds(labels: Maps, truths: Mapping[str, Truth]) -> dict[str, float]:
     """Compute average precision by chance and at best, for every category in the photo.
-
-    `chance_ap_{category}` is the one of a map without information, the share of positives.
-    `limit_ap_{category}` is the one of `labels`, the exact labels after lifting and rendering
-    (`label_limit`).
-    """
+    `chance_ap_{category}` is that of a map without information, the share of positives. `limit_ap_{category}`
+    is that of `labels`, the exact labels after lifting and rendering (`label_limit`)."""
     found: dict[str, float] = {}
     for category, truth in truths.items():
-        if truth.mask.any():
-            found[f"chance_ap_{category}"] = float(truth.mask.mean())
-            best = average_precision(labels[category].cpu().numpy(), truth.mask)
-            assert best is not None  # the truth has a positive
-            found[f"limit_ap_{category}"] = best
+        best = average_precision(labels[category].cpu().numpy(), truth.mask)
+        if best is not None:
+            chance = float(truth.mask.mean())
+            found |= {f"chance_ap_{category}": chance, f"limit_ap_{category}": best}
     return found
 
 
@@ -239,28 +227,20 @@ class MapScorer:
         return {"": inside(blurred(raw), keep), "raw_": raw, "authors_": published}
 
     def scores(
-        self, photo: str, maps: Maps, prefix: str = "", truths: Mapping[str, Truth] | None = None
+        self, photo: str, variants: Mapping[str, Maps], truths: Mapping[str, Truth] | None = None
     ) -> dict[str, float]:
-        """Compute `{prefix}{measure}_{category}` for every labeled category that the photo shows.
-
-        `truths` are the photo's labels at the size of the maps; by default they are read from the files.
-        """
+        """Compute `{prefix}{measure}_{category}` of maps by prefix, for every labeled category in the photo.
+        `truths` are the photo's labels at the size of the maps; by default they are read from the files."""
         if truths is None:
-            truths = self.truth.truths(photo, map_size(maps))
+            truths = self.truth.truths(photo, map_size(next(iter(variants.values()))))
         for category, truth in truths.items():
             if truth.mask.any():
                 self._scored.add(category)
             else:
                 self.without.setdefault(category, set()).add(photo)
-        return score_maps(maps, truths, prefix, self.smooths)
-
-    def scores_of(
-        self, photo: str, variants: Mapping[str, Maps], truths: Mapping[str, Truth] | None = None
-    ) -> dict[str, float]:
-        """Compute `scores` of several variants of maps by their prefixes."""
         found: dict[str, float] = {}
         for prefix, maps in variants.items():
-            found |= self.scores(photo, maps, prefix, truths)
+            found |= score_maps(maps, truths, prefix, self.smooths)
         return found
 
     def protocol(self, mask: str) -> dict[str, Any]:

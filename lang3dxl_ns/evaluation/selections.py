@@ -18,7 +18,7 @@ from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.scene.camera import Camera
 
 _LEAST_SHARE = 0.03
-"""Share of all that is labeled with a word, below which a group is not a separate object."""
+"""Share of a word's labels below which a group is not a separate object."""
 
 
 def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePhoto]) -> dict[str, float]:
@@ -29,11 +29,6 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
       if the labels mark most of its pixels in the labeled photos. Gaussians are weighted by the pixels that
       they fill.
     - `box_iou_{category}`: IoU of the box of `Scene.find` with the labeled object's box that it matches best.
-
-    Args:
-        scene: the scene.
-        truth: labels of its photos.
-        photos: the labeled photos to use.
     """
     question = scene.ask([Prompt(category) for category in truth.categories])
     labels: list[tuple[Camera, Masks]] = []

@@ -20,11 +20,11 @@ from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import host_peak, progress_bar, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
-from lang3dxl_ns.evaluation.evaluated_photo import EvaluatedPhoto
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
 from lang3dxl_ns.evaluation.half_image import PROTOCOL, HalfImage, HalfImageProtocol
 from lang3dxl_ns.evaluation.label_limit import label_limit
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
+from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
 from lang3dxl_ns.evaluation.score_scene import truths_of
 from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resized
 from lang3dxl_ns.plugin.cameras import to_rasterizer
@@ -228,7 +228,7 @@ class Evaluation:
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
         evaluated.maps = inside(raw, keep)
         truths = truths_of(scorer.truth, photo, map_size(raw))
-        evaluated.metrics |= scorer.scores_of(photo.name, variants | {"teacher_": teacher}, truths)
+        evaluated.metrics |= scorer.scores(photo.name, variants | {"teacher_": teacher}, truths)
         evaluated.metrics |= bounds(inside(resized(limit(to_rasterizer(camera)), size), keep), truths)
 
     @torch.no_grad()

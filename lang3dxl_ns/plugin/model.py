@@ -24,8 +24,7 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.components.bounds import EVERY, FREE, keep_in_bounds
 from lang3dxl_ns.components.initialization import color_parameters, initial_gaussians, seed_positions
-from lang3dxl_ns.evaluation.feature_metrics import feature_metrics, match
-from lang3dxl_ns.evaluation.image_metrics import Lpips, psnr
+from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
 from lang3dxl_ns.plugin.optional_components import COMPONENTS
 from lang3dxl_ns.plugin.rendering_model import RenderingModel

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
-from lang3dxl_ns.rendering.ellipses import REACH_SLACK
+from lang3dxl_ns.rendering.gaussians import REACH_SLACK
 
 LOG2_E = math.log2(math.e)
 TILE = 16

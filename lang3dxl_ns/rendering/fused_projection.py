@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
-from lang3dxl_ns.rendering.ellipses import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Ellipses
-from lang3dxl_ns.rendering.gaussians import Gaussians
+from lang3dxl_ns.rendering.gaussians import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Ellipses, Gaussians
 from lang3dxl_ns.rendering.simd import (
     LANES,
     ceil,

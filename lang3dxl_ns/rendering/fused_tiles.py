@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lang3dxl_ns.common.jit import kernel
-from lang3dxl_ns.rendering.ellipses import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from lang3dxl_ns.rendering.fused_plan import SPLAT_COLUMNS, TILE, UNROLL
+from lang3dxl_ns.rendering.gaussians import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from lang3dxl_ns.rendering.simd import (
     LANES,
     absolute,

@@ -13,8 +13,6 @@ from lang3dxl_ns.common.image import resize
 
 Composite = Callable[[nn.Parameter], Float[Tensor, "h w c"]]
 """Function that composites values of Gaussians, [n, c], in one view."""
-
-
 MEMORY = 5e8
 """Bytes for the channels gathered at a time: values and gradients of both the Gaussians and the pixels."""
 
@@ -74,9 +72,6 @@ def gather(
     is Σ w(g, p), in pixels. Gaussians that are never visible have mass and mean 0. So do those with more mass
     outside the foreground, or else the sky would take on values from the edges of towers.
 
-    Compositing is linear in the composited values, map(p) = Σ_g w(g, p) f(g), so the sums are its derivative
-    in the direction of F. One backward pass per view computes them exactly.
-
     Args:
         count: number of Gaussians, n.
         views: for each view, a function that composites values of the Gaussians, and the pixels' values F.
@@ -92,10 +87,7 @@ def gather(
         channels = max(int(memory / 4 / numbers), 1)
         for start in range(0, width + 2, channels):
             part = pixels.channels(start, start + channels).to(like)
-            with torch.enable_grad():
-                probe = nn.Parameter(like.new_zeros(count, part.shape[-1]))
-                (gradient,) = torch.autograd.grad(composite(probe), probe, part)
-            sums[:, start : start + channels] += gradient.to(place)
+            sums[:, start : start + channels] += filled_parts(composite, part, count).to(place)
     features, mass = sums[:, :width], torch.where(sums[:, -1] > sums[:, -2], 0, sums[:, -2])
     features /= torch.where(mass > 0, mass, torch.inf)[:, None]
     return features, mass
@@ -107,7 +99,9 @@ def filled_pixels(composite: Composite, weight: Float[Tensor, "h w"], count: int
 
 
 def filled_parts(composite: Composite, weights: Float[Tensor, "h w k"], count: int) -> Float[Tensor, "n k"]:
-    """Compute how many pixels every Gaussian fills in each of several parts of a view, weighted per pixel."""
+    """Compute how many pixels every Gaussian fills in each of several parts of a view, weighted per pixel.
+    Compositing is linear in the composited values, map(p) = Σ_g w(g, p) f(g), so these sums over pixels are
+    its derivative in the direction of the weights, which one backward pass computes exactly."""
     with torch.enable_grad():
         probe = nn.Parameter(weights.new_zeros(count, weights.shape[-1]))
         (gradient,) = torch.autograd.grad(composite(probe), probe, weights)

@@ -1,4 +1,4 @@
-"""Inputs and outputs of `rasterize`: Gaussians and rendered maps."""
+"""Gaussians, their screen ellipses and rendered maps; the rendering rules that all backends share."""
 
 from __future__ import annotations
 
@@ -6,11 +6,24 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.scene.camera import Camera
 
+ALPHA_MIN = 1 / 255
+"""Alpha below which a Gaussian is skipped in a pixel."""
+ALPHA_MAX = 0.999
+TRANSMITTANCE_MIN = 1e-4
+"""Transmittance at which a pixel stops: before the Gaussian that would bring it to this value or below."""
+FRUSTUM_MARGIN = 0.3
+"""Share of the image's half size by which positions may lie outside it in the Jacobian. Farther ones are
+clamped, because the affine approximation is poor there (gsplat 1.4's rule)."""
+MAX_SIGMA_PIXELS = 1e8
+"""Largest standard deviation of an ellipse, pixels. Larger ones overflow float32 in the determinant; only
+Gaussians around the camera reach it."""
+REACH_SLACK = 1e-3
+"""Margin added to pixel ranges, pixels, so that rounding never drops a visible pair."""
 MAX_LOG_SCALE = 60.0
 """Upper limit of log scales before `exp`. An infinite scale has the gradient 0 · ∞ = NaN."""
 CLOSEST = 1.5
@@ -33,16 +46,12 @@ class Gaussians:
 
     def detach(self) -> Gaussians:
         """Return the same Gaussians without gradient."""
-        return Gaussians(
-            self.means.detach(), self.quats.detach(), self.scales.detach(), self.opacities.detach()
-        )
+        return Gaussians(*(part.detach() for part in vars(self).values()))
 
     def seen_from(self, camera: Camera) -> Gaussians:
-        """Return the same Gaussians, but transparent where their depth is small relative to their length.
-
-        A splat's affine approximation holds only where a Gaussian is small for its depth. Without this, a
-        Gaussian as small as a finger beside the picture would cover it when the camera is close to a wall.
-        """
+        """Return the same Gaussians, but transparent where their depth is small relative to their length. A
+        splat's affine approximation holds only where a Gaussian is small for its depth. Without this, a
+        Gaussian as small as a finger beside the picture would cover it when the camera is close to a wall."""
         with torch.no_grad():
             moved, place = camera.at_origin(self.means)
             depth = (self.means - place) @ moved.view_matrix[2, :3] + moved.view_matrix[2, 3]
@@ -51,7 +60,25 @@ class Gaussians:
 
     def moved(self, by: Float[Tensor, "3"]) -> Gaussians:
         """Return the same Gaussians with shifted centers."""
-        return Gaussians(self.means + by, self.quats, self.scales, self.opacities)
+        return replace(self, means=self.means + by)
+
+
+@dataclass
+class Ellipses:
+    """Gaussians projected to the screen. Radius and opacity are 0 for those not visible."""
+
+    means2d: Float[Tensor, "1 n 2"]
+    """Centers, pixels from the top-left corner. They are one tensor with gsplat's leading camera axis,
+    because densification reads the gradient from it."""
+    conics: Float[Tensor, "n 3"]
+    """Inverse covariances (xx, xy, yy), pixels⁻²."""
+    variances: Float[Tensor, "n 2"]
+    """Diagonal of the covariances (xx, yy), pixels². The compiled kernels give it no gradient."""
+    depths: Float[Tensor, " n"]
+    """Distance along the camera's z axis, world units."""
+    opacities: Float[Tensor, " n"]
+    radii: Int[Tensor, "1 n"]
+    """Three standard deviations along the long axis, whole pixels; 0 if not visible."""
 
 
 @dataclass

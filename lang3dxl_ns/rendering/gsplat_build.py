@@ -48,11 +48,10 @@ class Extension(NamedTuple):
 
 
 class Need(NamedTuple):
-    """A prerequisite of the build."""
+    """A prerequisite of the build; nothing was found if it is missing."""
 
     what: str
     found: str | None
-    """Description of what was found; None if it is missing."""
     remedy: str
 
 
@@ -69,7 +68,7 @@ def _package(name: str) -> list[Path]:
 
 
 def find_toolkit(cuda: str) -> Path | None:
-    """Find a toolkit of the major version of torch's CUDA ("13.2"): the environment's, else the system's."""
+    """Find a toolkit of the major version of torch's CUDA ("13.2")."""
     major = cuda.partition(".")[0]
     for home in _toolkit_places(major):
         with contextlib.suppress(OSError, subprocess.SubprocessError):
@@ -150,8 +149,7 @@ def device_arch() -> str:
 
 
 def build_folder(arch: str) -> Path:
-    """Return the folder of gsplat's build for these versions of gsplat, torch, CUDA, Python, and these
-    GPUs."""
+    """Return the folder of gsplat's build for these GPUs and the versions installed."""
     import torch
 
     cache = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or Path.home() / ".cache" / "lang3dxl").expanduser()
@@ -168,13 +166,9 @@ def built(folder: Path, name: str = "gsplat_cuda") -> Path | None:
 
 
 def build(extension: Extension, folder: Path, arch: str) -> Path:
-    """Compile into a folder, continuing an earlier build there that was interrupted, and return the library.
-
-    If another process is building there, wait for it. Output goes to `folder`/build.log.
-
-    Raises:
-        UserError: something is missing, or the compiler failed.
-    """
+    """Compile into a folder, with the output in build.log, and return the library. An interrupted build is
+    continued, and another process that builds there is waited for. Raises UserError if something is missing,
+    or the compiler failed."""
     missing = [f"{need.what} is missing: {need.remedy}" for need in needs(folder) if need.found is None]
     if missing:
         raise UserError("gsplat's CUDA kernels can't be built here. " + ". ".join(missing))
@@ -198,16 +192,17 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
 
     toolkit = find_toolkit(torch.version.cuda or "")
     assert toolkit is not None
-    home = _link_tree(toolkit, folder / "cuda")
     jobs = max(1, min(os.cpu_count() or 1, int(machine_memory() / JOB_BYTES)))
-    environment = {"MAX_JOBS": str(jobs), **os.environ, "CUDA_HOME": str(home), "TORCH_CUDA_ARCH_LIST": arch}
-    environment["PATH"] = search_path(home / "bin")
+    environment = {"MAX_JOBS": str(jobs), **os.environ, "TORCH_CUDA_ARCH_LIST": arch}
+    environment |= {"CUDA_HOME": str(toolkit), "PATH": search_path(toolkit / "bin")}
+    libraries = str(_linkable(toolkit, folder / "lib")), os.environ.get("LIBRARY_PATH")
+    environment["LIBRARY_PATH"] = os.pathsep.join(filter(None, libraries))
     arguments = {
         "name": extension.name,
         "sources": [str(path) for path in _united(extension.sources, folder)],
         "extra_cflags": ["-O3"],
         "extra_cuda_cflags": ["-O3", "--use_fast_math"],
-        "extra_include_paths": [str(path) for path in (*extension.include, *_headers(home))],
+        "extra_include_paths": [str(path) for path in (*extension.include, *_headers(toolkit))],
         "build_directory": str(folder),
         "verbose": True,
     }
@@ -232,19 +227,12 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
     return library
 
 
-def _link_tree(toolkit: Path, folder: Path) -> Path:
-    """Return the toolkit, or links to it laid out like a system's. The linker looks for lib64/libcudart.so,
-    which pip's packages lack."""
-    runtimes = sorted((toolkit / "lib").glob("libcudart.so.*"))  # several are links to one file
-    if (toolkit / "lib64").is_dir() or not runtimes:
-        return toolkit
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / "lib64").mkdir(parents=True)
-    for name in ("bin", "include", "nvvm"):
-        (folder / name).symlink_to(toolkit / name)
-    for library in (toolkit / "lib").glob("lib*.a"):
-        (folder / "lib64" / library.name).symlink_to(library)
-    (folder / "lib64" / "libcudart.so").symlink_to(runtimes[0])
+def _linkable(toolkit: Path, folder: Path) -> Path:
+    """Return the folder with a link libcudart.so, which the linker looks for, and pip's packages lack."""
+    folder.mkdir(exist_ok=True)
+    for runtime in sorted((toolkit / "lib").glob("libcudart.so.*"))[:1]:  # several are links to one file
+        (folder / "libcudart.so").unlink(missing_ok=True)
+        (folder / "libcudart.so").symlink_to(runtime)
     return folder
 
 
@@ -270,11 +258,8 @@ def load(library: Path, name: str = "gsplat_cuda") -> ModuleType:
 
 
 def make_ready() -> None:
-    """Load gsplat's kernels for this machine's GPUs, building them first if necessary.
-
-    Raises:
-        UserError: the kernels are not available. The message says what is missing and how to get it.
-    """
+    """Load gsplat's kernels for this machine's GPUs, building them first if necessary. Raises UserError that
+    says what is missing and how to get it."""
     import gsplat
     import torch
 
@@ -286,12 +271,7 @@ def make_ready() -> None:
         raise UserError("gsplat's kernels run on NVIDIA's GPUs, and this one is AMD's")
     arch = device_arch()
     folder = build_folder(arch)
-    library = built(folder) or build(gsplat_extension(), folder, arch)
-    try:
-        kernels = load(library)
-    except ImportError:  # the library is damaged
-        library.unlink()
-        kernels = load(build(gsplat_extension(), folder, arch))
+    kernels = load(built(folder) or build(gsplat_extension(), folder, arch))
     gsplat.csrc = sys.modules["gsplat.csrc"] = kernels
 
 

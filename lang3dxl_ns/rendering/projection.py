@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.rendering.ellipses import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Ellipses
-from lang3dxl_ns.rendering.gaussians import Gaussians
+from lang3dxl_ns.rendering.gaussians import FRUSTUM_MARGIN, MAX_SIGMA_PIXELS, Ellipses, Gaussians
 from lang3dxl_ns.scene.camera import Camera
 
 
@@ -24,7 +23,9 @@ def project(
     view = camera.view_matrix.to(gaussians.means)
     intrinsics = camera.intrinsics.to(gaussians.means)
     points = gaussians.means @ view[:3, :3].T + view[:3, 3]
-    drawable = _drawable(points, gaussians.scales, intrinsics, near)
+    with torch.no_grad():  # beyond the near plane, and not so large on screen that numbers overflow
+        sigma = gaussians.scales.amax(1) * torch.maximum(intrinsics[0, 0], intrinsics[1, 1])
+        drawable = (points[:, 2] > near) & (sigma < MAX_SIGMA_PIXELS * points[:, 2])
     points = torch.where(drawable[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
     scales = torch.where(drawable[:, None], gaussians.scales, 0.0)
     x, y, z = points.unbind(1)
@@ -52,22 +53,12 @@ def project(
     opacities = torch.where(drawable, gaussians.opacities, 0.0)
     if antialiased:
         opacities = opacities * area / determinant.sqrt()
-    with torch.no_grad():
-        radii = _radii(means2d[0], xx, yy, xy, camera) * drawable
-    return Ellipses(means2d, conics, torch.stack([xx, yy], dim=1), z, opacities, radii[None])
-
-
-@torch.no_grad()
-def _drawable(
-    points: Float[Tensor, "n 3"],
-    scales: Float[Tensor, "n 3"],
-    intrinsics: Float[Tensor, "3 3"],
-    near: float,
-) -> Bool[Tensor, " n"]:
-    """Return which Gaussians are beyond the near plane and not so large on screen that numbers overflow."""
-    z = points[:, 2]
-    sigma = scales.amax(1) * torch.maximum(intrinsics[0, 0], intrinsics[1, 1])
-    return (z > near) & (sigma < MAX_SIGMA_PIXELS * z)
+    with torch.no_grad():  # gsplat's radius, 0 where it misses the image
+        spread = (0.25 * (xx - yy).square() + xy.square()).clamp_min(0.01).sqrt()
+        radii = (3 * (0.5 * (xx + yy) + spread).sqrt()).ceil()
+        last, first = means2d[0].T + radii, means2d[0].T - radii
+        inside = (last > 0).all(0) & (first[0] < camera.width) & (first[1] < camera.height) & drawable
+    return Ellipses(means2d, conics, torch.stack([xx, yy], dim=1), z, opacities, (radii * inside).int()[None])
 
 
 def _jacobian_row(
@@ -95,18 +86,3 @@ def rotations(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (xx + yy),
     ]  # fmt: skip
     return torch.stack(entries, dim=1).view(-1, 3, 3)
-
-
-def _radii(
-    means2d: Float[Tensor, "n 2"],
-    xx: Float[Tensor, " n"],
-    yy: Float[Tensor, " n"],
-    xy: Float[Tensor, " n"],
-    camera: Camera,
-) -> Int[Tensor, " n"]:
-    """Compute gsplat's radius: three standard deviations along the long axis, 0 where it misses the image."""
-    spread = (0.25 * (xx - yy).square() + xy.square()).clamp_min(0.01).sqrt()
-    radii = (3 * (0.5 * (xx + yy) + spread).sqrt()).ceil()
-    x, y = means2d.unbind(1)
-    inside = (x + radii > 0) & (x - radii < camera.width) & (y + radii > 0) & (y - radii < camera.height)
-    return (radii * inside).int()

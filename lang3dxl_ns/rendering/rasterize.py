@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -13,9 +13,8 @@ from torch import Tensor
 import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
-from lang3dxl_ns.rendering.ellipses import ALPHA_MIN, Ellipses
-from lang3dxl_ns.rendering.gaussians import Gaussians, Raster
-from lang3dxl_ns.rendering.gsplat_backend import rasterize_with_gsplat
+from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Ellipses, Gaussians, Raster
+from lang3dxl_ns.rendering.gsplat_backend import composite_with_gsplat
 from lang3dxl_ns.rendering.projection import project
 from lang3dxl_ns.rendering.torch_rasterizer import Compositing
 from lang3dxl_ns.scene.camera import Camera
@@ -77,16 +76,28 @@ def rasterize(
     elif backend == "gsplat" and gaussians.means.is_cuda:
         gsplat_build.make_ready()
     # gsplat's kernels cannot be launched on empty input.
-    render: Callable[..., Raster] = functools.partial(_rasterize, backend)
-    if backend == "gsplat" and len(channels):
-        render = rasterize_with_gsplat
+    by_gsplat = backend == "gsplat" and len(channels) > 0
+    composite = composite_with_gsplat if by_gsplat else partial(_composite, backend)
+    if by_gsplat and not torch.is_grad_enabled():
+        detach_features = False  # spares a second pass
     gaussians, channels, features = _without_broken(gaussians, channels, features)
     camera, place = camera.at_origin(gaussians.means)
-    return render(
-        gaussians.moved(-place), camera, channels, background,
-        features=features, detach_features=detach_features, render_depth=render_depth,
-        antialiased=antialiased, absgrad=absgrad, near=near, eps2d=eps2d,
+    attached, detached, sizes = channels, channels[:, :0], [channels.shape[1]]
+    if features is not None and detach_features:
+        detached = features
+    elif features is not None:
+        attached = torch.cat([channels, features], dim=1)
+        sizes.append(features.shape[1])
+    maps, detached_map, alpha, info = composite(
+        gaussians.moved(-place), camera, attached, detached,
+        depth=render_depth, antialiased=antialiased, absgrad=absgrad, near=near, eps2d=eps2d,
     )  # fmt: skip
+    image, *others = maps.split([*sizes, 1] if render_depth else sizes, dim=2)
+    depth = others.pop() / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None
+    feature_map = None
+    if features is not None:
+        feature_map = detached_map if detach_features else others[0]
+    return Raster(image + (1 - alpha) * background, feature_map, alpha, depth, info)
 
 
 def _best_backend(means: Tensor) -> Backend:
@@ -112,11 +123,8 @@ def _without_broken(
     def clean(values: Tensor) -> Tensor:
         return torch.where(sound.view(-1, *[1] * (values.dim() - 1)), values, 0.0)
 
-    return (
-        Gaussians(*map(clean, vars(g).values())),
-        clean(channels),
-        None if features is None else clean(features),
-    )
+    features = None if features is None else clean(features)
+    return Gaussians(*map(clean, vars(g).values())), clean(channels), features
 
 
 def _kernels(backend: Backend) -> tuple[Callable[..., Ellipses], type[torch.autograd.Function]]:
@@ -143,41 +151,28 @@ def _check_sizes(
         raise ValueError(f"{channels.shape[1]} channels, but a background of shape {tuple(background.shape)}")
 
 
-def _rasterize(
+def _composite(
     backend: Backend,
     gaussians: Gaussians,
     camera: Camera,
-    channels: Float[Tensor, "n c"],
-    background: Float[Tensor, " c"],
+    attached: Float[Tensor, "n c"],
+    detached: Float[Tensor, "n d"],
     *,
-    features: Float[Tensor, "n d"] | None,
-    detach_features: bool,
-    render_depth: bool,
+    depth: bool,
     antialiased: bool,
     absgrad: bool,
     near: float,
     eps2d: float,
-) -> Raster:
-    """Render everything in one pass: depth and features are extra channels of the image."""
+) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    """Composite channels over black: those with a gradient to the geometry (then the depth, if requested),
+    those without, and alpha, [h, w, …] each. The last value is `Raster.info`."""
     to_screen, compositing = _kernels(backend)
     ellipses = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
-    attached = [channels]
-    if features is not None and not detach_features:
-        attached.append(features)
-    if render_depth:
-        attached.append(ellipses.depths[:, None])
     maps, detached_map, alpha = compositing.apply(
         ellipses.means2d, ellipses.conics, ellipses.opacities,
-        torch.cat(attached, dim=1) if len(attached) > 1 else channels,
-        features if features is not None and detach_features else channels[:, :0],
+        torch.cat([attached, ellipses.depths[:, None]], dim=1) if depth else attached, detached,
         ellipses.variances, ellipses.depths, camera.width, camera.height, absgrad,
     )  # fmt: skip
-    parts = list(maps.split([part.shape[1] for part in attached], dim=2))
-    depth = parts.pop() / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None
-    image = parts[0] + (1 - alpha) * background
-    feature_map = None
-    if features is not None:
-        feature_map = detached_map if detach_features else parts[1]
     info = {
         "width": camera.width,
         "height": camera.height,
@@ -186,4 +181,4 @@ def _rasterize(
         "gaussian_ids": None,
         "means2d": ellipses.means2d,
     }
-    return Raster(image, feature_map, alpha, depth, info)
+    return maps, detached_map, alpha, info

@@ -37,17 +37,10 @@ def render(
     background: Float[Tensor, "3"] | None = None,
     backend: Backend = "auto",
 ) -> Rendering:
-    """Render Gaussians in their own colors. This is safe to call from any thread.
+    """Render Gaussians in their own colors, and composite further `channels`, one row per Gaussian.
 
-    Args:
-        splats: the Gaussians, world frame.
-        camera: where to render them from.
-        channels: further values to composite, one row per Gaussian.
-        background: color behind the scene, 0…1; black by default.
-        backend: one of the backends of `rasterize`.
-
-    Raises:
-        ValueError: for the reasons that `rasterize` has.
+    The background is 0…1, by default black. This is safe to call from any thread. Raises ValueError like
+    `rasterize`.
     """
     raster = rasterize(
         splats.gaussians.seen_from(camera), camera, splats.colors(camera.position),

@@ -190,12 +190,6 @@ def store_column(typing_context, matrix, row, column, value):
     return types.void(matrix, types.intp, types.intp, value), emit
 
 
-@intrinsic
-def spread(typing_context, value):
-    """Copy a scalar to every lane."""
-    return VectorType(value)(value), lambda context, builder, sig, args: _spread(builder, args[0])
-
-
 # --- functions -------------------------------------------------------------------------------------------
 
 

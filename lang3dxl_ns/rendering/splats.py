@@ -8,13 +8,15 @@ from math import isqrt
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.rendering.gaussians import Gaussians
 from lang3dxl_ns.rendering.spherical_harmonics import BAND_0, rotated_harmonics, spherical_harmonics
+
+_TO_SCIPY, _FROM_SCIPY = [1, 2, 3, 0], [3, 0, 1, 2]
+"""Columns of quaternions w, x, y, z in scipy's order, and of scipy's in ours."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,15 +76,10 @@ class Splats:
         return self._mapped(lambda tensor: tensor[rows])
 
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Splats:
-        """Transform the Gaussians to another frame.
+        """Transform the Gaussians to another frame by [[s·R, t], [0, 1]], with a rotation R, a scale s > 0
+        and a translation t. Raises ValueError for another matrix."""
+        from scipy.spatial.transform import Rotation
 
-        Args:
-            similarity: [[s·R, t], [0, 1]] from this frame to the other one, with a rotation R, a scale s > 0
-                and a translation t.
-
-        Raises:
-            ValueError: the matrix is not a similarity.
-        """
         turned = similarity[:3, :3].double().cpu()
         scale = float(turned.det().clamp_min(0) ** (1 / 3))
         rotation = turned / max(scale, 1e-30)
@@ -91,11 +88,12 @@ class Splats:
         like = self.means
         means = scale * (like @ rotation.T.to(like)) + similarity[:3, 3].to(like)
         identity = self.quats.new_tensor([1.0, 0, 0, 0])
-        quats = torch.where(self.quats.norm(dim=1, keepdim=True) > 0, self.quats, identity)
+        quats = torch.where(self.quats.norm(dim=1, keepdim=True) > 0, self.quats, identity).double().cpu()
+        turns = Rotation.from_matrix(rotation.numpy()) * Rotation.from_quat(quats[:, _TO_SCIPY].numpy())
         return replace(
             self,
             means=means,
-            quats=_product(_quaternion(rotation).to(quats), quats),
+            quats=torch.from_numpy(turns.as_quat()[:, _FROM_SCIPY]).to(self.quats),
             scales=scale * self.scales,
             harmonics=rotated_harmonics(self.harmonics, rotation),
         )
@@ -114,26 +112,3 @@ class Splats:
 def harmonics_of(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
     """Compute harmonics of degree 0 for colors that do not depend on the viewing direction."""
     return (colors[:, None] - 0.5) / BAND_0
-
-
-def _quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "4"]:
-    """Convert a rotation matrix to a unit quaternion (w, x, y, z)."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation.numpy()).as_quat()
-    return torch.tensor([w, x, y, z], dtype=torch.float64)
-
-
-def _product(a: Float[Tensor, "4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """Multiply quaternions: the result rotates by b, then by a."""
-    aw, ax, ay, az = a.unbind()
-    w, x, y, z = F.normalize(b, dim=1).unbind(1)
-    return torch.stack(
-        [
-            aw * w - ax * x - ay * y - az * z,
-            aw * x + ax * w + ay * z - az * y,
-            aw * y - ax * z + ay * w + az * x,
-            aw * z + ax * y - ay * x + az * w,
-        ],
-        dim=1,
-    )

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lang3dxl_ns.rendering.ellipses import ALPHA_MAX, ALPHA_MIN, REACH_SLACK, TRANSMITTANCE_MIN
+from lang3dxl_ns.rendering.gaussians import ALPHA_MAX, ALPHA_MIN, REACH_SLACK, TRANSMITTANCE_MIN
 
 TILE = 8
 """Pixels per side of a tile."""

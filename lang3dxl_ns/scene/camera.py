@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.checks import is_coordinate
+from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
@@ -60,17 +61,16 @@ class Lens:
 
     def check(self) -> None:
         """Raise ValueError if the lens cannot be rendered with."""
-        values = (self.width, self.height, self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not all(map(is_coordinate, values)):
-            raise ValueError("a lens has a value that is not a number")
-        if type(self.width) is not int or type(self.height) is not int or min(self.width, self.height) < 1:
-            raise ValueError(f"a picture has {self.width} × {self.height} pixels")
-        if self.width * self.height > MOST_PIXELS or max(self.width, self.height) > LONGEST_SIDE:
-            raise ValueError(f"{self.width} × {self.height} pixels are too many")
-        if min(self.fx, self.fy) <= 0:
-            raise ValueError(f"a lens has the focal lengths {self.fx}, {self.fy}")
-        if type(self.fisheye) is not bool or len(self.distortion) not in (0, 4, 5, 8):
-            raise ValueError("a lens has no known distortion")
+        width, height = self.width, self.height
+        values = (width, height, self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        expect(all(map(is_coordinate, values)), "a lens has a value that is not a number")
+        whole = type(width) is int and type(height) is int and min(width, height) >= 1
+        expect(whole, f"a picture has {width} × {height} pixels")
+        small = width * height <= MOST_PIXELS and max(width, height) <= LONGEST_SIDE
+        expect(small, f"{width} × {height} pixels are too many")
+        expect(min(self.fx, self.fy) > 0, f"a lens has the focal lengths {self.fx}, {self.fy}")
+        known = type(self.fisheye) is bool and len(self.distortion) in (0, 4, 5, 8)
+        expect(known, "a lens has no known distortion")
 
     def resized(self, width: int, height: int) -> Lens:
         """Return the lens at another resolution."""
@@ -88,18 +88,30 @@ class Lens:
         return Camera(view_matrix, self.matrix.float(), self.width, self.height)
 
 
-def check_pose(rows: object) -> None:
-    """Check a pose that was read from a file.
+class HasLens:
+    """Base of what was taken with a lens."""
 
-    It must be a [3, 4] or [4, 4] nested list of finite numbers, and its rotation must keep volumes within a
-    factor of eight. Raises ValueError otherwise."""
-    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
-        raise ValueError("a pose is not three rows of four numbers")
-    if len(rows) not in (3, 4) or not all(is_coordinate(value) for row in rows for value in row):
-        raise ValueError("a pose is not three rows of four numbers")
-    turn = float(np.linalg.det(np.array([row[:3] for row in rows[:3]], dtype=np.float64)))
-    if not 1 / 8 < turn < 8:
-        raise ValueError("a pose is not a rotation and a position")
+    lens: Lens
+
+    @property
+    def width(self) -> int:
+        """Width in pixels."""
+        return self.lens.width
+
+    @property
+    def height(self) -> int:
+        """Height in pixels."""
+        return self.lens.height
+
+
+def check_pose(rows: Any) -> None:
+    """Check a pose from a file: a [3, 4] or [4, 4] nested list of finite numbers, whose rotation changes no
+    volume more than eightfold. Raises ValueError otherwise."""
+    in_rows = isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows)
+    numbers = in_rows and all(is_coordinate(value) for row in rows for value in row)
+    expect(numbers and len(rows) in (3, 4), "a pose is not three rows of four numbers")
+    turn = np.linalg.det(np.array([row[:3] for row in rows[:3]], dtype=np.float64))
+    expect(1 / 8 < turn < 8, "a pose is not a rotation and a position")
 
 
 @dataclass
@@ -107,7 +119,7 @@ class Camera:
     """Pinhole camera without distortion and skew; OpenCV axes (x right, y down, z forward)."""
 
     view_matrix: Float[Tensor, "4 4"]
-    """Rigid transform from world to camera, in world units."""
+    """Rigid transform, world → camera, world units."""
     intrinsics: Float[Tensor, "3 3"]
     """Intrinsic matrix in pixels; the origin is the photo's top-left corner, so pixel centers lie at +0.5."""
     width: int
@@ -125,12 +137,12 @@ class Camera:
 
     def detach(self) -> Camera:
         """Return the camera without gradient."""
-        return Camera(self.view_matrix.detach(), self.intrinsics.detach(), self.width, self.height)
+        return replace(self, view_matrix=self.view_matrix.detach(), intrinsics=self.intrinsics.detach())
 
     def to(self, device: torch.device | str) -> Camera:
         """Return the camera on a device."""
         view, intrinsics = (to_device(part, device) for part in (self.view_matrix, self.intrinsics))
-        return Camera(view, intrinsics, self.width, self.height)
+        return replace(self, view_matrix=view, intrinsics=intrinsics)
 
     def at_origin(self, like: Tensor) -> tuple[Camera, Float[Tensor, "3"]]:
         """Return the camera in a world whose origin is its own (rounded) position, and that position.
@@ -145,7 +157,7 @@ class Camera:
         place = -(view[:3, :3].T @ view[:3, 3]).detach().to(like.dtype)
         shift = torch.eye(4, dtype=view.dtype, device=view.device)
         shift[:3, 3] = place
-        moved = Camera((view @ shift).to(like.dtype), self.intrinsics, self.width, self.height)
+        moved = replace(self, view_matrix=(view @ shift).to(like.dtype))
         return moved.to(like.device), to_device(place, like.device)
 
 
@@ -160,7 +172,7 @@ def view_matrix(camera_to_world: Float[Tensor, "3 4"]) -> Float[Tensor, "4 4"]:
 
 
 def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
-    """Convert world → camera (OpenCV axes) to nerfstudio's camera → world; inverse of `view_matrix`."""
+    """Invert `view_matrix`."""
     rotation = view_matrix[:3, :3].T
     position = -rotation @ view_matrix[:3, 3:]
     return torch.cat([rotation * view_matrix.new_tensor([1.0, -1.0, -1.0]), position], dim=1)
@@ -168,10 +180,8 @@ def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
 
 @torch.no_grad()
 def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    """Return which Gaussians may be visible: all that are, and some that aren't.
-
-    The ball of 3.5 standard deviations around each is tested against the planes through the image's edges.
-    """
+    """Return which Gaussians may be visible: all that are, and some that aren't. The ball of 3.5 standard
+    deviations around each is tested against the planes through the image's edges."""
     points = means @ camera.view_matrix[:3, :3].T + camera.view_matrix[:3, 3]
     reach = 3.5 * scales.amax(dim=1)
     seen = points[:, 2] > 0
@@ -194,14 +204,11 @@ def resized(camera: Camera, longer_side: int) -> Camera:
 
 
 def with_longer_side(camera: Camera, pixels: int) -> Camera:
-    """Return the view at another resolution.
-
-    Raises UserError for a side below 1 or above `LONGEST_SIDE`, and if over half of the memory is needed.
-    """
+    """Return the view at another resolution. Raises UserError for a side below 1 or above `LONGEST_SIDE`, and
+    if over half of the memory is needed."""
     if not (isinstance(pixels, int) and 1 <= pixels <= LONGEST_SIDE):
         raise UserError(f"a picture of {pixels} pixels can't be rendered: give 1 to {LONGEST_SIDE}")
-    factor = pixels / max(camera.width, camera.height)
-    width, height = max(round(camera.width * factor), 1), max(round(camera.height * factor), 1)
+    width, height = scaled_size(camera.width, camera.height, pixels / max(camera.width, camera.height))
     needed, most = _PER_PIXEL * width * height, machine_memory() / 2
     if needed > most:
         raise UserError(
@@ -209,21 +216,17 @@ def with_longer_side(camera: Camera, pixels: int) -> Camera:
             f"machine's memory: give at most {int(pixels * (most / needed) ** 0.5)} pixels"
         )
     zoom = camera.intrinsics.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
-    return Camera(camera.view_matrix, camera.intrinsics * zoom, width, height)
+    return replace(camera, intrinsics=camera.intrinsics * zoom, width=width, height=height)
 
 
 def with_field_of_view(camera: Camera, degrees: float) -> Camera:
-    """Return the view through a centered lens with another vertical field of view and square pixels.
-
-    Raises UserError unless the field of view lies between 1 and 170 degrees.
-    """
+    """Return the view through a centered lens with another vertical field of view and square pixels. Raises
+    UserError unless the field of view lies between 1 and 170 degrees."""
     if not (isinstance(degrees, int | float) and 1 <= degrees <= 170):
         raise UserError(f"the field of view is {degrees}: give 1 to 170 degrees")
     focal = camera.height / 2 / math.tan(math.radians(degrees) / 2)
-    intrinsics = torch.tensor(
-        [[focal, 0.0, camera.width / 2], [0.0, focal, camera.height / 2], [0.0, 0.0, 1.0]]
-    )
-    return Camera(camera.view_matrix, intrinsics.to(camera.intrinsics), camera.width, camera.height)
+    lens = Lens(camera.width, camera.height, focal, focal, camera.width / 2, camera.height / 2)
+    return replace(camera, intrinsics=lens.matrix.to(camera.intrinsics))
 
 
 def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:
@@ -234,4 +237,4 @@ def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:
         check_pose(pose.double().tolist())
     except ValueError as error:
         raise UserError(f"{error}: give camera → world, such as the `pose` of a photo") from error
-    return Camera(view_matrix(pose[:3].float()), like.intrinsics, like.width, like.height)
+    return replace(like, view_matrix=view_matrix(pose[:3].float()))

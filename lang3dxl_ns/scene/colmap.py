@@ -13,7 +13,7 @@ from numpy import ndarray as Array
 from lang3dxl_ns.common.checks import FARTHEST
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError, is_plain
-from lang3dxl_ns.scene.camera import Lens, check_pose
+from lang3dxl_ns.scene.camera import HasLens, Lens, check_pose
 from lang3dxl_ns.scene.colmap_check import check_binary_model
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 
@@ -27,7 +27,7 @@ in OpenCV's order."""
 
 
 @dataclass(frozen=True, eq=False)
-class TrackedPhoto:
+class TrackedPhoto(HasLens):
     """Photo of a COLMAP model: lens, pose and the 3D points tracked in it."""
 
     name: str
@@ -40,16 +40,6 @@ class TrackedPhoto:
     """Positions of the points in the (distorted) photo."""
     quarter_turns: int = 0
     """Clockwise quarter turns from the file's pixels as stored to this photo's."""
-
-    @property
-    def width(self) -> int:
-        """Width in pixels."""
-        return self.lens.width
-
-    @property
-    def height(self) -> int:
-        """Height in pixels."""
-        return self.lens.height
 
     @property
     def center(self) -> Float[Array, "3"]:
@@ -72,11 +62,8 @@ class Reconstruction:
 
 
 def read_reconstruction(model_dir: Path) -> Reconstruction:
-    """Read a COLMAP model (.bin or .txt) with its tracks.
-
-    Raises UserError for a folder without a model, a damaged or empty model, and a camera model that OpenCV
-    can't undistort.
-    """
+    """Read a COLMAP model (.bin or .txt) with its tracks. Raises UserError for a missing, damaged or empty
+    one, and for a camera model that OpenCV can't undistort."""
     model = _read_model(Path(model_dir))
     images = {
         name: image for i, image in model.images.items() if image.has_pose and (name := _name(i, image))
@@ -160,19 +147,14 @@ def _tracked_photo(
             f"photo {image.name} has an impossible camera ({error}), remove it from the model: {camera}"
         ) from error
     tracked = [point for point in image.get_observation_points2D() if point.point3D_id in positions]
-    return TrackedPhoto(
-        name=image.name,
-        lens=lens,
-        camera_from_world=pose,
-        points=np.array([positions[point.point3D_id] for point in tracked], dtype=np.float64).reshape(-1, 3),
-        pixels=np.array([point.xy for point in tracked], dtype=np.float64).reshape(-1, 2),
-    )
+    points = np.array([positions[point.point3D_id] for point in tracked], dtype=np.float64).reshape(-1, 3)
+    pixels = np.array([point.xy for point in tracked], dtype=np.float64).reshape(-1, 2)
+    return TrackedPhoto(image.name, lens, pose, points, pixels)
 
 
 def _distortion(name: str, camera: pycolmap.Camera) -> tuple[tuple[float, ...], bool]:
-    """Return OpenCV's distortion coefficients for a COLMAP camera, and whether it is a fisheye.
-
-    Raises UserError for a camera model that OpenCV can't undistort."""
+    """Return OpenCV's distortion coefficients for a COLMAP camera, and whether it is a fisheye. Raises
+    UserError for a camera model that OpenCV can't undistort."""
     model = camera.model_name
     coefficients = tuple(camera.params[camera.extra_params_idxs()].tolist())
     coefficients += (0.0,) * (4 - len(coefficients))

@@ -19,10 +19,8 @@ _POSE, _KEYPOINT, _OBSERVATION, _SENSOR = 7 * 8, 3 * 8, 2 * 4, 2 * 4
 
 
 def check_binary_model(folder: Path) -> None:
-    """Walk through the records of the binary files present.
-
-    Raises UserError if a file ends early or continues after its last record.
-    """
+    """Walk through the records of the binary files present. Raises UserError if a file ends early or
+    continues after its last record."""
     for name, step in _STEPS.items():
         path = folder / f"{name}.bin"
         if path.is_file():

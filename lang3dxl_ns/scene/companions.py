@@ -43,12 +43,9 @@ def is_name(name: object) -> bool:
 
 
 def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bool = False) -> Path | None:
-    """Find the file in `folder` that belongs to a photo; None if there is none.
-
-    It is called like the photo, with a suffix appended (COLMAP's photo.jpg.png, which distinguishes photo.jpg
-    from photo.png) or replaced. Raises UserError for a name that leads out of the folder, and for a pipe or a
-    device of that name.
-    """
+    """Find the file in `folder` that is called like a photo, with a suffix appended or replaced. COLMAP
+    appends, as photo.jpg.png, which distinguishes photo.jpg from photo.png. Raises UserError for a name that
+    leads out of the folder, and for a pipe or a device of that name."""
     path = inside(folder, name, follow_links=True)  # the photo's name; the file found is checked below
     candidates = [path.with_name(path.name + suffix) for suffix in suffixes]
     candidates += [path.with_suffix(suffix) for suffix in suffixes]

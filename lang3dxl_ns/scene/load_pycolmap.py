@@ -10,9 +10,8 @@ import numpy  # noqa: F401 (before pycolmap: in the other order, Pillow's PNG wr
 
 
 def load_pycolmap() -> ModuleType:
-    """Import pycolmap, and restore the Python SIGTERM handler that its import replaces.
-
-    pycolmap's handler prints a stack trace and kills the process."""
+    """Import pycolmap, and restore the Python SIGTERM handler that its import replaces. pycolmap's handler
+    prints a stack trace and kills the process."""
     handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 

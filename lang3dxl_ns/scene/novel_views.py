@@ -7,8 +7,6 @@ only evaluation reads them.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 
 FOLDER = "test_views"
-_CAMERAS = "cameras.json"
+CAMERAS = "cameras.json"
 
 
 @dataclass(frozen=True)
@@ -41,7 +39,7 @@ class NovelViews:
 
 def read_novel_views(scene: Path) -> NovelViews | None:
     """Read a scene's test views; None if it has none. Raises UserError for a damaged cameras.json."""
-    path = scene / FOLDER / _CAMERAS
+    path = scene / FOLDER / CAMERAS
     if not path.is_file():
         return None
     try:
@@ -52,35 +50,13 @@ def read_novel_views(scene: Path) -> NovelViews | None:
         raise UserError(f"{path} is damaged ({error!r}): make the scene again, or remove the file") from error
 
 
-def write_novel_cameras(folder: Path, cameras: Sequence[TrackedPhoto], same_light: bool) -> None:
-    """Write test_views/cameras.json into a scene's `folder`; views are named after their files."""
-    views = [
-        {
-            "name": g.name,
-            "width": g.width,
-            "height": g.height,
-            "intrinsics": [g.lens.fx, g.lens.fy, g.lens.cx, g.lens.cy],
-            "camera_from_world": g.camera_from_world.tolist(),
-            "points": g.points.round(6).tolist(),
-        }
-        for g in cameras
-    ]
-    content = {"same_light": same_light, "views": views}
-    (folder / FOLDER / _CAMERAS).write_text(json.dumps(content) + "\n")
-
-
 def _tracked(view: dict) -> TrackedPhoto:
-    fx, fy, cx, cy = (float(value) for value in view["intrinsics"])
+    fx, fy, cx, cy = map(float, view["intrinsics"])
     lens = Lens(int(view["width"]), int(view["height"]), fx, fy, cx, cy)
     lens.check()
-    points = np.array(view["points"], dtype=np.float64).reshape(-1, 3)
     check_pose(view["camera_from_world"])
     pose = np.array(view["camera_from_world"], dtype=np.float64).reshape(3, 4)
-    x, y, z = pose @ np.column_stack([points, np.ones(len(points))]).T
-    return TrackedPhoto(
-        name=f"{FOLDER}/{view['name']}",
-        lens=lens,
-        camera_from_world=pose,
-        points=points,
-        pixels=np.column_stack([fx * x / z + cx, fy * y / z + cy]),
-    )
+    points = np.array(view["points"], dtype=np.float64).reshape(-1, 3)
+    x, y, z = pose[:, :3] @ points.T + pose[:, 3:]
+    pixels = np.column_stack([fx * x / z + cx, fy * y / z + cy])
+    return TrackedPhoto(f"{FOLDER}/{view['name']}", lens, pose, points, pixels)

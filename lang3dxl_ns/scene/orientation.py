@@ -44,30 +44,13 @@ def turned_lens(lens: Lens, quarters: int) -> Lens:
 
 
 def upright(tracked: TrackedPhoto, size: tuple[int, int], quarters: int) -> TrackedPhoto:
-    """Turn a model's photo upright: lens, pose and tracks are turned with the pixels.
-
-    The photos may already have been turned when the model was made (by another program). Then the shape of
-    the model's camera differs from the stored pixels', and lens, pose and tracks are kept.
-
-    Args:
-        tracked: the photo in the COLMAP model, whose pixels are as stored or already turned.
-        size: width and height of the file's pixels as stored.
-        quarters: quarter turns of the file, from `quarter_turns`.
-    """
+    """Turn a model's photo upright, whose file has a `size` (width, height) and `quarter_turns` as stored.
+    Lens, pose and tracks are turned with the pixels. If the program that made the model had turned the photos
+    already, the shape of the model's camera differs from the stored pixels', and all are kept."""
     width, height = size
     fits_stored = (tracked.width > tracked.height) == (width > height)
-    if quarters % 2 and width != height and not fits_stored:
-        return replace(tracked, quarter_turns=quarters)
-    pixels, camera = tracked.pixels, tracked.camera_from_world
-    across, high = tracked.width, tracked.height
-    for _ in range(quarters):
-        pixels = np.column_stack([high - pixels[:, 1], pixels[:, 0]])
-        camera = _QUARTER @ camera
-        across, high = high, across
-    return replace(
-        tracked,
-        lens=turned_lens(tracked.lens, quarters),
-        camera_from_world=camera,
-        pixels=pixels,
-        quarter_turns=quarters,
-    )
+    lens, pixels, camera = tracked.lens, tracked.pixels, tracked.camera_from_world
+    for _ in range(quarters if fits_stored or width == height or quarters % 2 == 0 else 0):
+        pixels = np.column_stack([lens.height - pixels[:, 1], pixels[:, 0]])
+        lens, camera = turned_lens(lens, 1), _QUARTER @ camera
+    return replace(tracked, lens=lens, camera_from_world=camera, pixels=pixels, quarter_turns=quarters)

@@ -37,21 +37,16 @@ def pairs_to_match(names: Sequence[str], descriptors: Descriptors) -> list[tuple
 def similar_pairs(names: Sequence[str], descriptors: Descriptors, neighbors: int) -> list[tuple[str, str]]:
     """Pair each photo with its `neighbors` nearest by aggregated descriptors (VLAD, Jégou et al. 2010)."""
     from sklearn.cluster import MiniBatchKMeans
+    from sklearn.neighbors import NearestNeighbors
 
     rng = np.random.default_rng(0)
     some = [names[i] for i in rng.permutation(len(names))[:200]]
     sample = np.concatenate([_rows(descriptors(name), _SAMPLE // len(some), rng) for name in some])
     words = MiniBatchKMeans(min(_WORDS, len(sample)), random_state=0, n_init=3).fit(sample).cluster_centers_
-    vectors = np.zeros((len(names), words.size), np.float32)
-    for vector, name in zip(vectors, names, strict=True):
-        vector[:] = _aggregate(_rows(descriptors(name), _PER_PHOTO, rng), words)
-    pairs: set[tuple[str, str]] = set()
-    for start in range(0, len(names), 256):
-        likeness = vectors[start : start + 256] @ vectors.T
-        nearest = np.argpartition(-likeness, min(neighbors, len(names) - 1), axis=1)[:, : neighbors + 1]
-        for row, others in enumerate(nearest, start):
-            pairs.update((names[min(row, o)], names[max(row, o)]) for o in others if o != row)
-    return sorted(pairs)
+    vectors = np.stack([_aggregate(_rows(descriptors(name), _PER_PHOTO, rng), words) for name in names])
+    search = NearestNeighbors(n_neighbors=min(neighbors, len(names) - 1), metric="cosine").fit(vectors)
+    found = enumerate(search.kneighbors(return_distance=False))  # without the photo itself
+    return sorted({(names[min(i, j)], names[max(i, j)]) for i, others in found for j in others})
 
 
 def _rows(descriptors: UInt8[Array, "n 128"], most: int, rng: np.random.Generator) -> Float[Array, "m 128"]:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
-from lang3dxl_ns.scene.camera import Lens, scaled_size
+from lang3dxl_ns.scene.camera import HasLens, Lens, scaled_size
 from lang3dxl_ns.scene.orientation import quarter_turns, upright
 
 if TYPE_CHECKING:
@@ -31,12 +31,9 @@ _LARGE = 1_500_000
 
 
 @dataclass(frozen=True)
-class Photo:
-    """Photo on disk with its lens.
-
-    The file may differ from the lens in size, but not in aspect ratio: reading resizes it to the lens's size.
-    This class is the only place that decodes photos, and everything is read upright.
-    """
+class Photo(HasLens):
+    """Photo on disk with its lens, read upright and at the lens's size, whose aspect ratio the file has. No
+    other code decodes photos."""
 
     name: str
     """Name in the COLMAP model; it may contain folders."""
@@ -48,25 +45,12 @@ class Photo:
     quarter_turns: int = 0
     """Clockwise quarter turns that bring the file's pixels as stored upright."""
 
-    @property
-    def width(self) -> int:
-        """Width in pixels, upright."""
-        return self.lens.width
-
-    @property
-    def height(self) -> int:
-        """Height in pixels, upright."""
-        return self.lens.height
-
     @classmethod
     def from_model(cls, tracked: TrackedPhoto, path: Path, mask_path: Path | None = None) -> Photo:
-        """Create a photo with its lens from the COLMAP model, adapted to the size of the file on disk.
-
-        So a folder of resized photos works with the same model. `tracked` comes from `upright_in_model`.
-        Raises UserError for an unreadable file and for another aspect ratio.
-        """
-        size, _ = stored_size(path, tracked.name)
-        size = _turned_size(size, tracked.quarter_turns)
+        """Create a photo from the model (after `upright_in_model`), with its lens at the size of the file on
+        disk, so that resized photos work. Raises UserError for an unreadable file and for another aspect
+        ratio."""
+        size = _turned_size(stored_size(path, tracked.name)[0], tracked.quarter_turns)
         _check_shape(tracked.name, path, size, (tracked.width, tracked.height))
         return cls(tracked.name, path, mask_path, tracked.lens.resized(*size), tracked.quarter_turns)
 
@@ -76,11 +60,9 @@ class Photo:
         return self if shrink >= 1 else replace(self, lens=self.lens.scaled(shrink))
 
     def read(self, scale: float = 1.0) -> Float[Tensor, "h w 3"]:
-        """Read the photo as a pinhole camera with the same fx, fy, cx, cy would take it.
-
-        The result is RGB in 0..1 at `scaled_size`, and black where the photo does not reach. Raises UserError
-        for an unreadable file and for an aspect ratio other than the camera's.
-        """
+        """Read the photo as a pinhole camera with the same fx, fy, cx, cy would take it: RGB in 0..1 at
+        `scaled_size`, black where the photo does not reach. Raises UserError for an unreadable file and for
+        another aspect ratio than the camera's."""
         return self.read_uint8(scale).float() / 255
 
     def read_uint8(self, scale: float = 1.0) -> UInt8[Tensor, "h w 3"]:
@@ -94,11 +76,9 @@ class Photo:
         return torch.from_numpy(np.array(image.resize(size, Image.Resampling.BILINEAR)))
 
     def read_mask(self, scale: float = 1.0) -> Bool[Tensor, "h w"] | None:
-        """Read the foreground at the size of `read(scale)`; None without a mask file and distortion.
-
-        It is where the mask is at least half bright and undistortion stays inside the photo. Raises UserError
-        for an unreadable mask.
-        """
+        """Read the foreground at the size of `read(scale)`: where the mask is at least half bright and
+        undistortion stays inside the photo. It is None without a mask file and distortion. Raises UserError
+        for an unreadable mask."""
         if self.mask_path is None and not self.lens.distorts:
             return None
         mask = np.ones((self.height, self.width), dtype=bool)
@@ -111,29 +91,24 @@ class Photo:
         return torch.from_numpy(np.array(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST)))
 
     def read_file(self, longer_side: int) -> UInt8[Tensor, "h w 3"]:
-        """Read the file upright and still distorted, shrunk to at most `longer_side` pixels.
-
-        `read_mask` accepts masks drawn on this picture. Raises UserError for an unreadable file.
-        """
+        """Read the file upright and still distorted, shrunk to at most `longer_side` pixels, as masks are
+        drawn. Raises UserError for an unreadable file."""
         shrink = longer_side / max(self.width, self.height)
         image = self._decoded(scaled_size(self.width, self.height, min(shrink, 1.0)))
         image.thumbnail((longer_side, longer_side), Image.Resampling.BILINEAR)
         return torch.from_numpy(np.array(image))
 
     def undistort_labels(self, labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-        """Undistort labels drawn on the file (at any size) like `read`, by nearest pixel.
-
-        The result is −1 outside the photo. Labels must fit into 32 bits.
-        """
+        """Undistort 32-bit labels drawn on the file (at any size) like `read`, by nearest pixel; −1 outside
+        the photo."""
         labels = self._drawn_upright(labels)
         if not self.lens.distorts:
             return labels
         return torch.from_numpy(self._undistort(labels.numpy().astype(np.int32), nearest=True, empty=-1))
 
     def stamp(self, path: Path | None = None) -> list[int]:
-        """Return size, modification time and inode of the photo's file (or of its mask, `path`).
-
-        They change when the content does. Raises UserError if the file is missing."""
+        """Return size, modification time and inode of the photo's file (or of its mask, `path`), which change
+        with the content. Raises UserError if the file is missing."""
         with _readable(path or self.path, self.name):
             status = (path or self.path).stat()
             return [status.st_size, status.st_mtime_ns, status.st_ino]
@@ -149,9 +124,8 @@ class Photo:
         return image.transpose(_TURNS[self.quarter_turns]) if self.quarter_turns else image
 
     def _drawn_upright(self, drawn: Any) -> Any:
-        """Turn a mask (picture) or labels (tensor) upright if they are shaped like the pixels as stored.
-
-        Most programs draw on photos that they show upright; what was drawn on these stays as it is."""
+        """Turn a mask (picture) or labels (tensor) upright if they are shaped like the pixels as stored. Most
+        programs draw on photos that they show upright, and these stay as they are."""
         width, height = drawn.size if isinstance(drawn, Image.Image) else tuple(drawn.shape)[::-1]
         lies = abs(math.log(width * self.height / (height * self.width)))
         if self.quarter_turns % 2 == 0 or lies <= abs(math.log(width * self.width / (height * self.height))):
@@ -181,21 +155,15 @@ def _undistortion(lens: Lens) -> tuple[Float32[Array, "h w"], Float32[Array, "h 
 
     # OpenCV's origin is the center of the first pixel, hence -0.5.
     pinhole = lens.matrix.numpy() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    coefficients = np.array(lens.distortion or (0.0,) * 4)
-    module = cv2.fisheye if lens.fisheye else cv2
-    size = lens.width, lens.height
-    columns, rows = module.initUndistortRectifyMap(
-        pinhole, coefficients, np.eye(3), pinhole, size, cv2.CV_32FC1
-    )
+    coefficients, size = np.array(lens.distortion or (0.0,) * 4), (lens.width, lens.height)
+    undistort = (cv2.fisheye if lens.fisheye else cv2).initUndistortRectifyMap
+    columns, rows = undistort(pinhole, coefficients, np.eye(3), pinhole, size, cv2.CV_32FC1)
     return columns, rows, _seen(columns, rows)
 
 
 def _seen(columns: Float32[Array, "h w"], rows: Float32[Array, "h w"]) -> Bool[Array, "h w"]:
-    """Return which pixels of the undistorted image sample a valid place in the file.
-
-    Pixels outside the file are invalid. So are those beyond the distortion polynomial's turning point, which
-    show the inside of the photo a second time (there the map is mirrored: its determinant is negative).
-    """
+    """Return which pixels of the undistorted image sample the file, and before the distortion polynomial's
+    turning point. Beyond it the map is mirrored (its determinant is negative), and shows the photo again."""
     height, width = columns.shape
     inside = (columns > -0.5) & (columns < width - 0.5) & (rows > -0.5) & (rows < height - 0.5)
     if min(height, width) < 2:  # too narrow to turn over
@@ -215,16 +183,13 @@ def _turned_size(size: tuple[int, int], quarters: int) -> tuple[int, int]:
 
 def stored_size(path: Path, name: str) -> tuple[tuple[int, int], int]:
     """Read width and height of a file's pixels as stored, and the quarter turns that bring them upright.
-
     Raises UserError for an unreadable file."""
     with _readable(path, name), open_picture(path) as image:
         return image.size, quarter_turns(image)
 
 
 def upright_in_model(tracked: TrackedPhoto, path: Path) -> TrackedPhoto:
-    """Turn a model's photo upright with its file, for `Photo.from_model`.
-
-    Raises UserError for an unreadable file."""
+    """Turn a model's photo upright with its file. Raises UserError for an unreadable file."""
     return upright(tracked, *stored_size(path, tracked.name))
 
 
@@ -244,9 +209,8 @@ def _readable(path: Path, name: str) -> Iterator[None]:
 
 
 def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) -> Image.Image:
-    """Decode a file as stored to 8-bit RGB; a large JPEG may be shrunk, not below `at_least`.
-
-    Gray, CMYK and palettes are converted, 16 bits are reduced, and transparency is dropped."""
+    """Decode a file as stored to 8-bit RGB, without transparency; a large JPEG may be shrunk, not below
+    `at_least`."""
     with _readable(path, name), open_picture(path) as image:
         if at_least is not None and image.width * image.height > _LARGE:
             image.draft(None, at_least)  # does nothing for other formats

@@ -31,26 +31,18 @@ class PhotoFolder:
 
 
 def find_photos(data: Path) -> PhotoFolder:
-    """Find the photos of a scene's folder.
-
-    They are those in images/ or dense/images/ if there are any, otherwise all in the folder and its
-    sub-folders, except masks, results and the like. Links to folders are not followed. Raises UserError for a
-    folder that doesn't exist.
-    """
+    """Find the photos of a scene's folder. They are those in images/ or dense/images/ if there are any,
+    otherwise all in the folder and its sub-folders, except masks, results and the like. Links to folders are
+    not followed. Raises UserError for a folder that doesn't exist."""
     if not data.is_dir():
         raise UserError(f"{data} is not a folder: give the folder with your photos, or a video")
-    for folder in (*(data / f for f in IMAGE_FOLDERS), data):
-        names = tuple(photos_below(folder))
-        if names:
-            return PhotoFolder(folder, names)
-    return PhotoFolder(data, ())
+    found = (PhotoFolder(f, tuple(photos_below(f))) for f in (*map(data.joinpath, IMAGE_FOLDERS), data))
+    return next((photos for photos in found if photos.names), PhotoFolder(data, ()))
 
 
 def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
-    """Group the names by camera and lens: by maker, model, focal length and size.
-
-    Photos without EXIF share a camera if all of them have the same size; otherwise each has its own.
-    """
+    """Group the names by camera and lens: by maker, model, focal length and size. Photos without EXIF share a
+    camera if all of them have the same size; otherwise each has its own."""
     groups: dict[tuple, list[str]] = {}
     silent: dict[str, tuple[int, int]] = {}
     for name in photos.names:

@@ -39,14 +39,10 @@ class Photometry:
 def measure_photometry(
     photos: Sequence[Photo], reconstruction: Reconstruction, at_most: int = 60
 ) -> Photometry | None:
-    """Fit log color = point + photo (robust per photo) to at most `at_most` photos, evenly spaced.
-
-    Unreadable photos are skipped. The result is None if fewer than three photos share enough tracked points.
-    """
-    chosen = photos[:: -(-len(photos) // at_most)] if photos else []
-    point_of: dict[bytes, int] = {}
-    rows: list[tuple[Array, Array, Array]] = []
-    for photo in chosen:
+    """Fit log color = point + photo (robust per photo) to at most `at_most` photos, evenly spaced. Unreadable
+    photos are skipped. The result is None if fewer than three photos share enough tracked points."""
+    rows: list[tuple[Array, ...]] = []
+    for photo in photos[:: max(-(-len(photos) // at_most), 1)]:
         tracked = reconstruction.photos.get(photo.name)
         if tracked is None or len(tracked.points) < _FEWEST_POINTS:
             continue
@@ -56,17 +52,15 @@ def measure_photometry(
             colors, usable = _log_colors(photo, tracked.pixels / [tracked.width, tracked.height])
         except UserError:
             continue
-        ids = np.array([point_of.setdefault(p.tobytes(), len(point_of)) for p in tracked.points])
         rays = tracked.points - tracked.center
         rays = rays / np.linalg.norm(rays, axis=1, keepdims=True).clip(1e-12)
-        rows.append((ids[usable], colors[usable], rays[usable]))
+        index = np.full(len(rays), len(rows))
+        rows.append(tuple(values[usable] for values in (tracked.points, index, colors, rays)))
     if len(rows) < 3:
         return None
-    point = np.concatenate([ids for ids, _, _ in rows])
-    photo_index = np.repeat(np.arange(len(rows)), [len(ids) for ids, _, _ in rows])
-    color = np.concatenate([colors for _, colors, _ in rows])
-    ray = np.concatenate([rays for _, _, rays in rows])
-    shared = np.bincount(point, minlength=len(point_of))[point] >= 2
+    points, photo_index, color, ray = map(np.concatenate, zip(*rows, strict=True))
+    point = np.unique(points, axis=0, return_inverse=True)[1].ravel()
+    shared = np.bincount(point)[point] >= 2
     if shared.sum() < 2 * _FEWEST_POINTS:
         return None
     return _fit(point[shared], photo_index[shared], color[shared], ray[shared])
@@ -123,9 +117,7 @@ def _explained_by_direction(
 ) -> float:
     """Compute the adjusted R² of a linear function of direction, over points seen at least `fewest` times."""
     explained, total = 0.0, 0.0
-    for group in _grouped(point):
-        if len(group) < fewest:
-            continue
+    for group in (group for group in _grouped(point) if len(group) >= fewest):
         centered = ray[group] - ray[group].mean(axis=0)
         gray = residual[group].mean(axis=1)
         gray = gray - gray.mean()

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
+from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 
@@ -41,10 +42,8 @@ class MatchedPair:
 def doubtful_placements(
     rotations: Mapping[int, Float[Array, "3 3"]], pairs: Iterable[MatchedPair]
 ) -> dict[int, str]:
-    """Find photos that are doubtfully placed, with reasons; rotations: world → camera in the model.
-
-    Either more matches contradict a photo's placement than support it, or only one other photo supports it.
-    """
+    """Find photos that are doubtfully placed, with reasons; rotations: world → camera in the model. Either
+    more matches contradict a photo's placement than support it, or only one other photo supports it."""
     reasons: dict[int, str] = {}
     judged = [(pair, _apart(rotations, pair) > APART) for pair in pairs]
     while True:  # the most contradicted first, since its pairs would accuse its neighbors
@@ -55,12 +54,10 @@ def doubtful_placements(
             for photo in (pair.first, pair.second):
                 (contradicting if contradicts else supporting)[photo] += pair.matches
                 supporters[photo] += not contradicts
-        accused = {
-            photo: n - supporting[photo] for photo, n in contradicting.items() if n > supporting[photo]
-        }
+        accused = contradicting - supporting
         if not accused:
             break
-        worst = max(accused, key=lambda photo: accused[photo])
+        worst = max(accused, key=accused.__getitem__)
         reasons[worst] = "most of its matches are with photos that stand elsewhere"
     lonely = [p for p in rotations if p not in reasons and supporters[p] < 2 and len(rotations) > 3]
     return reasons | dict.fromkeys(lonely, "only one other photo supports it")
@@ -68,8 +65,8 @@ def doubtful_placements(
 
 def _apart(rotations: Mapping[int, Float[Array, "3 3"]], pair: MatchedPair) -> float:
     """Compute the angle in degrees between the measured rotation of a pair and the model's."""
-    modeled = rotations[pair.second] @ rotations[pair.first].T
-    return float(np.degrees(np.arccos(np.clip((np.trace(modeled.T @ pair.turn) - 1) / 2, -1, 1))))
+    between = rotations[pair.first] @ rotations[pair.second].T @ pair.turn
+    return float(np.degrees(Rotation.from_matrix(between).magnitude()))
 
 
 def matched_pairs(database: pycolmap.Database, model: pycolmap.Reconstruction) -> list[MatchedPair]:

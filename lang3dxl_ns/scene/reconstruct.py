@@ -17,7 +17,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,8 +31,7 @@ from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
 from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs, rotations_of
-from lang3dxl_ns.scene.reconstruction_report import ReconstructionReport
-from lang3dxl_ns.scene.reconstruction_settings import ReconstructionSettings
+from lang3dxl_ns.scene.reconstruction import ReconstructionReport, ReconstructionSettings
 from lang3dxl_ns.scene.video import extract_frames, is_video
 
 if TYPE_CHECKING:
@@ -42,17 +42,16 @@ _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
 _CONVERTED = (".webp", ".gif")  # formats that Pillow reads and COLMAP does not
 _CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar; a killed process loses one step
+_RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
+"""Thresholds of the incremental mapper where it finds no model with the usual ones."""
 
 
 def reconstruct(
     photos: PhotoFolder, work: Path, model: Path, settings: ReconstructionSettings | None = None
 ) -> ReconstructionReport:
-    """Reconstruct photos, or resume an earlier attempt with the same photos and settings.
-
-    The largest model is written to `model`/0, others to `model`/1 …, and intermediate results to `work`.
-    Raises UserError for fewer than two photos, if `model` already exists, and if the photos do not make a
-    scene; the message says what to do.
-    """
+    """Reconstruct photos, or resume an earlier attempt with the same photos and settings (in `work`). The
+    largest model is written to `model`/0, others to `model`/1 …. Raises UserError that says what to do for
+    fewer than two photos, if `model` already exists, and if the photos do not make a scene."""
     settings = settings or ReconstructionSettings()
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
@@ -72,7 +71,7 @@ def reconstruct(
         raise UserError(_why_no_model(features, partners))
     names = dict(zip(copies.names, good.names, strict=True))
     reasons = _reasons(copies.names, models, features, partners)
-    with _opened(database) as db:
+    with load_pycolmap().Database.open(database) as db:
         doubts = doubtful_placements(rotations_of(models[0]), matched_pairs(db, models[0]))
     doubtful = {names[models[0].images[i].name]: why for i, why in sorted(doubts.items())}
     for image in (image for model in models for image in model.images.values()):
@@ -87,7 +86,7 @@ def reconstruct(
         other_models=tuple(other.num_reg_images() for other in models[1:]),
         seconds={stage: round(seconds, 1) for stage, seconds in clock.items()},
     )  # fmt: skip
-    _publish(models, work, model)
+    _publish(models, model)
     write_atomically(work / "report.json", json.dumps(asdict(report), indent=2))
     return report
 
@@ -95,11 +94,8 @@ def reconstruct(
 def reconstruct_scene(
     data: Path, cache_dir: Path | None = None, settings: ReconstructionSettings | None = None
 ) -> tuple[Path, Path]:
-    """Reconstruct a folder of photos or a video, log the result, and return the scene's folder and model.
-
-    The model is written to sparse/0 in the scene's folder or, if sparse is taken or the folder is read-only,
-    to the cache. Raises UserError like `reconstruct` and `extract_frames`.
-    """
+    """Reconstruct a folder of photos or a video, and return the scene's folder and model: sparse/0 in it or,
+    if sparse is taken or the folder is read-only, in the cache. Raises UserError as `reconstruct` does."""
     data = expanded(data).absolute()
     if is_video(data):
         data = extract_frames(data)
@@ -121,7 +117,6 @@ def model_in(folder: Path) -> bool:
 
 def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     """Separate the readable photos, without duplicate files, from the others, for which reasons are given.
-
     Raises UserError if fewer than two photos are usable."""
     good, left_out = readable(photos)
     first: dict[bytes, str] = {}
@@ -153,7 +148,6 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
 
 def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     """Link the photos under numbers, in their order; formats that COLMAP can't read become converted copies.
-
     COLMAP separates names by spaces, so "photo 1.jpg" would be two names."""
     folder = work / "photos"
     shutil.rmtree(folder, ignore_errors=True)
@@ -206,13 +200,14 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
 def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
     """Extract the SIFT features that are missing in the database."""
     pycolmap = load_pycolmap()
-    with _opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         done = {image.name for image in db.read_all_images() if db.exists_keypoints(image.image_id)}
     missing = [name for name in photos.names if name not in done]
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = settings.max_size
-    options.num_threads = _threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2)
-    options.sift.max_num_features = settings.features
+    options = pycolmap.FeatureExtractionOptions(
+        max_image_size=settings.max_size,
+        num_threads=_threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2),
+        sift={"max_num_features": settings.features},
+    )
     with progress("features of photos", len(missing)) as advance:
         for start in range(0, len(missing), _CHUNK_PHOTOS):
             chunk = missing[start : start + _CHUNK_PHOTOS]
@@ -223,7 +218,7 @@ def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettin
 def _match(database: Path, names: Sequence[str]) -> None:
     """Find and verify the matches of pairs that are missing in the database."""
     pycolmap = load_pycolmap()
-    with _opened(database) as db:
+    with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
         pairs = pairs_to_match(known, lambda name: db.read_descriptors(ids[name]).data)
@@ -232,11 +227,11 @@ def _match(database: Path, names: Sequence[str]) -> None:
             for a, b in pairs
             if not (db.exists_matches(ids[a], ids[b]) and db.exists_two_view_geometry(ids[a], ids[b]))
         ]
-    options = pycolmap.FeatureMatchingOptions()
-    options.num_threads = _threads(5e8)
-    listed = database.with_name("pairs.txt")
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = listed
+    options, listed = (
+        pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8)),
+        database.with_name("pairs.txt"),
+    )
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     with progress("pairs of photos", len(missing)) as advance:
         for start in range(0, len(missing), _CHUNK_PAIRS):
             chunk = missing[start : start + _CHUNK_PAIRS]
@@ -246,63 +241,47 @@ def _match(database: Path, names: Sequence[str]) -> None:
 
 
 def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pycolmap.Reconstruction]:
-    """Run the mapper and return the models, largest first.
-
-    If the incremental mapper finds none with the usual thresholds, lower ones are tried."""
+    """Run the mapper and return the models, largest first. The incremental one may need `_RELAXED`."""
     pycolmap = load_pycolmap()
-    folder = work / "mapping"
-    for relaxed in (False,) if kind == "global" else (False, True):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        with progress("photos with a pose", len(photos.names)) as advance:
+    settings = {"random_seed": 0, "num_threads": os.cpu_count() or 1}
+    least = min(_SMALLEST_MODEL, len(photos.names))
+    for thresholds in ({},) if kind == "global" else ({}, _RELAXED):
+        bar = progress("photos with a pose", len(photos.names))
+        with TemporaryDirectory(dir=work) as folder, bar as advance:
             if kind == "global":
-                options = pycolmap.GlobalPipelineOptions()
-                options.random_seed, options.num_threads = 0, os.cpu_count() or 1
+                options = pycolmap.GlobalPipelineOptions(**settings)
                 found = pycolmap.global_mapping(database, photos.folder, folder, options)
             else:
-                options = _incremental_options(relaxed)
+                options = pycolmap.IncrementalPipelineOptions(
+                    min_model_size=_SMALLEST_MODEL, mapper=thresholds, **settings
+                )
                 found = pycolmap.incremental_mapping(
                     database, photos.folder, folder, options, next_image_callback=advance
                 )
-        shutil.rmtree(folder, ignore_errors=True)
-        least = min(_SMALLEST_MODEL, len(photos.names))
         models = [m for m in found.values() if m.num_reg_images() >= least and m.num_points3D()]
         if models:
             break
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 
-def _incremental_options(relaxed: bool) -> Any:
-    options = load_pycolmap().IncrementalPipelineOptions()
-    options.min_model_size = _SMALLEST_MODEL
-    options.random_seed, options.num_threads = 0, os.cpu_count() or 1
-    if relaxed:
-        options.mapper.init_min_num_inliers = 30
-        options.mapper.init_min_tri_angle = 4.0
-        options.mapper.abs_pose_min_num_inliers = 15
-    return options
-
-
-def _publish(models: list[pycolmap.Reconstruction], work: Path, model: Path) -> None:
+def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:
     """Write all models, and move them into place at once."""
-    complete = model.with_name(f".{model.name}.{os.getpid()}.tmp")
-    shutil.rmtree(complete, ignore_errors=True)
     try:
-        for index, found in enumerate(models):
-            (complete / str(index)).mkdir(parents=True)
-            found.write_binary(complete / str(index))
-        complete.rename(model)
+        with TemporaryDirectory(prefix=f".{model.name}.", dir=model.parent) as folder:
+            complete = Path(folder) / "complete"
+            for index, found in enumerate(models):
+                (complete / str(index)).mkdir(parents=True)
+                found.write_binary(complete / str(index))
+            complete.rename(model)
     except OSError as error:
         raise UserError(
             f"the model can't be written to {model} ({error}): make room, or choose --cache-dir"
         ) from error
-    finally:
-        shutil.rmtree(complete, ignore_errors=True)
 
 
 def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:
     """Count, for every photo, its features and the photos with which it has verified matches."""
-    with _opened(database) as db:
+    with load_pycolmap().Database.open(database) as db:
         images = {image.image_id: image.name for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(number) for number, name in images.items()}
         pairs, inliers = db.read_two_view_geometry_num_inliers()
@@ -354,15 +333,6 @@ def _why_no_model(features: Mapping[str, int], partners: Mapping[str, int]) -> s
 def _threads(memory_each: float) -> int:
     """Return the number of cores, limited by half of the machine's memory."""
     return int(max(1, min(os.cpu_count() or 1, machine_memory() / 2 // memory_each)))
-
-
-@contextmanager
-def _opened(database: Path) -> Iterator[Any]:
-    db = load_pycolmap().Database.open(database)
-    try:
-        yield db
-    finally:
-        db.close()
 
 
 @contextmanager

@@ -24,10 +24,8 @@ class Stand:
 
 def stand_of(camera: Camera, aspect: float, target: tuple[float, ...] | None = None) -> Stand:
     """Compute the viewpoint that shows all of a photo in a window of this aspect ratio (width ÷ height).
-
     `target` is the orbit center, which is moved onto the photo's axis at its distance; None puts it a unit
-    away.
-    """
+    away."""
     view = camera.view_matrix.double().cpu().numpy()
     forward, position = view[2, :3], -view[:3, :3].T @ view[:3, 3]
     ahead = 1.0 if target is None else float((np.asarray(target) - position) @ forward)

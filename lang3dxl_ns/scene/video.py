@@ -25,8 +25,9 @@ _READING = ("-v", "error", "-protocol_whitelist", "file", "-format_whitelist", "
 """Options of ffmpeg for untrusted files: a playlist, for example, could name other files and addresses."""
 
 
-def _address(video: Path) -> str:
-    return f"file:{video.absolute()}"  # a name may look like an option, or like another protocol
+def _reading(program: str, video: Path) -> list[str]:
+    # A name may look like an option, or like another protocol.
+    return [program, *_READING, "-i", f"file:{video.absolute()}"]
 
 
 def is_video(path: Path) -> bool:
@@ -40,11 +41,9 @@ def frames_folder(video: Path) -> Path:
 
 
 def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOST_FRAMES) -> Path:
-    """Write the sharpest frame of every interval of 1/`rate` seconds to `frames_folder`/images, upright.
-
-    Return `frames_folder`. Frames of an earlier call are kept. Raises UserError without ffmpeg, and for a
-    file that is not a video or a very short one.
-    """
+    """Write the sharpest frame of every interval of 1/`rate` seconds to `frames_folder`/images, upright,
+    unless an earlier call did. Raises UserError without ffmpeg, and for a file that is no video or a very
+    short one."""
     folder = frames_folder(video)
     if (folder / "images").is_dir():
         return folder
@@ -72,7 +71,7 @@ def _sharpest(sharpness: Float[Array, " n"], stretches: int) -> Int[Array, " s"]
 def _sharpness(video: Path) -> Float[Array, " n"]:
     """Compute the variance of the Laplacian of every frame, downsized and gray."""
     width, height = _LOOK
-    command = ["ffmpeg", *_READING, "-i", _address(video), "-an", "-vf", f"scale={width}:{height}"]
+    command = [*_reading("ffmpeg", video), "-an", "-vf", f"scale={width}:{height}"]
     command += ["-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "gray", "-"]
     values = []
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
@@ -85,7 +84,7 @@ def _sharpness(video: Path) -> Float[Array, " n"]:
 
 def _duration(video: Path) -> float:
     asked = ("-select_streams", "v:0", "-show_entries", "stream=codec_type:format=duration", "-of", "json")
-    command = ["ffprobe", *_READING, *asked, _address(video)]
+    command = [*_reading("ffprobe", video), *asked]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     try:
         answer = json.loads(found.stdout)
@@ -104,7 +103,7 @@ def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     wanted = "+".join(f"eq(n,{index})" for index in chosen)
-    command = ["ffmpeg", *_READING, "-i", _address(video), "-an", "-vf", f"select='{wanted}'"]
+    command = [*_reading("ffmpeg", video), "-an", "-vf", f"select='{wanted}'"]
     command += ["-fps_mode", "passthrough", "-q:v", "2", str(partial / "frame_%05d.jpg")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode or not any(partial.iterdir()):

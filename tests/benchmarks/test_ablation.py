@@ -258,7 +258,7 @@ def test_new_weights_of_the_same_name_make_runs_anew(tmp_path, monkeypatch):
 
 @pytest.mark.nightly
 def test_the_command_trains_scores_and_reports(tmp_path, capsys):
-    from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
+    from lab.landmark.scene_writer import DemoScene, write_scene
 
     sizes = {"photos": 10, "test_views": 6, "width": 128, "height": 96, "workers": 1}
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=5, **sizes))

@@ -12,8 +12,8 @@ import pytest
 from label_sets import write_plain
 from processes import Process
 
+from lab.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns import cli
-from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.preparation.store import FeatureStore
 
 READING = ("lang3dxl_ns.evaluation.predictions", "_read_array")

@@ -7,7 +7,7 @@ import rich.progress
 import torch
 
 from lang3dxl_ns.common.console import progress, silence_libraries
-from lang3dxl_ns.evaluation.image_metrics import Lpips
+from lang3dxl_ns.evaluation.photo_metrics import Lpips
 
 
 @pytest.mark.parametrize(

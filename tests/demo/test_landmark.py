@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.landmark.labels import (
+from lab.landmark.labels import (
     BUILDING_PARTS,
     CATEGORIES,
     ELEMENT,
@@ -14,13 +13,14 @@ from lang3dxl_ns.demo.landmark.labels import (
     building_mask,
     category_masks,
 )
-from lang3dxl_ns.demo.landmark.landmark import FAMILIES, Landmark
-from lang3dxl_ns.demo.landmark.materials import MATERIALS
-from lang3dxl_ns.demo.landmark.openings import Openings
-from lang3dxl_ns.demo.landmark.photography import random_photo_size, random_view, take_photo
-from lang3dxl_ns.demo.landmark.raycast import Camera, cast
-from lang3dxl_ns.demo.landmark.shading import ShadowMap
-from lang3dxl_ns.demo.landmark.shapes import MISS, Box, Ellipsoid, Frustum, Polytope, gable, prism
+from lab.landmark.landmark import FAMILIES, Landmark
+from lab.landmark.materials import MATERIALS
+from lab.landmark.openings import Openings
+from lab.landmark.photography import random_photo_size, random_view, take_photo
+from lab.landmark.raycast import Camera, cast
+from lab.landmark.shading import ShadowMap
+from lab.landmark.shapes import MISS, Box, Ellipsoid, Frustum, Polytope, gable, prism
+from lang3dxl_ns.common.errors import UserError
 
 FOOT = (0.3, -0.2, 0.1)
 SOLIDS = {

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lab.landmark.labels import PART, SMALLEST_POSITIVE, category_masks
+from lab.landmark.landmark import FAMILIES, Landmark
+from lab.landmark.novel_cameras import EACH, choose_cameras
+from lab.landmark.photography import plain_view, take_photo
+from lab.landmark.raycast import Camera
+from lab.landmark.scene_writer import TEST_POINTS, DemoScene, write_scene
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.landmark.labels import PART, SMALLEST_POSITIVE, category_masks
-from lang3dxl_ns.demo.landmark.landmark import FAMILIES, Landmark
-from lang3dxl_ns.demo.landmark.novel_cameras import EACH, choose_cameras
-from lang3dxl_ns.demo.landmark.photography import plain_view, take_photo
-from lang3dxl_ns.demo.landmark.raycast import Camera
-from lang3dxl_ns.demo.landmark.scene_writer import TEST_POINTS, DemoScene, write_scene
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.novel_views import read_novel_views
 

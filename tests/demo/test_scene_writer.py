@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lab.landmark.labels import PART, SMALLEST_POSITIVE, building_mask, category_masks
+from lab.landmark.landmark import Landmark
+from lab.landmark.photography import take_photo
+from lab.landmark.scene_writer import DemoScene, photo_view, write_scene
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.landmark.labels import PART, SMALLEST_POSITIVE, building_mask, category_masks
-from lang3dxl_ns.demo.landmark.landmark import Landmark
-from lang3dxl_ns.demo.landmark.photography import take_photo
-from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, photo_view, write_scene
 from lang3dxl_ns.scene.colmap import read_reconstruction
 
 PHOTOS, SIZE, SEED = 12, (120, 90), 6

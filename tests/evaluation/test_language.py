@@ -32,8 +32,8 @@ def test_field_and_teacher_are_scored_by_the_same_rules(tmp_path):
     cosines = scorer.queries.cosines(features)
     field = scorer.named(scorer.queries.relevancy_of_cosines(cosines), size)
     teacher = scorer.teacher_maps(features, size)
-    assert scorer.scores("0001.jpg", field)["ap_domes"] == 1.0
-    assert scorer.scores("0001.jpg", teacher, "teacher_")["teacher_ap_domes"] == 1.0
+    assert scorer.scores("0001.jpg", {"": field})["ap_domes"] == 1.0
+    assert scorer.scores("0001.jpg", {"teacher_": teacher})["teacher_ap_domes"] == 1.0
 
 
 def test_published_prompts_are_joined_with_common_words_and_compete_with_canonical_phrases_alone(tmp_path):

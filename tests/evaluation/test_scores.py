@@ -222,7 +222,7 @@ def test_noise_of_jpeg_changes_no_score(tmp_path, mask):
     for quality in (20, 50, 80):
         write_holyscenes(tmp_path / str(quality), "domes", "0001", mask, quality)
         scorer = MapScorer(GroundTruth(tmp_path / str(quality)))
-        assert scorer.scores("0001.jpg", maps) == exact
+        assert scorer.scores("0001.jpg", {"": maps}) == exact
 
 
 def test_photos_without_a_positive_are_counted_once(tmp_path, mask):
@@ -231,7 +231,7 @@ def test_photos_without_a_positive_are_counted_once(tmp_path, mask):
     scorer = MapScorer(GroundTruth(tmp_path))
     maps = {"domes": torch.rand(20, 30), "windows": torch.rand(20, 30)}
     for prefix, variant in scorer.variants(maps).items():
-        assert f"{prefix}ap_domes" not in scorer.scores("0001", variant, prefix)
+        assert f"{prefix}ap_domes" not in scorer.scores("0001", {prefix: variant})
     assert scorer.protocol("none")["photos_without_positives"] == {"domes": 1}
 
 
@@ -242,11 +242,11 @@ def test_masks_are_scored_in_three_ways_and_labels_by_langsplats_measures(tmp_pa
     assert list(MapScorer(GroundTruth(tmp_path / "masks")).variants(maps)) == ["", "raw_", "authors_"]
     scorer = MapScorer(GroundTruth(tmp_path / "labels"))
     assert list(scorer.variants(maps)) == [""]
-    assert {"smooth_located_domes", "smooth_iou_domes"} <= set(scorer.scores("0001", maps))
+    assert {"smooth_located_domes", "smooth_iou_domes"} <= set(scorer.scores("0001", {"": maps}))
 
 
 def test_the_raw_score_is_that_of_the_map_itself(tmp_path, mask):
     write_plain(tmp_path, "domes", "0001", mask)
     scorer, maps = MapScorer(GroundTruth(tmp_path)), {"domes": torch.rand(20, 30)}
-    raw = scorer.scores("0001", scorer.variants(maps)["raw_"], "raw_")["raw_ap_domes"]
+    raw = scorer.scores("0001", scorer.variants(maps))["raw_ap_domes"]
     assert raw == pytest.approx(average_precision(maps["domes"].numpy(), mask[::2, ::2]))

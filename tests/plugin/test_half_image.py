@@ -7,7 +7,7 @@ from conftest import make_trainer
 from lang3dxl_ns.components.looks import Look
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.evaluation.half_image import HalfImageProtocol
-from lang3dxl_ns.evaluation.image_metrics import psnr
+from lang3dxl_ns.evaluation.photo_metrics import psnr
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 
 USE = "pipeline__model__appearance__use"

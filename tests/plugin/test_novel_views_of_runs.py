@@ -10,10 +10,11 @@ from conftest import make_trainer
 from label_sets import write_plain
 from PIL import Image
 
+from lab.landmark.scene_writer import write_novel_cameras
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.colmap import read_reconstruction
-from lang3dxl_ns.scene.novel_views import FOLDER, write_novel_cameras
+from lang3dxl_ns.scene.novel_views import FOLDER
 
 HELD_OUT = ("photo_000.jpg", "photo_008.jpg")
 

@@ -3,8 +3,8 @@
 import pytest
 from conftest import make_trainer
 
-from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
-from lang3dxl_ns.demo.landmark.scene_writer import write_scene
+from lab.landmark.demo_scene import DemoScene
+from lab.landmark.scene_writer import write_scene
 from lang3dxl_ns.evaluation.aggregate import average
 
 SMALL = {

@@ -9,8 +9,8 @@ import torch
 from conftest import make_trainer
 from PIL import Image
 
+from lab.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.preparation.collection import plan_crops
 from lang3dxl_ns.preparation.needs import Sources, needs_table, read_needs, scene_needs, write_needs

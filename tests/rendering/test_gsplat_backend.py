@@ -5,6 +5,7 @@ import torch
 from splat_clouds import gradients, make_cloud, maps, relative_error
 
 from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering.gaussians import ALPHA_MIN
 from lang3dxl_ns.scene.camera import Camera
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -16,15 +17,17 @@ def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, heigh
     assert {tensor.dtype for tensor in (means, quats, scales, opacities, colors, viewmats, Ks)} == {
         torch.float32
     }
-    depth = settings.pop("render_mode", "RGB") == "RGB+ED"
+    depth = settings.pop("render_mode", "RGB") == "RGB+D"
     rendering = rasterize(
         Gaussians(means, quats, scales, opacities), Camera(viewmats[0], Ks[0], width, height), colors,
-        settings.pop("backgrounds")[0], near=settings.pop("near_plane"), eps2d=settings.pop("eps2d"),
+        near=settings.pop("near_plane"), eps2d=settings.pop("eps2d"),
         antialiased=settings.pop("rasterize_mode") == "antialiased", render_depth=depth,
         absgrad=settings.pop("absgrad", False), backend="torch",
     )  # fmt: skip
     assert not settings
-    image = torch.cat([rendering.image, rendering.depth], dim=2) if depth else rendering.image
+    image = rendering.image
+    if depth:  # accumulated
+        image = torch.cat([image, rendering.depth * rendering.alpha.clamp_min(ALPHA_MIN / 2)], dim=2)
     return image[None], rendering.alpha[None], {**rendering.info, "tile_size": 16}
 
 

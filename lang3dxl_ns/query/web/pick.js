@@ -2,7 +2,7 @@
 import { floats } from "./decode.js";
 
 const BLUR = 0.3; // square pixels added to every splat's variance, as in training
-const MARGIN = 1.3; // half sizes of the picture beyond which a splat keeps its shape at this limit: see ellipses.py
+const MARGIN = 1.3; // half sizes of the picture beyond which a splat keeps its shape at this limit: see gaussians.py
 
 /** Unpack centers [3n] (relative to the scene's origin), axes [9n] scaled by standard deviations, opacities [n]. */
 export function unpackSplats(buffer) {

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lang3dxl_ns.demo.landmark.shapes import floats
+from lab.landmark.shapes import floats
 
 # name: (color, pattern, gloss). Colors are linear reflectances.
 _KINDS: dict[str, tuple[tuple[float, float, float], str, float]] = {

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from lab.landmark.families import cathedral, hall, mosque
+from lab.landmark.labels import BUILDING_PARTS, PARTS
+from lab.landmark.materials import Material
+from lab.landmark.shapes import Shape
+from lab.landmark.surroundings import place_surroundings
+from lab.landmark.vocabulary import Builder
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.demo.landmark.families import cathedral, hall, mosque
-from lang3dxl_ns.demo.landmark.labels import BUILDING_PARTS, PARTS
-from lang3dxl_ns.demo.landmark.materials import Material
-from lang3dxl_ns.demo.landmark.shapes import Shape
-from lang3dxl_ns.demo.landmark.surroundings import place_surroundings
-from lang3dxl_ns.demo.landmark.vocabulary import Builder
 
 _GRAMMARS = {"cathedral": cathedral, "mosque": mosque, "hall": hall}
 FAMILIES = tuple(_GRAMMARS)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lang3dxl_ns.demo.landmark.shapes import MISS, NEAREST, Shape, Surface, Vector
+from lab.landmark.shapes import MISS, NEAREST, Shape, Surface, Vector
 
 DOORS = ("leaves", "panels", "tympanum", "open")
 """Fillings of portals."""

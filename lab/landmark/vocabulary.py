@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lang3dxl_ns.demo.landmark.labels import ELEMENT, PART
-from lang3dxl_ns.demo.landmark.materials import COVERING, MASONRY, make_material
-from lang3dxl_ns.demo.landmark.openings import Openings
-from lang3dxl_ns.demo.landmark.shape_list import Point, ShapeList
+from lab.landmark.labels import ELEMENT, PART
+from lab.landmark.materials import COVERING, MASONRY, make_material
+from lab.landmark.openings import Openings
+from lab.landmark.shape_list import Point, ShapeList
 
 FRONT, LEFT, BACK, RIGHT = 0.0, math.pi / 2, math.pi, -math.pi / 2
 """Facings of walls, as angles from +x, which the façade faces."""

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int, Int16, UInt8
 from numpy import ndarray as Array
 
-from lang3dxl_ns.demo.landmark.materials import Material, fractal_noise
-from lang3dxl_ns.demo.landmark.raycast import Camera, SunCamera, cast
-from lang3dxl_ns.demo.landmark.shapes import Shape, floats
+from lab.landmark.materials import Material, fractal_noise
+from lab.landmark.raycast import Camera, SunCamera, cast
+from lab.landmark.shapes import Shape, floats
 
 SHADOW_MAP = 256
 """Pixels per side of the shadow map, about 0.3 m each on a landmark of 40 m radius."""

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lang3dxl_ns.demo.landmark.labels import PART
-from lang3dxl_ns.demo.landmark.materials import MASONRY, colored, make_material
-from lang3dxl_ns.demo.landmark.openings import Openings
-from lang3dxl_ns.demo.landmark.shape_list import Point, ShapeList
-from lang3dxl_ns.demo.landmark.vocabulary import Builder, above, ahead
+from lab.landmark.labels import PART
+from lab.landmark.materials import MASONRY, colored, make_material
+from lab.landmark.openings import Openings
+from lab.landmark.shape_list import Point, ShapeList
+from lab.landmark.vocabulary import Builder, above, ahead
 
 
 def place_surroundings(b: Builder, center, radius: float) -> None:

@@ -6,7 +6,7 @@ import json
 import multiprocessing
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -15,14 +15,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lang3dxl_ns.common.console import progress
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.demo.landmark.demo_scene import DemoScene
-from lang3dxl_ns.demo.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
-from lang3dxl_ns.demo.landmark.landmark import Landmark
-from lang3dxl_ns.demo.landmark.novel_cameras import choose_cameras
-from lang3dxl_ns.demo.landmark.photography import (
+from lab.landmark.demo_scene import DemoScene
+from lab.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
+from lab.landmark.landmark import Landmark
+from lab.landmark.novel_cameras import choose_cameras
+from lab.landmark.photography import (
     Shot,
     View,
     plain_view,
@@ -30,8 +27,8 @@ from lang3dxl_ns.demo.landmark.photography import (
     random_view,
     take_photo,
 )
-from lang3dxl_ns.demo.landmark.raycast import Camera
-from lang3dxl_ns.demo.landmark.sparse_model import (
+from lab.landmark.raycast import Camera
+from lab.landmark.sparse_model import (
     POINTS,
     Similarity,
     TakenPhoto,
@@ -39,9 +36,12 @@ from lang3dxl_ns.demo.landmark.sparse_model import (
     sample_points,
     write_model,
 )
+from lang3dxl_ns.common.console import progress
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import TrackedPhoto
-from lang3dxl_ns.scene.novel_views import FOLDER, write_novel_cameras
+from lang3dxl_ns.scene.novel_views import CAMERAS, FOLDER
 
 HELD_OUT_EVERY = 8
 """Interval of nerfstudio's split: of the photos sorted by name, 0, 8, 16 … are held out."""
@@ -197,6 +197,23 @@ def _tracked(view: TakenPhoto, similarity: Similarity) -> TrackedPhoto:
         points=points,
         pixels=np.zeros((len(points), 2)),
     )
+
+
+def write_novel_cameras(folder: Path, cameras: Sequence[TrackedPhoto], same_light: bool) -> None:
+    """Write test_views/cameras.json into a scene's `folder`; views are named after their files."""
+    views = [
+        {
+            "name": g.name,
+            "width": g.width,
+            "height": g.height,
+            "intrinsics": [g.lens.fx, g.lens.fy, g.lens.cx, g.lens.cy],
+            "camera_from_world": g.camera_from_world.tolist(),
+            "points": g.points.round(6).tolist(),
+        }
+        for g in cameras
+    ]
+    content = {"same_light": same_light, "views": views}
+    (folder / FOLDER / CAMERAS).write_text(json.dumps(content) + "\n")
 
 
 def _write_truth(shot: Shot, save_photo, order: _Order) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from lang3dxl_ns.demo.landmark.vocabulary import (
+from lab.landmark.vocabulary import (
     BACK,
     FRONT,
     LEFT,

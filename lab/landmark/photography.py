@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
-from lang3dxl_ns.demo.landmark.labels import PART, building_mask
-from lang3dxl_ns.demo.landmark.landmark import Landmark
-from lang3dxl_ns.demo.landmark.materials import MATERIALS, Material
-from lang3dxl_ns.demo.landmark.raycast import Camera, cast
-from lang3dxl_ns.demo.landmark.shading import ShadowMap, Weather, light, trace
-from lang3dxl_ns.demo.landmark.shapes import MISS, Shape, floats
-from lang3dxl_ns.demo.landmark.surroundings import passers_by
+from lab.landmark.labels import PART, building_mask
+from lab.landmark.landmark import Landmark
+from lab.landmark.materials import MATERIALS, Material
+from lab.landmark.raycast import Camera, cast
+from lab.landmark.shading import ShadowMap, Weather, light, trace
+from lab.landmark.shapes import MISS, Shape, floats
+from lab.landmark.surroundings import passers_by
 
 SMALLEST_SHARE = 0.18
 """Least share of a picture that the building must fill. Photos with less are not taken."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int16
 from numpy import ndarray as Array
 
-from lang3dxl_ns.demo.landmark.shapes import MISS, NEAREST, Shape, Vector
+from lab.landmark.shapes import MISS, NEAREST, Shape, Vector
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lang3dxl_ns.demo.landmark.labels import PART
-from lang3dxl_ns.demo.landmark.materials import Material
-from lang3dxl_ns.demo.landmark.shapes import Box, Ellipsoid, Frustum, Polytope, Shape, gable, prism
+from lab.landmark.labels import PART
+from lab.landmark.materials import Material
+from lab.landmark.shapes import Box, Ellipsoid, Frustum, Polytope, Shape, gable, prism
 
 Point = tuple[float, float, float]
 

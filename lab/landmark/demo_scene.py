@@ -1,4 +1,4 @@
-"""Settings of a demo scene, apart from the generator so that `lang3dxl demo-scene --help` starts fast."""
+"""`lang3dxl demo-scene`, apart from the generator so that its help starts fast."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.settings_help import showing
 
+
+@showing("out", "photos", "seed", "family")
 @dataclass
 class DemoScene:
     """Generate a demo scene: photos of a procedural landmark."""
@@ -31,3 +35,9 @@ class DemoScene:
     people. 0 makes none."""
     workers: int | None = None
     """Number of processes. The default is one per CPU core."""
+
+    def main(self) -> None:
+        from lab.landmark.scene_writer import write_scene
+
+        folder = write_scene(self)
+        say(f"{self.photos} photos, COLMAP model, masks and ground truth in {folder}")

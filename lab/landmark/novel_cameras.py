@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lang3dxl_ns.demo.landmark.labels import SMALLEST_POSITIVE, category_masks
-from lang3dxl_ns.demo.landmark.landmark import Landmark
-from lang3dxl_ns.demo.landmark.photography import plain_view, random_camera
-from lang3dxl_ns.demo.landmark.raycast import Camera
-from lang3dxl_ns.demo.landmark.shading import trace
+from lab.landmark.labels import SMALLEST_POSITIVE, category_masks
+from lab.landmark.landmark import Landmark
+from lab.landmark.photography import plain_view, random_camera
+from lab.landmark.raycast import Camera
+from lab.landmark.shading import trace
 
 EACH = 5
 """Minimum number of views that show each category, or a third of the views if there are fewer than 15."""

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray as Array
 
-from lang3dxl_ns.demo.landmark.labels import PART
-from lang3dxl_ns.demo.landmark.photography import Shot
-from lang3dxl_ns.demo.landmark.raycast import Camera
+from lab.landmark.labels import PART
+from lab.landmark.photography import Shot
+from lab.landmark.raycast import Camera
 from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 
 POINTS = 24_000

@@ -1,0 +1,123 @@
+"""Evaluated photo: PSNR and LPIPS of its rendering; L1, PSNR and cosine of its decoded features."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor, nn
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig
+from lang3dxl_ns.evaluation.scores import Maps
+
+ALEXNET = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
+"""Address of the AlexNet weights that LPIPS uses, as torchvision publishes them."""
+
+
+@dataclass
+class EvaluatedPhoto:
+    """Figures of a photo, and the pictures behind them."""
+
+    name: str
+    metrics: dict[str, float]
+    """Figures of the photo: psnr etc., `render_seconds`, and with appearance `half_psnr` etc. With ground
+    truth also `query_seconds`, and `ap_{category}` etc. with the prefixes of `evaluation.aggregate`."""
+    images: dict[str, Tensor]
+    """Pictures by name: `img` (photo beside rendering, [H, 2W, 3]), with semantics `bottleneck`, and with
+    appearance `fitted`, the rendering in the look of the half-image protocol."""
+    maps: Maps
+    """Relevancy by category, as queries show it, at the size of scoring; empty without ground truth."""
+    masked: bool = False
+    """Whether the maps are restricted to a foreground mask."""
+
+    def write_pictures(self, folder: Path) -> None:
+        """Write every picture to `folder` as a JPEG named after the photo."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, image in self.images.items():
+            pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
+            Image.fromarray(pixels).save(folder / f"{self.name.replace('/', '_')}.{name}.jpg")
+
+
+def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
+    """Compute the peak signal-to-noise ratio in decibels, for a peak of 1."""
+    return -10 * torch.log10(F.mse_loss(predicted, target).clamp_min(1e-10))
+
+
+class Lpips:
+    """LPIPS (AlexNet), loaded at first use. It is skipped unless its weights are in torch's cache, because
+    nothing is downloaded without a request. It is not an nn.Module, so that AlexNet stays out of
+    checkpoints."""
+
+    @cached_property
+    def _metric(self) -> nn.Module | None:
+        if not _weights().is_file():
+            say(f"LPIPS is skipped: it needs {ALEXNET}, put into {_weights().parent}")
+            return None
+        from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
+
+        try:
+            return LearnedPerceptualImagePatchSimilarity(normalize=True)
+        except (OSError, RuntimeError) as error:  # damaged file
+            say(f"LPIPS is skipped: its weights cannot be loaded ({error})")
+            return None
+
+    def __call__(self, target: Float[Tensor, "1 3 h w"], predicted: Float[Tensor, "1 3 h w"]) -> float | None:
+        """Compute the distance of two images in [0, 1]; None without weights."""
+        if self._metric is None:
+            return None
+        return float(self._metric.to(target.device)(target, predicted.clamp(0, 1)))
+
+
+def _weights() -> Path:
+    return Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET.rpartition("/")[2]
+
+
+def match(
+    features: Float[Tensor, "h w c"],
+    target: Float[Tensor, "hd wd c"],
+    crop_sides: Sequence[float],
+    mask: Float[Tensor, "h w"] | None = None,
+) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
+    """Average features over the target's crops, and compute the weight of each cell. The kernel is the
+    downsampler's without its learned attenuation, so it is the same for every way of training."""
+    kernel = AttenuatedDownsampler(DownsamplerConfig(hidden=0), features.shape[-1])
+    return kernel(features, (target.shape[0], target.shape[1]), crop_sides, mask)
+
+
+def feature_metrics(
+    kind: str,
+    predicted: Float[Tensor, "h w c"],
+    target: Float[Tensor, "h w c"],
+    mean: Float[Tensor, " c"],
+    weight: Float[Tensor, "h w"] | None = None,
+) -> dict[str, float]:
+    """Compute L1, PSNR (peak 1) and cosine of `predicted`, and the same for predicting the `mean` everywhere.
+
+    Features are compared on the encoder's own scale, as in Lang3D-XL's encoder ablation. Cells of zero weight
+    (no foreground) are ignored. Keys are `{kind}_l1`, `{kind}_psnr` and `{kind}_cosine`, and the same with
+    `_of_mean` appended.
+    """
+    cells = target.new_ones(target.shape[:2], dtype=torch.bool) if weight is None else weight > 0
+    if not cells.any():
+        return {}
+    metrics = _agreement(predicted[cells], target[cells])
+    baseline = _agreement(mean.expand_as(target)[cells], target[cells])
+    return {f"{kind}_{name}": value for name, value in metrics.items()} | {
+        f"{kind}_{name}_of_mean": value for name, value in baseline.items()
+    }
+
+
+def _agreement(predicted: Float[Tensor, "n c"], target: Float[Tensor, "n c"]) -> dict[str, float]:
+    predicted, target = predicted.double(), target.double()
+    return {
+        "l1": float(F.l1_loss(predicted, target)),
+        "psnr": float(psnr(predicted, target)),
+        "cosine": float(F.cosine_similarity(predicted, target, dim=-1).mean()),
+    }
