@@ -39,6 +39,8 @@ _SECONDS_PER_DRAW, _SECONDS_PER_GAUSSIAN = 1e-5, 1e-4
 """Time on one core per Gaussian drawn in a step and per Gaussian searched, for the announced duration."""
 _MOST_GROWTH = 3
 """Largest factor of steps and sample; more takes longer and hardly improves the features (docs/scale.md)."""
+_BLENDS = 0.9
+"""Fraction of blends among the draws where codes are composited before they are decoded, as in the paper."""
 _SEARCHES = (0.4, 0.6, 0.8)
 """Fractions of the steps after which the sample's codes are searched anew, because descent alone leaves some
 of them in the wrong place."""
@@ -108,10 +110,21 @@ def fit(
     config: CompressionConfig,
     generator: torch.Generator | None = None,
     advance: Callable[[], None] = lambda: None,
+    blends: float = 0.0,
 ) -> Float[Tensor, "m code"]:
     """Train the field and the codes of these Gaussians together, and return the codes.
 
-    The loss is the mean absolute difference over Gaussians drawn with probability ∝ √mass."""
+    The loss is the mean absolute difference over Gaussians drawn with probability ∝ √mass.
+
+    Args:
+        sample: the Gaussians' features.
+        field: the field, which is trained in place.
+        config: steps, batch and rates.
+        generator: source of the draws.
+        advance: called after every step.
+        blends: fraction of the draws that are replaced by blends of two Gaussians, whose codes decode to the
+            same blend of their features. Codes are then not searched anew, which would scatter them.
+    """
     place = field.output_mean
     if not len(sample.mass):
         return place.new_empty(0, field.code_dim)
@@ -126,18 +139,27 @@ def fit(
     optimizer = torch.optim.Adam(groups, eps=1e-15)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.steps, eta_min=0.0)
     chances = weight.cpu().double().cumsum(0)
-    searches = {round(share * config.steps) for share in _SEARCHES}
+    searches = set() if blends else {round(share * config.steps) for share in _SEARCHES}
+
+    def draw() -> Int[Tensor, " batch"]:
+        place = torch.rand(config.batch, generator=generator, dtype=torch.float64) * chances[-1]
+        return torch.searchsorted(chances, place).clamp_max(len(chances) - 1)
+
     field.set_progress(1.0)
     with torch.enable_grad():
         for step in range(config.steps):
             if step in searches and step:
                 codes.data.copy_(_search(sample, field, codes.data, basis))
-            draws = torch.rand(config.batch, generator=generator, dtype=torch.float64) * chances[-1]
-            rows = torch.searchsorted(chances, draws).clamp_max(len(chances) - 1)
-            wanted = sample.rows(rows, codes)
+            rows = draw()
+            wanted, used = sample.rows(rows, codes), codes[rows.to(codes.device)]
+            if blends:
+                other, (part, mixed) = draw(), torch.rand(2, config.batch, 1, generator=generator)
+                part = (part * (mixed < blends)).to(codes)
+                used = used.lerp(codes[other.to(codes.device)], part)
+                wanted = wanted.lerp(sample.rows(other, codes), part)
             if basis is not None:
                 wanted = basis.features(wanted)
-            loss = (field.decode_clip(codes[rows.to(codes.device)]) - wanted).abs().mean()
+            loss = (field.decode_clip(used) - wanted).abs().mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -347,7 +369,7 @@ class JointField(_LearningField):
         config = self.compression.grown(len(features))
         step = self._step(len(features), advance)
         sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
-        codes = fit(sample, self, config, generator, step)
+        codes = fit(sample, self, config, generator, step, _BLENDS)
         return assign(features, mass, self, codes, basis)
 
 
