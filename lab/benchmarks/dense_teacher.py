@@ -45,7 +45,6 @@ from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.engine import PerGaussian, QueryEngine
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
@@ -162,7 +161,7 @@ class Comparison:
 
 def engine_of(scene: Scene, features: Float[Tensor, "n c"]) -> PerGaussian:
     rows = F.normalize(torch.where(features.isfinite(), features, 0.0), dim=1).half()
-    return PerGaussian(GaussianFeatures(rows, None, (rows != 0).any(1)), scene.engine.temperature)
+    return PerGaussian(rows, temperature=scene.engine.temperature)
 
 
 @dataclass(frozen=True, eq=False)

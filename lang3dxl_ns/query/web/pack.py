@@ -20,7 +20,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.hash_grid import HASH_PRIMES
 from lang3dxl_ns.components.semantic_field import SemanticField
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera
@@ -111,7 +111,7 @@ def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning
     Raises:
         UserError: the rows of a wide decoder are too large for a page.
     """
-    decoded = GaussianFeatures.of(decoder, codes)
+    decoded = PerGaussian.of(decoder, codes)
     rows = decoded.rows.cpu()
     width = rows.shape[1]
     gram = None if decoded.head is None else (decoded.head @ decoded.head.T).flatten().tolist()
