@@ -23,11 +23,10 @@ from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
+from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
 from lang3dxl_ns.rendering.splats import Splats
 
 _LIGHT = 0.15

@@ -21,8 +21,8 @@ from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
-from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.match import as_bytes, save_picture
+from lang3dxl_ns.query.visibility import fingerprint
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.rendering.projection import rotations
 from lang3dxl_ns.rendering.render import Rendering, composite, render

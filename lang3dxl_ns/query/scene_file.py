@@ -26,6 +26,7 @@ from torch import Tensor
 
 from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded, write_atomically
@@ -37,7 +38,7 @@ from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
-from lang3dxl_ns.query.teach import TaughtWord
+from lang3dxl_ns.query.teach import TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering.splats import Splats
@@ -149,6 +150,30 @@ def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
     write_atomically(path, len(start).to_bytes(8, "little") + start + content[begin:])
 
 
+def with_words_of(scene: Scene, earlier: Path) -> Scene:
+    """Return the scene with the taught words of the file that it replaces, where it doesn't know them. Log
+    which are kept and how, and which are lost. A missing file has no words."""
+    if not earlier.is_file():
+        return scene
+    try:
+        words = describe_scene_file(earlier)["taught"]
+    except UserError as error:
+        say(f"Words taught in {earlier.name} are lost: {error}")
+        return scene
+    for word in words:
+        if (name := known_word(word.name)) in scene.words:
+            continue
+        try:
+            scene = scene.carrying(word)
+        except UserError as error:
+            say(f"The taught word {word.name!r} is lost: {error}")
+            continue
+        count = len(scene.words[name].examples)
+        how = f"learned anew from its examples ({count})" if count else "as it was: check it in a few photos"
+        say(f"The taught word {word.name!r} is kept, {how}")
+    return scene
+
+
 def _stored_codes(codes: Float[Tensor, "n d"], bounded: bool) -> Shaped[Array, "n d"]:
     """Convert bounded codes to the 16-bit coordinates in (0, 1) that the hash grid reads; keep others."""
     if not bounded:
@@ -230,9 +255,9 @@ def read_scene(
     background = None if file.background is None else torch.tensor(file.background, device=device)
     return Scene(
         splats, replace(file.scene, photos=photos), decoder, codes,
-        looks=looks, background=background, config=config, encode_texts=encode_texts,
-        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"), words=file.taught,
-    )  # fmt: skip
+        looks=looks, background=background, config=config or QueryConfig(), encode_texts=encode_texts,
+        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
+    ).with_words(file.taught)  # fmt: skip
 
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:

@@ -5,7 +5,6 @@ Numbers are little-endian. docs/share.md lists the files.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -192,9 +191,3 @@ def halves(values: Tensor) -> bytes:
 
 def _array(values: Tensor) -> Shaped[Array, "..."]:
     return values.detach().float().cpu().numpy()
-
-
-def spread(items: Sequence[Any], most: int) -> list[Any]:
-    """Choose at most this many of the items, evenly spaced."""
-    count = min(most, len(items))
-    return [items[i * len(items) // count] for i in range(count)]
