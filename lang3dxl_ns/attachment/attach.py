@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame, side_by_side
+from lang3dxl_ns.attachment.attach_config import AttachConfig
+from lang3dxl_ns.attachment.frames import camera_in, find_frame, side_by_side
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.attachment.learn import learn, prepare_photos, scene_file, settled
 from lang3dxl_ns.attachment.segment import segmented
-from lang3dxl_ns.attachment.views import Up, rendered_views
+from lang3dxl_ns.attachment.views import rendered_views
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
@@ -22,7 +22,6 @@ from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
-from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
@@ -32,22 +31,6 @@ from lang3dxl_ns.rendering.splats import Splats
 _LIGHT = 0.15
 """Deviation of the photos' brightness (natural logarithm) above which a message reports it."""
 _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
-
-
-@dataclass
-class AttachConfig:
-    """Settings of `attach`."""
-
-    views: int = 48
-    """Number of views of the splat to render and learn from, without photos."""
-    up: Up = "auto"
-    """Axis of the splat that points up, without photos. With auto, it is estimated from the ground."""
-    cache_dir: Path | None = None
-    """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
-    segment: tuple[str, ...] = ()
-    """Words that a segmenter, `preparation.foreground_model`, finds in the photos and teaches the scene."""
-    preparation: PreparationConfig = field(default_factory=PreparationConfig)
-    """Settings of encoders, crops and foreground."""
 
 
 def attach(
@@ -80,7 +63,7 @@ def attach(
         raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
     if data is None and place is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
-    preparation = settled(config.preparation)
+    preparation = settled(config)
     option_prefix.set("--")
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
@@ -131,9 +114,17 @@ def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path 
     no frame matches."""
     if collection.left_out:
         say(f"{len(collection.left_out)} photos are left out: {some(list(collection.left_out.values()), 3)}")
-    fit = find_frame(splats, collection, path)
+    fit, shown = find_frame(splats, collection, path), ""
     if not fit.fits:
-        raise UserError(_no_fit(splats, collection, fit, place))
+        if place is not None:
+            picture = place.with_name(f"{place.stem}.frame.png")
+            save_picture(side_by_side(splats, collection, fit), picture)
+            shown = f"; {picture} shows a photo beside the splat at its camera"
+        raise UserError(
+            f"the photos in {collection.folder} don't show this splat in any frame that programs use (the "
+            f"best, {fit.name}, agrees to {fit.score:.2f} of 1){shown}: give the photos and poses that the "
+            "splat was trained with, or leave out --data"
+        )
     say(f"the splat's frame is {fit.name}: renderings agree with their photos to {fit.score:.2f} (of 1)")
     if fit.lighting > _LIGHT:
         say(
@@ -141,16 +132,3 @@ def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path 
             "learned all the same; the scene keeps the splat's colors"
         )
     return fit.similarity
-
-
-def _no_fit(splats: Splats, collection: PhotoCollection, fit: Fit, place: Path | None) -> str:
-    shown = ""
-    if place is not None:
-        picture = place.with_name(f"{place.stem}.frame.png")
-        save_picture(side_by_side(splats, collection, fit), picture)
-        shown = f"; {picture} shows a photo beside the splat at its camera"
-    return (
-        f"the photos in {collection.folder} don't show this splat in any frame that programs use (the best, "
-        f"{fit.name}, agrees to {fit.score:.2f} of 1){shown}: give the photos and poses that the splat was "
-        "trained with, or leave out --data"
-    )

@@ -33,14 +33,8 @@ def segmented(
     """Teach a scene a word by a segmenter; if that finds nothing, say so and return the same scene.
 
     Each photo votes about the Gaussians that it shows, so the others outvote an error in one photo. The word
-    is then learned from the Gaussians with a majority, as from marks by a person.
-
-    Args:
-        scene: the scene.
-        word: the word to teach.
-        segmenter: segmenter that finds the word in photos.
-        photos: photos of the scene.
-        cameras: camera of each photo, at the file's resolution, in the scene's frame.
+    is then learned from the Gaussians with a majority, as from marks by a person. `cameras` holds the photos'
+    cameras, at the files' resolution, in the scene's frame.
     """
     masks: dict[str, Bool[Tensor, "h w"]] = {}
 

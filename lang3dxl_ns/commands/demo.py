@@ -1,4 +1,4 @@
-"""`lang3dxl demo`: the full workflow on a generated scene, from photos to average precision."""
+"""`lang3dxl demo` and `demo-scene`: the full workflow on a generated landmark, and its photos alone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,18 @@ if TYPE_CHECKING:
 
 RUN = Path("run", "lang3dxl", "demo")
 """Folder of the run inside the demo's folder."""
-_STAGES = "stages.json"
+
+
+@showing("out", "photos", "seed", "family")
+@dataclass
+class GenerateScene(DemoScene):
+    """Generate a demo scene: photos of a procedural landmark."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.demo.landmark.scene_writer import write_scene
+
+        folder = write_scene(self)
+        say(f"{self.photos} photos, COLMAP model, masks and ground truth in {folder}")
 
 
 @showing("out", "quick", "steps", "seed")
@@ -78,11 +89,14 @@ class Demo:
             sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
-        stages = Stages(SHARES, out / _STAGES)
-        if (out / "scene" / "scene.json").exists():
+        from lang3dxl_ns.demo.landmark.scene_writer import write_scene
+
+        stages, scene = Stages(_SHARES, out / "stages.json"), out / "scene"
+        if kept := (scene / "scene.json").exists():
             say("scene: kept from an earlier command")
         with stages.stage("scene"):
-            scene = self._scene(out)
+            if not kept:
+                write_scene(DemoScene(out=scene, **{"family": self.family, **self._wanted}))
         config = self._config(scene, out)
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
         trainer.stages = stages
@@ -132,28 +146,22 @@ class Demo:
             found = dict(read_json(path))
         except (OSError, ValueError, TypeError) as error:
             return f"{path} can't be read ({error})"
-        different = (n for n, value in self._wanted.items() if found.get(n, 0) != value)
-        if (name := next(different, None)) is None:
-            return None
-        return f"{path.parent} is a scene with {name} {found.get(name, 0)}, not {self._wanted[name]}"
+        for name, value in self._wanted.items():
+            if found.get(name, 0) != value:
+                return f"{path.parent} is a scene with {name} {found.get(name, 0)}, not {value}"
+        return None
 
     @property
     def _wanted(self) -> dict[str, Any]:
         """Settings that distinguish the requested scene from others, with their names in scene.json."""
         photos, views = (24, 8) if self.quick else (48, 24)
-        wanted: dict[str, Any] = {"seed": self.seed, "wild": self.wild}
-        wanted["photos"] = photos if self.photos is None else self.photos
-        wanted["test_views"] = views if self.test_views is None else self.test_views
+        wanted = {
+            "seed": self.seed,
+            "wild": self.wild,
+            "photos": photos if self.photos is None else self.photos,
+            "test_views": views if self.test_views is None else self.test_views,
+        }
         return wanted | ({} if self.family == "auto" else {"family": self.family})
-
-    def _scene(self, out: Path) -> Path:
-        """Return the scene in `out`, generating it if necessary."""
-        from lang3dxl_ns.demo.landmark.scene_writer import write_scene
-
-        folder = out / "scene"
-        if (folder / "scene.json").exists():
-            return folder
-        return write_scene(DemoScene(out=folder, **{"family": self.family, **self._wanted}))
 
     def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
         """Build the run's configuration, resuming from an earlier command's checkpoint if there is one."""
@@ -223,7 +231,7 @@ size, as published. Test views are novel cameras in plain light, no people. PSNR
 
 _BOUNDS = {"seed": (0, 2**63), "photos": (4, 9999), "steps": (1, 1e9), "test_views": (0, 9999)}
 
-SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluate": 0.28}
+_SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluate": 0.28}
 """Stages of the demo, with their usual shares of its time on a CPU."""
 
 

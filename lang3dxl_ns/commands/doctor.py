@@ -20,15 +20,23 @@ LEAST_MEMORY, LEAST_DISK = 4e9, 10e9
 of eight megabytes per photo, and a run."""
 
 
+Verdict = Literal["ok", "note", "problem"]
+
+
 @dataclass(frozen=True)
 class Finding:
     """Result of one check."""
 
     what: str
-    verdict: Literal["ok", "note", "problem"]
+    verdict: Verdict
     found: str
     remedy: str = ""
     """Remedy if the check did not pass."""
+
+    @classmethod
+    def of(cls, what: str, found: str | None, remedy: str, fine: object, bad: Verdict = "note") -> Finding:
+        """Build the result of a check that passes if `fine` is true. None is reported as missing."""
+        return cls(what, "ok" if fine else bad, found or "not found", "" if fine else remedy)
 
 
 @dataclass(kw_only=True)
@@ -52,25 +60,23 @@ class Doctor:
             if finding.remedy:
                 print(f"{'':10}{finding.remedy}")
         if self.build:
-            build_now(self.arch)
+            self._build()
         problems = sum(finding.verdict == "problem" for finding in found)
         if problems:
             sys.exit(f"Verdict: {problems} problem(s) found, see above")
         print("Verdict: ready")
 
+    def _build(self) -> None:
+        """Build and load gsplat's kernels. Raises UserError if something is missing."""
+        from lang3dxl_ns.rendering import gsplat_build
 
-def build_now(arch: str = "") -> None:
-    """Build and load gsplat's kernels for a compute capability, by default this machine's. Raises UserError
-    if something is missing."""
-    from lang3dxl_ns.rendering import gsplat_build
-
-    arch = arch or gsplat_build.device_arch()
-    if not arch:
-        raise UserError("torch sees no GPU to build for: name a compute capability, such as --arch 8.6")
-    folder = gsplat_build.build_folder(arch)
-    library = gsplat_build.build(gsplat_build.gsplat_extension(), folder, arch)
-    gsplat_build.load(library)
-    print(f"gsplat's kernels for {arch}: {library}, built in {(folder / 'done').read_text().strip()}")
+        arch = self.arch or gsplat_build.device_arch()
+        if not arch:
+            raise UserError("torch sees no GPU to build for: name a compute capability, such as --arch 8.6")
+        folder = gsplat_build.build_folder(arch)
+        library = gsplat_build.build(gsplat_build.gsplat_extension(), folder, arch)
+        gsplat_build.load(library)
+        print(f"gsplat's kernels for {arch}: {library}, built in {(folder / 'done').read_text().strip()}")
 
 
 def findings() -> Iterator[Finding]:
@@ -81,17 +87,16 @@ def findings() -> Iterator[Finding]:
     free = shutil.disk_usage(Path.cwd()).free
     yield storage("free disk here", free, LEAST_DISK, "another folder: --output-dir, --cache-dir, HF_HOME")
     ffmpeg = shutil.which("ffmpeg")
-    remedy = "" if ffmpeg else "ns-render and videos need it: apt install ffmpeg, conda install ffmpeg"
-    yield Finding("ffmpeg", "ok" if ffmpeg else "note", ffmpeg or "not found", remedy)
+    remedy = "ns-render and videos need it: apt install ffmpeg, conda install ffmpeg"
+    yield Finding.of("ffmpeg", ffmpeg, remedy, ffmpeg)
 
 
 def versions() -> Iterator[Finding]:
     """Check Python and the required packages, pycolmap among them, against this package's requirements."""
     from packaging.requirements import Requirement
 
-    fine = (3, 10) <= sys.version_info[:2] < (3, 13)
-    remedy = "" if fine else "nerfstudio needs 3.10, 3.11 or 3.12: make an environment of it"
-    yield Finding("Python", "ok" if fine else "problem", sys.version.split()[0], remedy)
+    fine, remedy = (3, 10) <= sys.version_info[:2] < (3, 13), "make an environment of 3.10 to 3.12"
+    yield Finding.of("Python", sys.version.split()[0], remedy, fine, "problem")
     for need in (Requirement(line) for line in requires("lang3dxl-ns") or []):
         if need.marker is not None:
             continue
@@ -100,8 +105,8 @@ def versions() -> Iterator[Finding]:
         except PackageNotFoundError:
             found = ""
         good = found and need.specifier.contains(found.partition("+")[0], prereleases=True)
-        remedy = "" if good else f"pip install '{need.name}{need.specifier}'"
-        yield Finding(need.name, "ok" if good else "problem", found or "not installed", remedy)
+        remedy = f"pip install '{need.name}{need.specifier}'"
+        yield Finding.of(need.name, found or "not installed", remedy, good, "problem")
 
 
 def devices() -> Iterator[Finding]:
@@ -124,12 +129,9 @@ def devices() -> Iterator[Finding]:
     folder = gsplat_build.build_folder(gsplat_build.device_arch())
     if torch.version.hip is None and not gsplat_build.built(folder):
         for need in gsplat_build.needs(folder):
-            verdict: Literal["ok", "note"] = "note" if need.found is None else "ok"
-            remedy = need.remedy if need.found is None else ""
-            yield Finding(f"to build gsplat, {need.what}", verdict, need.found or "missing", remedy)
+            yield Finding.of(f"to build gsplat, {need.what}", need.found, need.remedy, need.found)
 
 
 def storage(what: str, size: float, least: float, remedy: str) -> Finding:
     """Check whether there is enough of a kind of storage, in bytes."""
-    verdict: Literal["ok", "note"] = "ok" if size >= least else "note"
-    return Finding(what, verdict, f"{size / 1e9:.1f} GB", "" if size >= least else f"little: use {remedy}")
+    return Finding.of(what, f"{size / 1e9:.1f} GB", f"little: use {remedy}", size >= least)

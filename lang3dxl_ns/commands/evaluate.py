@@ -57,7 +57,9 @@ class EvaluateMaps:
         photos, protocol = score_predictions(truth, self.maps, names, self.masks, self.temperature)
         results = average(list(photos.values()), with_deviation=True)
         results |= {"protocol": protocol, "photos": photos}
-        write_scores(self.out, self.scene or _scene_name(truth.folder.absolute()), results)
+        folder = truth.folder.absolute()
+        name = folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
+        write_scores(self.out, self.scene or name, results)
 
 
 @dataclass(kw_only=True)
@@ -186,11 +188,6 @@ def _told(name: str, protocol: dict[str, Any]) -> str:
     keys = ("evaluated_photos", "seen_in_training", "foreground")
     known = [f"{key.replace('_', ' ')}: {protocol[key]}" for key in keys if protocol.get(key) is not None]
     return f"- {name}: {', '.join(known) or 'its report does not tell how it was scored'}"
-
-
-def _scene_name(folder: Path) -> str:
-    """Derive the scene's name from a ground truth folder named after it, or one inside that."""
-    return folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
 
 
 def write_scores(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu") -> None:

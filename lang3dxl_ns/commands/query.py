@@ -10,8 +10,6 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from jaxtyping import Bool
-from numpy import ndarray as Array
 from PIL import Image
 
 from lang3dxl_ns import __version__
@@ -35,6 +33,7 @@ from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
 
+_NEAREST = Image.Resampling.NEAREST
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
@@ -84,39 +83,36 @@ class Query:
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         scene = scene.with_words(()) if self.without_taught else scene
         question = scene.ask(prompts)
-        prompts = list(question.prompts)
+        prompts = question.prompts
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
-        labels = CocoLabels([prompt.text for prompt in prompts])
-        views, best = [], [-1.0] * len(prompts)
-        where = [""] * len(prompts)
+        labels, views = CocoLabels([prompt.text for prompt in prompts]), []
+        best = [(-1.0, "")] * len(prompts)
         with progress_bar() as bar:
             for name, place, asked in bar.track(self._places(scene, question), description="rendering"):
                 wanted = question if len(asked) == len(prompts) else scene.ask([prompts[i] for i in asked])
                 matches = scene.matches(wanted, place)
                 for i, match in zip(asked, matches, strict=True):
-                    write_match(match, folders[i] / name)
-                    if match.score > best[i]:
-                        best[i], where[i] = match.score, f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
+                    _write_match(match, folders[i] / name)
+                    where = f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
+                    best[i] = max(best[i], (match.score, where), key=lambda found: found[0])
                 if self.coco is not None and isinstance(place, str):
-                    labels.add(place, [of_file(scene, place, match.mask) for match in matches])
+                    size = scene.file.photo(place).file_size
+                    masks = [Image.fromarray(match.mask).resize(size, _NEAREST) for match in matches]
+                    labels.add(place, [np.asarray(mask) for mask in masks])
                 if len(matches) > 1:
                     save_picture(together(matches), shared / f"{name}.png")
                 views.append(_view_report(name, matches))
         if self.coco is not None:
             write_atomically(self.coco, json.dumps(labels.content) + "\n")
-        doubts, levels = question.doubts, question.thresholds
-        texts = zip(prompts, doubts, levels, folders, strict=True)
+        texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))
         report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
         write_atomically(self.out / "query.json", json.dumps(report, indent=2, ensure_ascii=False) + "\n")
-        found = zip(prompts, doubts, levels, folders, best, where, strict=True)
-        for prompt, doubt, level, folder, score, place in found:
-            closest = "" if score > level else " (no match; this view comes closest)"
-            by = "" if prompt.taught is None else " (taught)"
-            say(f"{prompt.text}{by}: {score:.2f} at {place}; {folder}{closest}")
+        for (prompt, doubt, level, folder), (score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
-            told = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
-            for advice in filter(None, told):
-                say(f"  {advice}")
+            closest = "" if score > level else " (no match; this view comes closest)"
+            say(f"{prompt.text}{' (taught)' if taught else ''}: {score:.2f} at {where}; {folder}{closest}")
+            warnings = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
+            say(*(f"  {advice}" for advice in warnings if advice))
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
         """List file name (no suffix), camera or photo, and prompts of every requested view."""
@@ -154,14 +150,7 @@ def file_names(photos: list[str]) -> list[str]:
     return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
 
 
-def of_file(scene: Scene, photo: str, mask: Bool[Array, "h w"]) -> Bool[Array, "H W"]:
-    """Resize a view's mask to the size of the photo's file."""
-    found = scene.file.photo(photo)
-    size = found.size or (found.lens.width, found.lens.height)
-    return np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST))
-
-
-def write_match(match: Match, stem: Path) -> None:
+def _write_match(match: Match, stem: Path) -> None:
     """Write `stem`.overlay.png, .mask.png and .npy."""
     match.save(stem.with_name(f"{stem.name}.overlay.png"))
     save_picture(match.mask * np.uint8(255), stem.with_name(f"{stem.name}.mask.png"))
@@ -267,6 +256,6 @@ class Export:
 
     def _told(self) -> Provenance:
         """Return the provenance in the scene's own file, with what the flags override."""
-        own, program = provenance_of(self.scene), f"lang3dxl-ns {__version__}"
-        title, credit = self.title or own.title, self.credit or own.credit
-        return Provenance(title, credit, self.license or own.license, program, own.made_how)
+        flags = {"title": self.title, "credit": self.credit, "license": self.license}
+        told = {name: text for name, text in flags.items() if text}
+        return replace(provenance_of(self.scene), made_by=f"lang3dxl-ns {__version__}", **told)

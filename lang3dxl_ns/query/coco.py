@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,11 +32,7 @@ def mask_of(lengths: Sequence[int], size: tuple[int, int]) -> Bool[Array, "h w"]
 
 
 class CocoLabels:
-    """A data set in COCO's format, with an annotation for each connected part of each mask.
-
-    Args:
-        categories: names of the categories.
-    """
+    """A data set in COCO's format, with an annotation for each connected part of each mask."""
 
     def __init__(self, categories: Sequence[str]) -> None:
         self._images: list[dict[str, Any]] = []
@@ -44,19 +40,22 @@ class CocoLabels:
         self._categories = [{"id": i, "name": name} for i, name in enumerate(categories, start=1)]
 
     def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
-        """Add a photo.
-
-        Args:
-            photo: name of the photo.
-            masks: one mask per category, at the size of the photo's file.
-        """
-        height, width = masks[0].shape
-        image = {"id": len(self._images) + 1, "file_name": photo, "width": width, "height": height}
-        self._images.append(image)
+        """Add a photo by name, with one mask per category, at the size of the photo's file."""
+        image, (height, width) = len(self._images) + 1, masks[0].shape
+        self._images.append({"id": image, "file_name": photo, "width": width, "height": height})
         for category, mask in enumerate(masks, start=1):
-            for part in _parts(mask):
-                number = {"id": len(self._annotations) + 1, "image_id": image["id"], "category_id": category}
-                self._annotations.append(number | _annotation(part))
+            numbers, _ = label(mask)
+            for number, place in enumerate(find_objects(numbers), start=1):
+                area = int(np.count_nonzero(numbers[place] == number))
+                if area < _LEAST_PART * mask.size:
+                    continue
+                part = numbers == number
+                rows, columns = place
+                box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
+                labeled = {"id": len(self._annotations) + 1, "image_id": image, "category_id": category}
+                outline = {"size": list(part.shape), "counts": run_lengths(part)}
+                labeled |= {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
+                self._annotations.append(labeled)
 
     @property
     def content(self) -> dict[str, Any]:
@@ -67,21 +66,3 @@ class CocoLabels:
             "annotations": self._annotations,
             "categories": self._categories,
         }
-
-
-def _parts(mask: Bool[Array, "h w"]) -> Iterable[Bool[Array, "h w"]]:
-    numbers, _ = label(mask)
-    for number, place in enumerate(find_objects(numbers), start=1):
-        if np.count_nonzero(numbers[place] == number) >= _LEAST_PART * mask.size:
-            yield numbers == number
-
-
-def _annotation(part: Bool[Array, "h w"]) -> dict[str, Any]:
-    rows, columns = part.any(1).nonzero()[0], part.any(0).nonzero()[0]
-    left, top = int(columns[0]), int(rows[0])
-    return {
-        "segmentation": {"size": list(part.shape), "counts": run_lengths(part)},
-        "area": int(part.sum()),
-        "bbox": [left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1],
-        "iscrowd": 0,
-    }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from lang3dxl_ns.common.errors import UserError
@@ -26,7 +25,8 @@ def find_config(run: str | Path | None = None) -> Path:
     if place.is_dir():
         if place.joinpath("config.yml").is_file():
             return place / "config.yml"
-        configs = [path for depth in range(1, _DEEPEST + 1) for path in _configs(place, depth)]
+        found = (path for n in range(1, _DEEPEST + 1) for path in place.glob("*/" * n + "config.yml"))
+        configs = [path for path in found if path.is_file()]
         ours = [path for path in configs if path.with_name(SCENE_FILE).is_file()]
         if ours:
             return max(ours, key=lambda path: path.stat().st_mtime)
@@ -42,7 +42,3 @@ def find_config(run: str | Path | None = None) -> Path:
     if not place.is_file():
         raise UserError(f"{place} is not a file or folder: pass a run's folder, or its config.yml")
     return place
-
-
-def _configs(place: Path, depth: int) -> Iterator[Path]:
-    return (path for path in place.glob("*/" * depth + "config.yml") if path.is_file())

@@ -11,8 +11,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from statistics import fmean
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from torch import Tensor
@@ -119,11 +121,9 @@ def learn(
     word = fit(photos)
     # Each photo is judged by a word that the others teach.
     judges = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))] if len(photos) > 1 else [word]
-    precision = {
-        photo.name: photo.precision(judge.margins(sample, text))
-        for photo, judge in zip(photos, judges, strict=True)
-    }
-    doubt = _mean([1 - photo.separation(word.margins(sample, text)) for photo in photos])
+    judged = zip(photos, judges, strict=True)
+    precision = {photo.name: photo.precision(judge.margins(sample, text)) for photo, judge in judged}
+    doubt = fmean(1 - photo.separation(word.margins(sample, text)) for photo in photos)
     return replace(word, doubt=doubt, precision=precision, examples=tuple(examples))
 
 
@@ -177,10 +177,9 @@ def _sampled(
     first, second = (_spaced(torch.stack(parts).sum(0)) for parts in (words, rests))
     photos = []
     for example, one, word, rest in zip(examples, weights, words, rests, strict=True):
-        share = float(one.word.sum() / one.seen.sum())
-        word = torch.cat([word[first], torch.zeros_like(word[second])])
-        rest = torch.cat([torch.zeros_like(rest[first]), rest[second]])
-        kind = (share, example.evidence, example.complete)
+        word = F.pad(word[first], (0, len(second)))
+        rest = F.pad(rest[second], (len(first), 0))
+        kind = (float(one.word.sum() / one.seen.sum()), example.evidence, example.complete)
         photos.append(_Photo(example.photo, word / word.sum(), rest / rest.sum(), *kind))
     return torch.cat([first, second]), photos
 
@@ -238,8 +237,8 @@ def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     in photos where all of the word is marked, otherwise how far it ranks clicks above the rest."""
     complete = [photo.precision(text) for photo in photos if photo.complete]
     if complete:
-        return _GAIN * _mean(complete)
-    return max(_mean([2 * photo.separation(text) - 1 for photo in photos]), 0.0)
+        return _GAIN * fmean(complete)
+    return max(fmean([2 * photo.separation(text) - 1 for photo in photos]), 0.0)
 
 
 def _logistic(
@@ -260,8 +259,8 @@ def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     marks are complete; without any, part of the way from what is not clicked to what is."""
     complete = [photo for photo in photos if photo.complete]
     if not complete:
-        on = _mean([float(score @ photo.word) for photo in photos])
-        return _UP * on + (1 - _UP) * _mean([float(score @ photo.rest) for photo in photos])
+        on = fmean([float(score @ photo.word) for photo in photos])
+        return _UP * on + (1 - _UP) * fmean([float(score @ photo.rest) for photo in photos])
     order = score.argsort(descending=True, stable=True)
     overlap = torch.zeros_like(score)
     for photo in complete:
@@ -271,7 +270,3 @@ def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     overlap[:-1][falls <= 1e-4 * falls.sum()] = 0.0  # no threshold separates equal scores
     best = min(int(overlap.argmax()), len(order) - 2)
     return 0.5 * float(score[order[best]] + score[order[best + 1]])
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.run_file import ScenePhoto
-from lang3dxl_ns.query.teach import MASK_SIDE, Box, Example, Point
+from lang3dxl_ns.query.teach import MASK_SIDE, Example, Point
 
 MARK_SIDE = 320
 """Longer side in pixels of the views in which marks are gathered."""
@@ -22,12 +22,8 @@ _REACH = 0.01
 
 def marks(example: Example, photo: ScenePhoto, size: tuple[int, int]) -> Float[Tensor, "2 h w"]:
     """Compute the share of each pixel of a view (height, width) marked as the word, and as not the word.
-
-    Marks are drawn on the photo's file, while views are undistorted.
-
-    Raises:
-        UserError: marks lie outside the photo, or have other proportions.
-    """
+    Marks are drawn on the photo's file, while views are undistorted. Raises UserError if marks lie outside
+    the photo, or have other proportions."""
     width, height = photo.file_size
     labels = photo.photo().undistort_labels(_drawn(example, width, height))
     chosen = torch.stack([labels == 1, labels == 2]).float()
@@ -50,7 +46,11 @@ def _drawn(example: Example, width: int, height: int) -> Int[Tensor, "h w"]:
     place = f"{example.photo} of {width} × {height} pixels"
     x, y = labels.shape[1] / width, labels.shape[0] / height
     if example.box is not None:
-        left, top, right, bottom = _cut(example.box, width, height, place)
+        left, top = max(example.box[0], 0), max(example.box[1], 0)
+        right, bottom = min(example.box[2], width), min(example.box[3], height)
+        if not (left < right and top < bottom):
+            numbers = ", ".join(f"{x:g}" for x in example.box)
+            raise UserError(f"the box {numbers} marks nothing in {place}: give left, top, right and bottom")
         across = slice(int(left * x), max(math.ceil(right * x), int(left * x) + 1))
         labels[int(top * y) : max(math.ceil(bottom * y), int(top * y) + 1), across] = 1
     for points, label in ((example.points, 1), (example.not_points, 2)):
@@ -59,16 +59,6 @@ def _drawn(example: Example, width: int, height: int) -> Int[Tensor, "h w"]:
                 raise UserError(f"the point {column:g}, {row:g} lies outside {place}")
             _draw_disk(labels, ((column + 0.5) * x, (row + 0.5) * y), label)
     return labels
-
-
-def _cut(box: Box, width: int, height: int, place: str) -> Box:
-    """Clip a box to the photo. Raises UserError if nothing is left."""
-    left, top, right, bottom = box
-    cut = (max(left, 0), max(top, 0), min(right, width), min(bottom, height))
-    if not (cut[0] < cut[2] and cut[1] < cut[3]):
-        numbers = ", ".join(f"{x:g}" for x in box)
-        raise UserError(f"the box {numbers} marks nothing in {place}: give left, top, right and bottom")
-    return cut
 
 
 def _draw_disk(labels: Int[Tensor, "h w"], center: Point, label: int) -> None:

@@ -146,7 +146,10 @@ class Viewpoint:
     score: float
     """Mean relevancy of the most relevant thousandth of the view."""
     rank: float
-    """How well the view shows the match, 0…1, as computed by `rank_views`."""
+    """How well the view shows the match, 0…1: closeness of its peak to the scene's highest, times size, times
+    centering (`rank_views`)."""
+    shown: bool
+    """Whether the match fills at least one pixel."""
 
     def __repr__(self) -> str:
         return f"Viewpoint({self.name!r}, rank {self.rank:.2f}, {self.area:.1%} of it matches)"

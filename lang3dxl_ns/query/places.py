@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64
-from numpy import ndarray as Array
+from jaxtyping import Float
 from torch import Tensor
 
 _OUTLIERS = 0.02
@@ -48,14 +47,9 @@ def strongest_match(
     """Find the box of the connected Gaussians that match best; None if none does.
 
     Only Gaussians more than half-way from the threshold to the best count, so that weaker matches beside the
-    strongest don't widen its box. DBSCAN separates the groups.
+    strongest don't widen its box. DBSCAN separates groups that are more than `gap` world units apart.
 
-    Args:
-        means: centers, world units.
-        scores: relevancy of each Gaussian, 0…1.
-        mass: pixels that each Gaussian fills, over all views.
-        threshold: relevancy above which a Gaussian matches.
-        gap: world units that divide two groups.
+    scores: relevancy of each Gaussian, 0…1. mass: pixels that each Gaussian fills, over all views.
     """
     weights = (scores - threshold).clamp_min(0) * mass
     rows = (weights > 0).nonzero().squeeze(1)
@@ -67,13 +61,8 @@ def strongest_match(
 
 
 def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
-    """Group points, each within `gap` of others of its group, and return the groups' boxes.
-
-    Args:
-        means: centers, world units; at least one.
-        weight: weight of each point, above 0.
-        gap: world units that divide two groups.
-    """
+    """Group points (at least one, of weights above 0), each within `gap` world units of others of its group,
+    and return the groups' boxes."""
     heaviest = weight.argsort(descending=True)[:_MOST_POINTS]
     points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
     from sklearn.cluster import DBSCAN  # imported here, since the import takes a second
@@ -82,12 +71,12 @@ def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float)
     if (found < 0).all():  # no place is dense: take the heaviest Gaussian
         found = np.where(np.arange(len(found)) == share.argmax(), 0, -1)
     totals = np.bincount(found[found >= 0], weights=share[found >= 0]) / share.sum()
-    return [_around(points[found == i], float(total)) for i, total in enumerate(totals)]
-
-
-def _around(points: Float64[Array, "n 3"], share: float) -> Box:
-    low, high = np.quantile(points, (_OUTLIERS, 1 - _OUTLIERS), axis=0, method="nearest")
-    return Box(tuple(low.tolist()), tuple(high.tolist()), share)
+    boxes = []
+    for i, total in enumerate(totals.tolist()):
+        ends = np.quantile(points[found == i], (_OUTLIERS, 1 - _OUTLIERS), axis=0, method="nearest")
+        low, high = map(tuple, ends.tolist())
+        boxes.append(Box(low, high, total))
+    return boxes
 
 
 def _high(scores: Float[Tensor, " n"], mass: Float[Tensor, " n"]) -> float:

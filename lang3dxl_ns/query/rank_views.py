@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.query.match import Viewpoint
 from lang3dxl_ns.query.places import STRONG
 from lang3dxl_ns.query.visibility import VisibleGaussians
 
@@ -21,26 +21,12 @@ RIM = 0.25
 """Weight of a match at a view's rim, where it is likely cut off; it is 1 in the middle half."""
 
 
-@dataclass(frozen=True)
-class ViewRank:
-    """Measures of how well one view shows a match."""
-
-    area: float
-    """Share of the view that matches."""
-    peak: float
-    """Mean relevancy of the most relevant thousandth of the view, 0…1."""
-    shown: bool
-    """Whether the match fills at least one pixel."""
-    rank: float
-    """Score of the view, 0…1: closeness of its peak to the scene's highest, times size, times centering."""
-
-
 def rank_views(
     views: Mapping[str, VisibleGaussians],
     means: Float[Tensor, "n 3"],
     scores: Float[Tensor, " n"],
     threshold: float,
-) -> dict[str, ViewRank]:
+) -> list[Viewpoint]:
     """Rank every view by the pixels that Gaussians fill in it (hidden ones fill none). Views that show the
     match come first, best first.
 
@@ -49,7 +35,7 @@ def rank_views(
     the threshold, the scene's median relevancy takes its place, and the views that come closest lead.
     """
     if not views:
-        return {}
+        return []
     # Numbers stay on the device until the end, since reading each would wait for a GPU.
     peaks = torch.stack([_peak(view, scores) for view in views.values()])
     top = peaks.amax()
@@ -66,11 +52,11 @@ def rank_views(
         rows.append(torch.stack([((values > threshold) * shares).sum(), size * centered]))
     areas, fitness = torch.stack(rows).unbind(1)
     figures = torch.stack([areas, peaks, closeness * fitness], dim=1).tolist()
-    ranks = {
-        name: ViewRank(area, peak, area * view.size >= 1, rank)
+    ranks = [
+        Viewpoint(name, view.camera, area, peak, rank, shown=area * view.size >= 1)
         for (name, view), (area, peak, rank) in zip(views.items(), figures, strict=True)
-    }
-    return dict(sorted(ranks.items(), key=lambda item: (item[1].shown, item[1].rank), reverse=True))
+    ]
+    return sorted(ranks, key=lambda view: (view.shown, view.rank), reverse=True)
 
 
 def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, ""]:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float64
 from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
@@ -62,16 +62,12 @@ class ScenePhoto:
     @property
     def camera(self) -> Camera:
         """The camera for the rasterizer, at training resolution."""
-        return self.lens.camera(self._view_matrix)
+        return self.lens.camera(view_matrix(torch.tensor(self.camera_to_world, dtype=torch.float32)))
 
     @property
     def full_camera(self) -> Camera:
         """The camera at the file's resolution, for the rasterizer."""
-        return self.lens.resized(*self.file_size).camera(self._view_matrix)
-
-    @property
-    def _view_matrix(self) -> Float[Tensor, "4 4"]:
-        return view_matrix(torch.tensor(self.camera_to_world, dtype=torch.float32))
+        return self.lens.resized(*self.file_size).camera(self.camera.view_matrix)
 
     @property
     def pose(self) -> Float64[Array, "4 4"]:
@@ -81,23 +77,17 @@ class ScenePhoto:
     def photo(self, folder: Path = Path()) -> Photo:
         """Return the photo in its folder, without its mask if the mask's file is gone."""
         mask = Path(self.mask) if isinstance(self.mask, str) else None
-        return Photo(
-            name=self.name,
-            path=folder / self.name,
-            mask_path=mask if mask is not None and mask.is_file() else None,
-            lens=self.lens,
-        )
+        mask = mask if mask is not None and mask.is_file() else None
+        return Photo(self.name, folder / self.name, mask, self.lens)
 
     def foreground(self, size: tuple[int, int] | None = None) -> Bool[Tensor, "h w"] | None:
         """Read the photo's undistorted foreground; None if it has no mask, or the mask is gone.
 
         size: height and width in pixels; default: the size of the stored mask.
         """
+        mask = None if isinstance(self.mask, bytes) else self.photo().read_mask()
         if isinstance(self.mask, bytes):
-            pixels = np.array(Image.open(io.BytesIO(self.mask)).convert("1"))
-            mask: Bool[Tensor, "h w"] | None = torch.from_numpy(pixels)
-        else:
-            mask = self.photo().read_mask()
+            mask = torch.from_numpy(np.array(Image.open(io.BytesIO(self.mask)).convert("1")))
         if mask is None or size is None:
             return mask
         return F.interpolate(mask[None, None].float(), size, mode="nearest-exact")[0, 0].bool()
@@ -157,10 +147,8 @@ class SceneFile:
 
 
 def scene_from_json(content: dict[str, Any]) -> SceneFile:
-    """Build the description from a JSON object, after validating all its values.
-
-    Raises ValueError, KeyError, TypeError or AttributeError for anything else.
-    """
+    """Build the description from a JSON object, after validating all its values. Raises ValueError, KeyError,
+    TypeError or AttributeError for anything else."""
     photos = [_photo(**photo) for photo in content["photos"]]
     scene = SceneFile(**{**content, "photos": photos})
     expect(photos != [], "it lists no photo")

@@ -319,20 +319,7 @@ class Scene(ViewedScene):
             UserError: the pixel lies outside the view.
         """
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
-        feature = self._feature_at(self.camera(place, size), x, y)
-        if feature is None:
-            return []
-        queries, negatives = self.text.plain_queries(words).to(self.device), self.text.config.negatives
-        cosines = queries.cosines(feature)
-        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature).tolist()
-        named = sorted(zip(words, scores, strict=True), key=lambda pair: pair[1], reverse=True)
-        clear = any(score > CLEAR for word, score in named if word != "sky")
-        if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
-            return []
-        return named[: max(most, 0)]
-
-    def _feature_at(self, camera: Camera, x: float, y: float) -> Float[Tensor, " c"] | None:
-        """Blend the features that a pixel shows, unnormalized; None where too little of it has a meaning."""
+        camera = self.camera(place, size)
         if not (0 <= x < camera.width and 0 <= y < camera.height):
             raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
         pixel = torch.zeros(camera.height, camera.width, device=self.device)
@@ -340,8 +327,16 @@ class Scene(ViewedScene):
         share = self._fill(camera, pixel)
         rows = share.nonzero().squeeze(1)
         features = self.engine.features(rows)
-        meant = float(share[rows] @ (features != 0).any(1).float())
-        return None if meant < self.config.min_alpha else share[rows] @ features
+        if float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
+            return []
+        queries, negatives = self.text.plain_queries(words).to(self.device), self.text.config.negatives
+        cosines = queries.cosines(share[rows] @ features)
+        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature).tolist()
+        named = sorted(zip(words, scores, strict=True), key=lambda pair: pair[1], reverse=True)
+        clear = any(score > CLEAR for word, score in named if word != "sky")
+        if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
+            return []
+        return named[: max(most, 0)]
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 
@@ -406,22 +401,18 @@ class Scene(ViewedScene):
         unsure = {name: view.pixels @ open_question[view.rows.long()] for name, view in views.items()}
         return max(unsure, key=lambda name: float(unsure[name]))
 
-    def _with_taught(self, prompt: Prompt) -> Prompt:
-        taught = self.words.get(known_word(prompt.text))
-        return prompt if taught is None or prompt.vector is not None else replace(prompt, taught=taught)
-
     # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
 
     def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
         """Parse prompts, and attach the taught words. Raises UserError if there are no prompts."""
-        prompts: list[Prompt] = []
-        for text in _listed(texts):
-            if isinstance(text, Prompt):
-                prompts.append(self._with_taught(text))
-            elif isinstance(text, Tensor | Array):
+        prompts = list[Prompt]()
+        for text in texts if isinstance(texts, list | tuple) else [texts]:
+            if isinstance(text, Tensor | Array):
                 prompts.append(Prompt("vector", vector=self._vector(text)))
-            else:
-                prompts += map(self._with_taught, parse_prompts(text))
+                continue
+            for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text):
+                word = None if prompt.vector is not None else self.words.get(known_word(prompt.text))
+                prompts.append(prompt if word is None else replace(prompt, taught=word))
         return prompts or parse_prompts("")
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
@@ -459,12 +450,10 @@ class Scene(ViewedScene):
 
     def _views(self, question: Question, row: int) -> tuple[list[Viewpoint], list[Viewpoint]]:
         """Return the training views that show a prompt, and all training views, both best first."""
-        ranks = rank_views(self.visible, self.splats.means, question.relevancy[row], question.thresholds[row])
-        everything = [
-            Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
-            for name, found in ranks.items()
-        ]
-        return [view for view in everything if ranks[view.name].shown], everything
+        place = (self.splats.means, question.relevancy[row], question.thresholds[row])
+        ranks = rank_views(self.visible, *place)
+        everything = [replace(view, camera=self.file.photo(view.name).camera) for view in ranks]
+        return [view for view in everything if view.shown], everything
 
     # ── computed once ───────────────────────────────────────────────────────────────────────────────
 
@@ -506,10 +495,6 @@ def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
             f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
         )
     return encoder.encode_texts
-
-
-def _listed(texts: Any) -> list[Any]:
-    return list(texts) if isinstance(texts, list | tuple) else [texts]
 
 
 def _several(texts: Any, found: Sequence[Any]) -> bool:

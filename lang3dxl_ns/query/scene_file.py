@@ -77,19 +77,8 @@ class Provenance:
 
 
 def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) -> int:
-    """Write a scene as one file, atomically.
-
-    Args:
-        path: the file; its name ends in .scene.
-        scene: the scene. Foreground masks are read from their files and stored with it.
-        provenance: the scene's origin, as the file describes it.
-
-    Returns:
-        The number of bytes written.
-
-    Raises:
-        UserError: the name doesn't end in .scene.
-    """
+    """Write a scene as one file, atomically, with foreground masks read from their files. Return the number
+    of bytes. Raises UserError if the name doesn't end in .scene."""
     if path.suffix != SUFFIX:
         raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}")
     from safetensors.numpy import save
@@ -110,9 +99,20 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         "taught": [word.to_json() for word in scene.words.values()],
     }
     if scene.decoder is not None and scene.codes is not None:
-        described |= {"decoder": _described(scene.decoder), "words": list(common_words())}
+        settings = getattr(getattr(scene.decoder, "field", scene.decoder), "settings", None)
+        described["decoder"] = {
+            "name": scene.decoder.name,
+            "clip_dim": scene.decoder.clip_dim,
+            "dense_dim": scene.decoder.dense_dim,
+            "settings": None if settings is None else asdict(settings),
+        }
+        described["words"] = list(common_words())
         content |= _stored_state("decoder", scene.decoder)
-        content["codes"] = _stored_codes(scene.codes, scene.decoder.bounded)
+        content["codes"] = _array(scene.codes, np.float32)
+        if scene.decoder.bounded:  # 16-bit coordinates in (0, 1), which the hash grid reads
+            places = 1 + (scene.codes.double().sigmoid() * _STEPS).round()
+            known = scene.codes.isfinite().all(1, keepdim=True)
+            content["codes"] = _array(torch.where(known, places, 0), np.uint16)
         content["words"] = _array(scene.text.vectors(described["words"]), np.float16)
     if scene.looks is not None:
         field = scene.looks.field
@@ -129,15 +129,8 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
 
 
 def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
-    """Replace the taught words in a scene file, atomically; nothing else in it changes.
-
-    Args:
-        path: the scene file.
-        words: the words that it holds afterwards.
-
-    Raises:
-        UserError: the file is missing, damaged, or of a newer version.
-    """
+    """Replace the taught words in a scene file, atomically; nothing else in it changes. Raises UserError as
+    `read_scene` does."""
     with _opened(path):
         content = path.read_bytes()
         begin = 8 + int.from_bytes(content[:8], "little")
@@ -174,14 +167,6 @@ def with_words_of(scene: Scene, earlier: Path) -> Scene:
     return scene
 
 
-def _stored_codes(codes: Float[Tensor, "n d"], bounded: bool) -> Shaped[Array, "n d"]:
-    """Convert bounded codes to the 16-bit coordinates in (0, 1) that the hash grid reads; keep others."""
-    if not bounded:
-        return _array(codes, np.float32)
-    places = 1 + (codes.double().sigmoid() * _STEPS).round()
-    return _array(torch.where(codes.isfinite().all(1, keepdim=True), places, 0), np.uint16)
-
-
 def _stored_state(name: str, module: torch.nn.Module) -> dict[str, Shaped[Array, "..."]]:
     """Return a module's weights: in half precision, unless they are too large for it, or few."""
     stored = {}
@@ -201,16 +186,6 @@ def _stored_mask(photo: ScenePhoto) -> bytes | None:
     content = io.BytesIO()
     Image.fromarray(mask.cpu().numpy()).save(content, "PNG", optimize=True)
     return content.getvalue()
-
-
-def _described(decoder: Decoder) -> dict[str, Any]:
-    settings = getattr(getattr(decoder, "field", decoder), "settings", None)
-    return {
-        "name": decoder.name,
-        "clip_dim": decoder.clip_dim,
-        "dense_dim": decoder.dense_dim,
-        "settings": None if settings is None else asdict(settings),
-    }
 
 
 def _array(tensor: Tensor, kind: Any = None) -> Shaped[Array, "..."]:
@@ -261,11 +236,9 @@ def read_scene(
 
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
-    """Describe a scene file: `provenance`, `scene`, `gaussians`, `photos`, `clip`, `decoder`, `looks`,
-    `taught` (the words taught by example) and `bytes`.
-
-    No tensor is read. Raises UserError as `read_scene` does.
-    """
+    """Describe a scene file, without reading a tensor: `provenance`, `scene`, `gaussians`, `photos`, `clip`,
+    `decoder`, `looks`, `taught` (the words taught by example) and `bytes`. Raises UserError as `read_scene`
+    does."""
     path = expanded(path)
     with _opened(path) as file:
         return {
@@ -292,8 +265,7 @@ class _File:
             raise _NewerError(self.about["version"])
         self.scene: SceneFile = scene_from_json(self.about["scene"])
         self.provenance = Provenance(**self.about["provenance"])
-        texts = vars(self.provenance).values()
-        expect(all(isinstance(text, str) for text in texts), "its origin is no text")
+        expect(all(isinstance(t, str) for t in vars(self.provenance).values()), "its origin is no text")
         self.background: list[float] | None = self.about["background"]
         if self.background is not None:
             channels = [0 <= float(x) <= 1 for x in self.background]

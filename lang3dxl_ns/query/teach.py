@@ -77,12 +77,10 @@ class Example:
 
     def to_json(self) -> dict[str, Any]:
         """Convert the example to JSON, with masks as run lengths."""
-        described: dict[str, Any] = {"photo": self.photo}
+        described = {"photo": self.photo, "points": self.points, "not_points": self.not_points}
         if self.mask is not None:
-            described["mask"] = {"size": list(self.mask.shape), "counts": run_lengths(self.mask)}
-        if self.box is not None:
-            described["box"] = list(self.box)
-        return described | {"points": [*map(list, self.points)], "not_points": [*map(list, self.not_points)]}
+            described["mask"] = {"size": self.mask.shape, "counts": run_lengths(self.mask)}
+        return described if self.box is None else described | {"box": self.box}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Example:

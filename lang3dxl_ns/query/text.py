@@ -18,9 +18,9 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.query.doubt import UNRELATED
-from lang3dxl_ns.query.negatives import NEGATIVES, competitors
+from lang3dxl_ns.query.negatives import NEGATIVES, competitors, singulars
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.teach import TaughtWord
+from lang3dxl_ns.query.teach import TaughtWord, known_word
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
@@ -149,16 +149,8 @@ def synonym_table() -> dict[str, list[str]]:
 
 def synonyms_of(text: str) -> list[str]:
     """Return synonyms of a term in singular or plural, with or without an article; none for other texts."""
-    words, table = re.sub(r"^(an?|the)\s+", "", " ".join(text.lower().split())), synonym_table()
-    return next((table[form] for form in _singulars(words) if form in table), [])
-
-
-def _singulars(words: str) -> list[str]:
-    """Return the possible singulars of these words, and the words themselves."""
-    endings = (("", ""), ("s", ""), ("es", ""), ("ies", "y"), ("es", "is"), ("ia", "ion"), ("a", "um"))
-    irregular = {"oculi": "oculus", "abaci": "abacus"}
-    forms = [words.removesuffix(plural) + single for plural, single in endings if words.endswith(plural)]
-    return [*forms, irregular.get(words, words)]
+    words, table = re.sub(r"^(an?|the)\s+", "", known_word(text)), synonym_table()
+    return next((table[form] for form in singulars(words) if form in table), [])
 
 
 # ── vectors ─────────────────────────────────────────────────────────────────────────────────────────────

@@ -105,11 +105,8 @@ class PackedMeaning:
 
 
 def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
-    """Pack codes and a small field or, for wide decoders, decoded rows.
-
-    Raises:
-        UserError: the rows of a wide decoder are too large for a page.
-    """
+    """Pack codes and a small field or, for wide decoders, decoded rows. Raises UserError if these are too
+    large for a page."""
     decoded = PerGaussian.of(decoder, codes)
     rows = decoded.rows.cpu()
     width = rows.shape[1]
@@ -132,20 +129,15 @@ def _is_small(field: SemanticField) -> bool:
     """Return whether the page can decode this field: bounded codes, one pass through the grid, small
     layers."""
     settings = field.settings
-    products = sum(layer.weight.numel() for layer in _linear_layers(field))
+    products = sum(layer.weight.numel() for layer in field.layers if isinstance(layer, torch.nn.Linear))
     return settings.bounding == "sigmoid" and not settings.indexed and products <= _MOST_PRODUCTS
 
 
-def _linear_layers(field: SemanticField) -> list[torch.nn.Linear]:
-    return [layer for layer in field.layers if isinstance(layer, torch.nn.Linear)]
-
-
 def _packed_field(field: SemanticField) -> tuple[dict[str, Any], dict[str, bytes]]:
-    grid, settings, layers = field.grid, field.settings, _linear_layers(field)
-    table = grid.table.detach()
+    grid, settings, table = field.grid, field.settings, field.grid.table.detach()
+    layers = [layer for layer in field.layers if isinstance(layer, torch.nn.Linear)]
     if field.level_weights is not None:
-        ends = [*grid.offsets.tolist()[1:], grid.entries]
-        sizes = torch.tensor([end - start for start, end in zip(grid.offsets.tolist(), ends, strict=True)])
+        sizes = torch.tensor([*grid.offsets.tolist(), grid.entries]).diff()
         table = table * field.level_weights.cpu().repeat_interleave(sizes)[:, None].to(table)
     described = {
         "dimensions": settings.code_dim,

@@ -43,12 +43,8 @@ _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _RULES = {
-    "best": BEST,
-    "doubtful": DOUBTFUL,
-    "least_peak": LEAST_PEAK,
-    "even": EVEN,
-    "share": SHARE,
-    "clear": CLEAR,
+    **{"best": BEST, "doubtful": DOUBTFUL, "least_peak": LEAST_PEAK},
+    **{"even": EVEN, "share": SHARE, "clear": CLEAR},
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
 _TEXTS = 256
@@ -101,11 +97,10 @@ class Page:
         files = {path.name: path.read_bytes() for path in _HERE.iterdir() if path.suffix in _KINDS}
         files["splats.bin"] = pack_splats(scene.baked(self._look), center, self._toward).tobytes()
         up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
+        told = self._about
         about: dict[str, Any] = {
-            "title": self._about.title or Path(scene.file.data).name,
-            "credit": self._about.credit,
-            "license": self._about.license,
-            "made": self._about.made_how,
+            "title": told.title or Path(scene.file.data).name,
+            **{"credit": told.credit, "license": told.license, "made": told.made_how},
             "count": len(scene.splats),
             "center": center.tolist(),
             "antialiased": scene.splats.antialiased,
@@ -199,10 +194,7 @@ class Page:
 
     def answer(self, phrase: str) -> dict[str, Any]:
         """Express a phrase in this scene's numbers: itself, what is searched for, and what it competes with.
-
-        Raises:
-            UserError: the phrase is empty, or the scene has colors only.
-        """
+        Raises UserError if the phrase is empty, or the scene has colors only."""
         if self._meaning is None:
             raise UserError(NO_SEMANTICS)
         text = plain(phrase[:MOST_TEXT].encode("utf-8", "ignore").decode())
