@@ -40,9 +40,8 @@ def attach(
     config: AttachConfig | None = None,
     device: torch.device | str | None = None,
 ) -> Scene:
-    """Give a finished splat words: make a scene that answers any text.
-
-    Targets are kept beside the photos, so that an interrupted call continues when it is repeated.
+    """Give a finished splat words: make a scene that answers any text, with its Gaussians in the splat's own
+    frame and order. Targets are kept beside the photos, so that a repeated call continues an interrupted one.
 
     Args:
         splat: file or run of the splat, as `read_splats` takes it.
@@ -51,9 +50,6 @@ def attach(
         out: scene file to write; None (with `data`): none is written.
         config: settings.
         device: where to compute; by default a GPU if there is one.
-
-    Returns:
-        The scene, with its Gaussians in the splat's own frame and order.
 
     Raises:
         UserError: the splat or the photos cannot be read, or the photos do not show the splat.

@@ -28,12 +28,8 @@ _STEPS, _POINTS, _GAUSSIANS = 30, 2_000, 20_000
 
 
 def known_frames(reconstruction: Reconstruction, splat: Path) -> dict[str, Similarity]:
-    """List the possible frames of a splat, by the program that uses them.
-
-    Args:
-        reconstruction: the photos' poses, and points if there are some.
-        splat: file of the splat. In a run of nerfstudio, the file beside it gives the frame.
-    """
+    """List the possible frames of a splat, by the program that uses them. In a run of nerfstudio, a file
+    beside the splat gives the frame."""
     cameras = [np.vstack([p.camera_from_world, [0, 0, 0, 1]]) for p in reconstruction.photos.values()]
     poses = np.linalg.inv(np.array(cameras, np.float64))
     frames = _of_run(splat)

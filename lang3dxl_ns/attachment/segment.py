@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.preparation.segmentation import TextSegmenter
-from lang3dxl_ns.query.marks import MARK_SIDE
+from lang3dxl_ns.query.learn_word import MARK_SIDE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather

@@ -116,12 +116,8 @@ def calibrated(temperature: float, cosines: Float[Tensor, "n w"]) -> float:
     """Compute the temperature at which an encoder's margins mean what the built-in CLIP's mean.
 
     Encoders differ in how widely their cosines vary: by ±.5 or by ±.05. A relevancy at the calibrated
-    temperature does not change if all cosines are scaled or shifted.
-
-    Args:
-        temperature: temperature for the built-in CLIP; returned unchanged if the spread is 0.
-        cosines: cosines of a scene's features with words for present and absent things
-            (`TextEncoder.yardstick`).
+    temperature does not change if all cosines (with `TextEncoder.yardstick`) are scaled or shifted. If their
+    spread is 0, the temperature for the built-in CLIP is returned unchanged.
     """
     own = spread(cosines)
     return temperature * SPREAD / max(own, _LEAST_SPREAD) if own else temperature
@@ -141,11 +137,8 @@ def relevancy(
     canonical: Float[Tensor, "p c"],
     temperature: float = TEMPERATURE,
 ) -> Float[Tensor, "q ..."]:
-    """Compute min_c exp(τ s_q) / (exp(τ s_q) + exp(τ s_c)) = sigmoid(τ (s_q − max_c s_c)), s = cosine.
-
-    The result is in 0…1, above 0.5 where the query beats every canonical phrase. Vectors need not have unit
-    length. A zero feature (nothing rendered) gives 0.5. Source: LERF, Kerr et al. 2023.
-    """
+    """Compute min_c exp(τ s_q) / (exp(τ s_q) + exp(τ s_c)) = sigmoid(τ (s_q − max_c s_c)), s = cosine (LERF,
+    Kerr et al. 2023). A zero feature gives 0.5. Vectors need not have unit length."""
     prompts = Queries.of(queries[:, None].unbind(), canonical)
     return prompts.relevancy_of_cosines(prompts.cosines(features), temperature)
 

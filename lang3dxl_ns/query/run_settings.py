@@ -50,14 +50,9 @@ def read_settings(path: Path, places: Sequence[Sequence[str]], complete: bool = 
     """Read settings from a run's config.yml. The file is parsed as data only: settings, paths, and classes by
     name from nerfstudio and this package (nerfstudio's own commands call whatever a file names).
 
-    Args:
-        path: the file.
-        places: the settings to read, each as a path of names from the outermost in; () for all. The result is
-            None where there are none.
-        complete: give missing settings their defaults.
-
-    Raises:
-        UserError: the file is missing, damaged, or of another version, or requests more than settings.
+    Each place is a path of names from the outermost in; () stands for all settings. The result is None where
+    there are none. With `complete`, missing settings get their defaults. Raises UserError if the file is
+    missing, damaged, or of another version, or requests more than settings.
     """
     try:
         found = _construct(read_text(path), places)

@@ -23,11 +23,10 @@ from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.learn_word import Weights, learn
-from lang3dxl_ns.query.match import Found, Match, Viewpoint
+from lang3dxl_ns.query.match import Found, Match
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING
-from lang3dxl_ns.query.places import strongest_match
+from lang3dxl_ns.query.places import Viewpoint, rank_views, strongest_match
 from lang3dxl_ns.query.question import Question, match_thresholds
-from lang3dxl_ns.query.rank_views import rank_views
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.splat_file import write_index, write_splats

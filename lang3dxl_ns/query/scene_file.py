@@ -204,14 +204,9 @@ def read_scene(
 ) -> Scene:
     """Read a scene file. Nothing in it is executed, and no memory is allocated beyond what it holds.
 
-    Args:
-        path: the file.
-        device: default: a GPU if there is one.
-        config: defaults of queries.
-        encode_texts: the scene's CLIP, if it is already loaded, or is not where the scene file says.
-
-    Raises:
-        UserError: the file is missing, damaged, cut short, or of a newer version.
+    device: by default a GPU if there is one. encode_texts: the scene's CLIP, if it is already loaded, or is
+    not where the scene file says. Raises UserError if the file is missing, damaged, cut short, or of a newer
+    version.
     """
     path, device = expanded(path), torch.device(device or best_device())
     with _opened(path) as file:

@@ -75,8 +75,8 @@ def parse_prompts(typed: str) -> list[Prompt]:
 
 
 def _parse_prompt(part: str) -> Prompt:
-    negatives = [_tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
-    text = _tidy(_NEGATIVES.sub(" ", part))
+    negatives = [tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
+    text = tidy(_NEGATIVES.sub(" ", part))
     if found := re.fullmatch(r"(.+) not (.+)", text, re.IGNORECASE):
         say(
             f"{text} is searched for as it stands. To tell one thing from another: "
@@ -87,7 +87,8 @@ def _parse_prompt(part: str) -> Prompt:
     return Prompt(text, tuple(negative for negative in negatives if negative))
 
 
-def _tidy(text: str) -> str:
+def tidy(text: str) -> str:
+    """Return a phrase without quotes and extra spaces."""
     return " ".join(text.replace('"', " ").replace("\0", " ").split())
 
 
@@ -157,12 +158,7 @@ def synonyms_of(text: str) -> list[str]:
 
 
 class TextEncoder:
-    """Encoder of prompts to `Queries`, which encodes every string once.
-
-    Args:
-        encode: text encoder of the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
-        known: unit vectors of texts that need not be encoded.
-    """
+    """Encoder of prompts to `Queries`, which encodes every string once, except for `known` unit vectors."""
 
     def __init__(
         self,
@@ -181,10 +177,7 @@ class TextEncoder:
         return [word for word in found if word.lower() != text.lower()]
 
     def queries(self, prompts: Sequence[Prompt], known: Collection[str] = ()) -> Queries:
-        """Encode prompts, with synonyms combined as configured, and their competitors.
-
-        known: texts that are encoded without synonyms.
-        """
+        """Encode prompts, with synonyms (but for `known` texts) combined as configured, and competitors."""
         return Queries.of(
             [self._positive(p, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
             self.vectors(self.config.negatives),

@@ -119,13 +119,8 @@ class ViewedScene:
     def draw(
         self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
     ) -> Rendering:
-        """Render a camera as tensors on the scene's device.
-
-        Args:
-            camera: the camera to render from.
-            channels: further values of the Gaussians to composite.
-            look: the lighting; by default the scene's rule chooses for this view.
-        """
+        """Render a camera, and further values of the Gaussians, as tensors on the scene's device. Without a
+        look, the scene's rule chooses the lighting for this view."""
         if look is None and self.looks is not None:
             look = self.looks.of_view(camera)
         return render_in_look(
@@ -210,8 +205,12 @@ class ViewedScene:
     def gap(self) -> float:
         """Distance in world units below which matches are connected: 3 % of the median distance at which the
         scene is seen, about eight pixels of a small view; 0 if no training photo shows anything."""
-        distances = torch.tensor([view.distance(self.splats.means) for view in self.visible.values()])
-        return 0.03 * float(distances.nanmedian().nan_to_num())
+        distances = []
+        for view in self.visible.values():
+            pose, means = view.camera.view_matrix.to(self.splats.means), self.splats.means[view.rows]
+            if len(means):
+                distances.append(float((means @ pose[2, :3] + pose[2, 3]).median()))
+        return 0.03 * float(torch.tensor(distances).nanmedian()) if distances else 0.0
 
 
 def _pose(place: Any) -> Float[Tensor, "rows 4"]:

@@ -54,12 +54,6 @@ class VisibleGaussians:
         """Number of pixels in the view."""
         return self.camera.width * self.camera.height
 
-    def distance(self, means: Float[Tensor, "n 3"]) -> float:
-        """Compute the median depth of the visible Gaussians in world units; NaN if there are none."""
-        view = self.camera.view_matrix.to(means)
-        depths = means[self.rows] @ view[2, :3] + view[2, 3]
-        return float(depths.median()) if len(depths) else float("nan")
-
 
 def fingerprint(state: Mapping[str, Tensor], settings: object) -> str:
     """Hash tensors and settings (as JSON) to 16 hex digits."""

@@ -43,12 +43,8 @@ def pack_splats(
 
     The bytes are: red, green, blue, opacity; half-precision means; two octahedral coordinates of the
     rotation's axis; three logarithmic scales; the rotation's angle. Gaussians with a NaN or infinite value
-    become invisible, so that row numbers stay those of the scene.
-
-    Args:
-        splats: the Gaussians.
-        center: origin of the packed means, world units: half precision is finest close to it.
-        toward: viewing position for which colors are computed, world units.
+    become invisible, so that row numbers stay those of the scene. Half precision is finest close to `center`,
+    the origin of the packed means. Colors are those seen from `toward` (both in world units).
     """
     sound = splats.sound()[:, None]
     means = torch.where(sound, splats.means - center, 0.0).cpu().numpy().astype("<f2")

@@ -37,16 +37,8 @@ _HEADERS = {
 
 
 class PageServer(ThreadingHTTPServer):
-    """Server of one page from memory, until `shutdown`.
-
-    Args:
-        page: the page, with `live` set.
-        host: address to serve at.
-        port: the port; None: the first free one from 7007 on.
-
-    Raises:
-        UserError: the port is taken, or the address is not this machine's.
-    """
+    """Server of one live page from memory, until `shutdown`. Without a port, it takes the first free one from
+    7007 on. Raises UserError if the port is taken, or the address is not this machine's."""
 
     daemon_threads = True
 
