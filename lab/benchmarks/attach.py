@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
-from lang3dxl_ns.attachment.attach_config import AttachConfig
 from lang3dxl_ns.attachment.frames import camera_in
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lang3dxl_ns.attachment.attach_config import AttachConfig
+from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.frames import camera_in, find_frame, side_by_side
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.attachment.learn import learn, prepare_photos, scene_file, settled

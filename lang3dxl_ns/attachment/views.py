@@ -16,7 +16,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from lang3dxl_ns.attachment.attach_config import Up
+from lang3dxl_ns.attachment import Up
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import make_folder, read_json, write_atomically

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from lang3dxl_ns.attachment.attach_config import AttachConfig
+from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
 

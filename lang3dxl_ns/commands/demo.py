@@ -205,11 +205,9 @@ class Demo:
         from lang3dxl_ns.evaluation.report import scene_table
 
         splits = "\n".join(f"#{scene_table(*split)}" for split in report["splits"].items())
-        cost = [
-            [stage, f"{seconds:.0f}", f"{report['peak_mb'][stage]:.0f}"]
-            for stage, seconds in report["seconds"].items()
-        ]
-        cost.append(["all", f"{sum(report['seconds'].values()):.0f}", ""])
+        seconds, memory = report["seconds"], report["peak_mb"]
+        cost = [[stage, f"{spent:.0f}", f"{memory[stage]:.0f}"] for stage, spent in seconds.items()]
+        cost.append(["all", f"{sum(seconds.values()):.0f}", ""])
         return f"""# A landmark and its words
 
     {report["command"]}
@@ -244,11 +242,6 @@ def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, matches: dict[
         size = next(iter(photo.maps.values())).shape
         truth = scorer.truth.masks(photo.name, (size[0], size[1]))
     codes = photo.images.get("bottleneck", rendered)
-    return PictureRow(
-        name=photo.name,
-        photo=real.numpy(),
-        rendering=rendered.numpy(),
-        codes=codes.cpu().numpy(),
-        matches=matches,
-        truth={prompt: mask for prompt, mask in truth.items() if mask.any() and prompt in matches},
-    )
+    truth = {prompt: mask for prompt, mask in truth.items() if mask.any() and prompt in matches}
+    pictures = (real.numpy(), rendered.numpy(), codes.cpu().numpy())
+    return PictureRow(photo.name, *pictures, matches, truth)

@@ -20,23 +20,21 @@ LEAST_MEMORY, LEAST_DISK = 4e9, 10e9
 of eight megabytes per photo, and a run."""
 
 
-Verdict = Literal["ok", "note", "problem"]
-
-
 @dataclass(frozen=True)
 class Finding:
     """Result of one check."""
 
     what: str
-    verdict: Verdict
     found: str
+    fine: bool
     remedy: str = ""
     """Remedy if the check did not pass."""
+    bad: Literal["note", "problem"] = "note"
 
-    @classmethod
-    def of(cls, what: str, found: str | None, remedy: str, fine: object, bad: Verdict = "note") -> Finding:
-        """Build the result of a check that passes if `fine` is true. None is reported as missing."""
-        return cls(what, "ok" if fine else bad, found or "not found", "" if fine else remedy)
+    @property
+    def verdict(self) -> Literal["ok", "note", "problem"]:
+        """Whether the check passed, and how bad it is if not."""
+        return "ok" if self.fine else self.bad
 
 
 @dataclass(kw_only=True)
@@ -53,15 +51,14 @@ class Doctor:
     """Compute capability to build for, such as 8.6. The default is the one of this machine's GPUs."""
 
     def main(self) -> None:
-        found = []
+        problems = 0
         for finding in findings():
-            found.append(finding)
+            problems += finding.verdict == "problem"
             print(f"[{finding.verdict:^7}] {finding.what}: {finding.found}")
-            if finding.remedy:
+            if not finding.fine:
                 print(f"{'':10}{finding.remedy}")
         if self.build:
             self._build()
-        problems = sum(finding.verdict == "problem" for finding in found)
         if problems:
             sys.exit(f"Verdict: {problems} problem(s) found, see above")
         print("Verdict: ready")
@@ -83,20 +80,22 @@ def findings() -> Iterator[Finding]:
     """Run all checks, and yield each result."""
     yield from versions()
     yield from devices()
-    yield storage("memory", machine_memory(), LEAST_MEMORY, "--pipeline.datamanager.cache-gb 0.2")
-    free = shutil.disk_usage(Path.cwd()).free
-    yield storage("free disk here", free, LEAST_DISK, "another folder: --output-dir, --cache-dir, HF_HOME")
+    disk, folders = shutil.disk_usage(Path.cwd()).free, "another folder: --output-dir, --cache-dir, HF_HOME"
+    cache, memory = "--pipeline.datamanager.cache-gb 0.2", machine_memory()
+    yield Finding("memory", f"{memory / 1e9:.1f} GB", memory >= LEAST_MEMORY, f"little: use {cache}")
+    yield Finding("free disk here", f"{disk / 1e9:.1f} GB", disk >= LEAST_DISK, f"little: use {folders}")
     ffmpeg = shutil.which("ffmpeg")
     remedy = "ns-render and videos need it: apt install ffmpeg, conda install ffmpeg"
-    yield Finding.of("ffmpeg", ffmpeg, remedy, ffmpeg)
+    yield Finding("ffmpeg", ffmpeg or "not found", ffmpeg is not None, remedy)
 
 
 def versions() -> Iterator[Finding]:
     """Check Python and the required packages, pycolmap among them, against this package's requirements."""
     from packaging.requirements import Requirement
 
-    fine, remedy = (3, 10) <= sys.version_info[:2] < (3, 13), "make an environment of 3.10 to 3.12"
-    yield Finding.of("Python", sys.version.split()[0], remedy, fine, "problem")
+    fine, remedy = (3, 10) <= sys.version_info[:2] < (3, 13), "nerfstudio needs 3.10, 3.11 or 3.12"
+    remedy = f"{remedy}: make an environment of it"
+    yield Finding("Python", sys.version.split()[0], fine, remedy, "problem")
     for need in (Requirement(line) for line in requires("lang3dxl-ns") or []):
         if need.marker is not None:
             continue
@@ -104,16 +103,16 @@ def versions() -> Iterator[Finding]:
             found = version(need.name)
         except PackageNotFoundError:
             found = ""
-        good = found and need.specifier.contains(found.partition("+")[0], prereleases=True)
+        good = found != "" and need.specifier.contains(found.partition("+")[0], prereleases=True)
         remedy = f"pip install '{need.name}{need.specifier}'"
-        yield Finding.of(need.name, found or "not installed", remedy, good, "problem")
+        yield Finding(need.name, found or "not installed", good, remedy, "problem")
 
 
 def devices() -> Iterator[Finding]:
     """Check the GPUs, and what gsplat's kernels need. Without a GPU, report the CPU."""
-    cpu = Finding("device", "note", f"CPU, {os.cpu_count()} cores", "training is slower than on a GPU")
+    cpu = f"CPU, {os.cpu_count()} cores"
     if not (shutil.which("nvidia-smi") or glob("/dev/nvidia[0-9]*") or glob("/dev/kfd")):
-        yield cpu
+        yield Finding("device", cpu, False, "training is slower than on a GPU")
         return
     import torch  # takes seconds to import
 
@@ -121,17 +120,13 @@ def devices() -> Iterator[Finding]:
     from lang3dxl_ns.rendering import gsplat_build
 
     if trouble := unused_gpu():
-        yield Finding("device", "problem", cpu.found, trouble)
+        yield Finding("device", cpu, False, trouble, "problem")
         return
     for i in range(torch.cuda.device_count()):
         gpu = torch.cuda.get_device_properties(i)
-        yield Finding(f"device cuda:{i}", "ok", f"{gpu.name}, {gpu.total_memory / 1e9:.1f} GB")
+        yield Finding(f"device cuda:{i}", f"{gpu.name}, {gpu.total_memory / 1e9:.1f} GB", True)
     folder = gsplat_build.build_folder(gsplat_build.device_arch())
     if torch.version.hip is None and not gsplat_build.built(folder):
         for need in gsplat_build.needs(folder):
-            yield Finding.of(f"to build gsplat, {need.what}", need.found, need.remedy, need.found)
-
-
-def storage(what: str, size: float, least: float, remedy: str) -> Finding:
-    """Check whether there is enough of a kind of storage, in bytes."""
-    return Finding.of(what, f"{size / 1e9:.1f} GB", f"little: use {remedy}", size >= least)
+            what, there = f"to build gsplat, {need.what}", need.found is not None
+            yield Finding(what, need.found or "missing", there, need.remedy)

@@ -6,11 +6,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from jaxtyping import Bool
+from numpy import ndarray as Array
 from PIL import Image
+from scipy.ndimage import find_objects, label
 
 from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say
@@ -19,7 +22,6 @@ from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomi
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.open_scene import load_scene, provenance_of
-from lang3dxl_ns.query.coco import CocoLabels
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Match, save_picture, together
 from lang3dxl_ns.query.query_config import QueryConfig
@@ -28,11 +30,14 @@ from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import Provenance, with_words_of, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
+from lang3dxl_ns.query.teach import run_lengths
 from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
 from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
 
+_LEAST_PART = 1e-4
+"""Share of a photo below which a separate part of a mask is no label."""
 _NEAREST = Image.Resampling.NEAREST
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
@@ -129,6 +134,43 @@ class Query:
         photos = list(dict.fromkeys(best))
         asked = [[i for i, b in enumerate(best) if b == photo] for photo in photos]
         return list(zip(file_names(photos), photos, asked, strict=True))
+
+
+class CocoLabels:
+    """A data set in COCO's format, with an annotation for each connected part of each mask."""
+
+    def __init__(self, categories: Sequence[str]) -> None:
+        self._images: list[dict[str, Any]] = []
+        self._annotations: list[dict[str, Any]] = []
+        self._categories = [{"id": i, "name": name} for i, name in enumerate(categories, start=1)]
+
+    def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
+        """Add a photo by name, with one mask per category, at the size of the photo's file."""
+        image, (height, width) = len(self._images) + 1, masks[0].shape
+        self._images.append({"id": image, "file_name": photo, "width": width, "height": height})
+        for category, mask in enumerate(masks, start=1):
+            numbers, _ = label(mask)
+            for number, place in enumerate(find_objects(numbers), start=1):
+                area = int(np.count_nonzero(numbers[place] == number))
+                if area < _LEAST_PART * mask.size:
+                    continue
+                part = numbers == number
+                rows, columns = place
+                box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
+                labeled = {"id": len(self._annotations) + 1, "image_id": image, "category_id": category}
+                outline = {"size": list(part.shape), "counts": run_lengths(part)}
+                labeled |= {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
+                self._annotations.append(labeled)
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Content of the COCO file."""
+        return {
+            "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
+            "images": self._images,
+            "annotations": self._annotations,
+            "categories": self._categories,
+        }
 
 
 def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:

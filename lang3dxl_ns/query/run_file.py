@@ -1,6 +1,6 @@
-"""Scene description in a run's folder: the photos' names and cameras, and the CLIP.
+"""A run's folder: its search, and its scene description with the photos' names and cameras, and the CLIP.
 
-It is written when training starts, so that a finished run can be queried without its photos.
+The description is written when training starts, so that a finished run can be queried without its photos.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import read_json, write_atomically
+from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.photo import Photo
@@ -32,6 +32,10 @@ from lang3dxl_ns.scene.photo import Photo
 SCENE_FILE = "lang3dxl_scene.json"
 """Name of the scene description, which lies beside config.yml."""
 _VERSION = 2
+OUTPUTS = Path("outputs")
+"""Folder in which `ns-train` creates runs."""
+_DEEPEST = 4
+"""Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -209,3 +213,33 @@ def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
     lens = Lens(width, height, focal, focal, width / 2, height / 2)
     lens.check()
     return lens.camera(view_matrix(pose[:3]))
+
+
+def find_config(run: str | Path | None = None) -> Path:
+    """Find the config.yml of a run.
+
+    run: the file, the run's folder, or a folder above it, whose newest run is taken; None: the newest run
+    under outputs/. Runs of other methods, which lack a scene description, are skipped. Raises UserError if
+    there is no run.
+    """
+    place = OUTPUTS if run is None else expanded(run)
+    if place.is_dir():
+        if place.joinpath("config.yml").is_file():
+            return place / "config.yml"
+        found = (path for n in range(1, _DEEPEST + 1) for path in place.glob("*/" * n + "config.yml"))
+        configs = [path for path in found if path.is_file()]
+        ours = [path for path in configs if path.with_name(SCENE_FILE).is_file()]
+        if ours:
+            return max(ours, key=lambda path: path.stat().st_mtime)
+        others = f" of this method ({len(configs)} of others)" if configs else ""
+        raise UserError(
+            f"{place} holds no run{others}: name the folder of one, or train with ns-train lang3dxl --data "
+            "FOLDER"
+        )
+    if run is None:
+        raise UserError(
+            "there is no outputs/ here: name a run's folder, or train with ns-train lang3dxl --data FOLDER"
+        )
+    if not place.is_file():
+        raise UserError(f"{place} is not a file or folder: pass a run's folder, or its config.yml")
+    return place

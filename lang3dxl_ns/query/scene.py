@@ -215,9 +215,9 @@ class Scene(ViewedScene):
         for row, prompt in enumerate(question.prompts):
             scores, threshold = question.relevancy[row], question.thresholds[row]
             views, closest = self._views(question, row)
-            box = (
-                strongest_match(self.splats.means, scores, self.mass, threshold, self.gap) if views else None
-            )
+            box = None
+            if views:
+                box = strongest_match(self.splats.means, scores, self.mass, threshold, self.gap)
             relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
             shown = (views[:most], box, relevancy, matching)
             found.append(Found(prompt, *shown, question.doubts[row], threshold, closest[:most]))

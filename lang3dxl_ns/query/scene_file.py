@@ -35,7 +35,7 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, scene_from_json
+from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
 from lang3dxl_ns.query.teach import TaughtWord, known_word
@@ -119,8 +119,10 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
     for i, photo in enumerate(scene.photos):
-        if photo.mask is not None and (mask := _stored_mask(photo)):
-            content[f"mask.{i}"] = np.frombuffer(mask, np.uint8)
+        camera, picture = resized(photo.camera, _MASK_SIDE), io.BytesIO()
+        if (mask := photo.foreground((camera.height, camera.width))) is not None:
+            Image.fromarray(mask.cpu().numpy()).save(picture, "PNG", optimize=True)
+            content[f"mask.{i}"] = np.frombuffer(picture.getvalue(), np.uint8)
     photos = [replace(photo, mask=None) for photo in scene.photos]
     described["scene"] = asdict(replace(scene.file, photos=photos, data=Path(scene.file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
@@ -131,16 +133,12 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
 def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
     """Replace the taught words in a scene file, atomically; nothing else in it changes. Raises UserError as
     `read_scene` does."""
-    with _opened(path):
-        content = path.read_bytes()
-        begin = 8 + int.from_bytes(content[:8], "little")
-        header = json.loads(content[8:begin])
-        described = json.loads(header["__metadata__"][_KEY])
-        described["taught"] = [word.to_json() for word in words]
-        header["__metadata__"][_KEY] = json.dumps(described)
-        start = json.dumps(header).encode()
-        start += b" " * (-len(start) % 8)  # keep tensors aligned
-    write_atomically(path, len(start).to_bytes(8, "little") + start + content[begin:])
+    from safetensors.numpy import save
+
+    with _opened(path) as file:
+        described = file.about | {"taught": [word.to_json() for word in words]}
+        content = {name: file.array(name) for name in file.shapes}
+    write_atomically(path, save(content, {_KEY: json.dumps(described)}))
 
 
 def with_words_of(scene: Scene, earlier: Path) -> Scene:
@@ -176,16 +174,6 @@ def _stored_state(name: str, module: torch.nn.Module) -> dict[str, Shaped[Array,
             half = many and float(values.abs().max()) < _LARGEST_HALF
             stored[f"{name}.{key}"] = _array(values.half() if half else values)
     return stored
-
-
-def _stored_mask(photo: ScenePhoto) -> bytes | None:
-    camera = resized(photo.camera, _MASK_SIDE)
-    mask = photo.foreground((camera.height, camera.width))
-    if mask is None:
-        return None
-    content = io.BytesIO()
-    Image.fromarray(mask.cpu().numpy()).save(content, "PNG", optimize=True)
-    return content.getvalue()
 
 
 def _array(tensor: Tensor, kind: Any = None) -> Shaped[Array, "..."]:
@@ -253,7 +241,7 @@ class _File:
     """An open safetensors file with a scene: its description, and tensors whose shapes are checked first."""
 
     def __init__(self, opened: Any) -> None:
-        self._opened = opened
+        self.array = opened.get_tensor
         self.shapes = {name: opened.get_slice(name).get_shape() for name in opened.keys()}  # noqa: SIM118
         self.about: dict[str, Any] = json.loads((opened.metadata() or {})[_KEY])
         if self.about["version"] != VERSION:
@@ -270,7 +258,7 @@ class _File:
     def tensor(self, name: str, *shape: int) -> Tensor:
         """Read a tensor of any type with this shape. Raises ValueError for another shape."""
         expect(self.shapes[name] == list(shape), f"{name} has the shape {self.shapes[name]}")
-        values = self._opened.get_tensor(name)
+        values = self.array(name)
         return torch.from_numpy(values.astype(np.int32) if values.dtype == np.uint16 else values)
 
     def mask(self, photo: int) -> bytes | None:

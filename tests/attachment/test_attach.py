@@ -8,8 +8,8 @@ import torch
 from box_splat import box_splat
 from scenes import write_scene
 
+from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
-from lang3dxl_ns.attachment.attach_config import AttachConfig
 from lang3dxl_ns.attachment.known_frames import known_frames
 from lang3dxl_ns.commands.attach import _show
 from lang3dxl_ns.common.errors import UserError
