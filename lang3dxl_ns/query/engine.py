@@ -25,6 +25,7 @@ from lang3dxl_ns.query.relevancy import (
     in_chunks,
 )
 
+_CHUNK_MB = 64
 _SAMPLE = 4096
 """Number of Gaussians that a calibration uses."""
 
@@ -68,7 +69,7 @@ class PerGaussian:
             # A feature that all but vanishes carries no information, and its row may exceed half precision.
             return torch.where(seen & (rows.abs() < 6e4).all(1, keepdim=True), rows, 0.0).half()
 
-        return cls(in_chunks(decode, codes, decoder.clip_dim), head, temperature)
+        return cls(in_chunks(decode, codes, decoder.clip_dim, _CHUNK_MB), head, temperature)
 
     @cached_property
     def known(self) -> Bool[Tensor, " n"]:
@@ -97,7 +98,7 @@ class PerGaussian:
     def cosines(self, queries: Queries) -> Float[Tensor, "n v"]:
         """Compute the cosine of every Gaussian with every vector; 0 where unknown."""
         vectors = queries.vectors.T if self.head is None else self.head @ queries.vectors.T
-        return in_chunks(lambda part: part.float() @ vectors, self.rows, self.rows.shape[1])
+        return in_chunks(lambda part: part.float() @ vectors, self.rows, self.rows.shape[1], _CHUNK_MB)
 
     def calibrated(self, words: Queries) -> PerGaussian:
         """Return this engine with a temperature that suits the encoder (`relevancy.calibrated`).

@@ -24,7 +24,8 @@ _LEAST_SPREAD = 1e-4
 Decode = Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]]
 """Function from codes to raw CLIP features, such as `SemanticField.decode_clip`."""
 _CPU_MB, _GPU_MB = 48, 256
-"""Megabytes of the features that are decoded at a time."""
+"""Megabytes of the features that are decoded at a time. On a CPU, small parts stay in its cache and take half
+the time."""
 
 
 @dataclass(frozen=True)
@@ -144,16 +145,11 @@ def relevancy(
 
 
 def in_chunks(
-    work: Callable[[Tensor], Tensor],
-    values: Float[Tensor, "n d"],
-    width: int,
-    max_mb: float | None = None,
+    work: Callable[[Tensor], Tensor], values: Float[Tensor, "n d"], width: int, max_mb: float
 ) -> Float[Tensor, "n k"]:
     """Do work on a part of the rows at a time, so that three float32 copies of its `width` numbers per row
-    take at most `max_mb` megabytes. Parts are small on a CPU, where they stay in its cache and take half the
-    time, and smaller still if memory is short."""
-    most = (_GPU_MB if values.is_cuda else _CPU_MB) if max_mb is None else max_mb
-    rows = max(int(most * 2**20 / (3 * 4 * width)), 1)
+    take at most `max_mb` megabytes, or less if memory is short."""
+    rows = max(int(max_mb * 2**20 / (3 * 4 * width)), 1)
     return with_less_memory(lambda rows: torch.cat([work(part) for part in values.split(rows)]), rows)
 
 
@@ -162,4 +158,5 @@ def cosines_of_codes(
     decode: Decode, codes: Float[Tensor, "n code"], queries: Queries, max_mb: float | None = None
 ) -> Float[Tensor, "n v"]:
     """Compute the exact cosines of codes, decoded `in_chunks` to avoid a feature map of an image."""
-    return in_chunks(lambda part: queries.cosines(decode(part)), codes, queries.vectors.shape[-1], max_mb)
+    most = (_GPU_MB if codes.is_cuda else _CPU_MB) if max_mb is None else max_mb
+    return in_chunks(lambda part: queries.cosines(decode(part)), codes, queries.vectors.shape[-1], most)

@@ -178,12 +178,22 @@ class TextEncoder:
 
     def queries(self, prompts: Sequence[Prompt], known: Collection[str] = ()) -> Queries:
         """Encode prompts, with synonyms (but for `known` texts) combined as configured, and competitors."""
-        return Queries.of(
-            [self._positive(p, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
-            self.vectors(self.config.negatives),
-            [self.vectors(prompt.negatives) for prompt in prompts],
-            [self._against(p.text) if p.vector is None else self._against_all_but(p.vector) for p in prompts],
-        ).taught([prompt.taught for prompt in prompts])
+        negatives, positive, against = self.vectors(self.config.negatives), [], []
+        for prompt in prompts:
+            if prompt.vector is not None:
+                vector = prompt.vector.to(negatives)
+                other = negatives @ F.normalize(vector, dim=0) < _SAME  # phrases with another meaning
+                positive.append(vector[None])
+                against.append(other.nonzero().flatten().tolist() or list(range(len(negatives))))
+                continue
+            words = [] if prompt.text in known else self.synonyms(prompt.text)
+            words.append(searched(prompt.text) if prompt.taught is None else prompt.text)
+            joined = self.config.combine == "joined"
+            positive.append(self.vectors([", ".join(words)] if joined else words))
+            against.append(self._against(prompt.text))
+        own = [self.vectors(prompt.negatives) for prompt in prompts]
+        queries = Queries.of(positive, negatives, own, against)
+        return queries.taught([prompt.taught for prompt in prompts])
 
     def plain_queries(self, texts: Sequence[str]) -> Queries:
         """Encode texts without synonyms, and the configured negatives."""
@@ -201,18 +211,6 @@ class TextEncoder:
 
     def _against(self, text: str) -> list[int]:
         return competitors(self.config.negatives, [searched(text), *self.synonyms(text)])
-
-    def _against_all_but(self, vector: Float[Tensor, " c"]) -> list[int]:
-        """Return the indices of the negatives that a vector competes with: those with another meaning."""
-        phrases = self.vectors(self.config.negatives)
-        cosines = phrases @ F.normalize(vector.to(phrases), dim=0)
-        return (cosines < _SAME).nonzero().flatten().tolist() or list(range(len(phrases)))
-
-    def _positive(self, prompt: Prompt, synonyms: list[str]) -> Float[Tensor, "s c"]:
-        if prompt.vector is not None:
-            return prompt.vector.to(self.vectors(self.config.negatives))[None]
-        words = [*synonyms, searched(prompt.text) if prompt.taught is None else prompt.text]
-        return self.vectors([", ".join(words)] if self.config.combine == "joined" else words)
 
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:
         """Encode texts as unit vectors."""

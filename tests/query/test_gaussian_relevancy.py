@@ -6,7 +6,6 @@ import torch.nn.functional as F
 
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.query import relevancy
 from lang3dxl_ns.query.engine import PerGaussian, make_engine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.rendering import Gaussians, rasterize
@@ -62,7 +61,7 @@ def test_features_that_all_but_vanish_say_nothing(monkeypatch):
 def test_memory_for_decoding_changes_no_answer(monkeypatch):
     field, asked, codes = decoder(512), queries(512), torch.randn(300, 3)
     whole = PerGaussian.of(field, codes).of_gaussians(asked)
-    monkeypatch.setattr(relevancy, "_CPU_MB", 0.05)
+    monkeypatch.setattr("lang3dxl_ns.query.engine._CHUNK_MB", 0.05)
     parts = PerGaussian.of(field, codes).of_gaussians(asked)
     torch.testing.assert_close(parts, whole, atol=1e-3, rtol=0)  # 16 bits may round otherwise
 
