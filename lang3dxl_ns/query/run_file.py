@@ -167,8 +167,8 @@ def scene_from_json(content: dict[str, Any]) -> SceneFile:
 
 
 def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
-    distortion, size = tuple(lens.pop("distortion")), None if size is None else tuple(size)
-    photo = ScenePhoto(lens=Lens(**lens, distortion=distortion), size=size, **rest)
+    lens, size = lens | {"distortion": tuple(lens["distortion"])}, None if size is None else tuple(size)
+    photo = ScenePhoto(lens=Lens(**lens), size=size, **rest)
     expect(is_name(photo.name), f"a photo is called {photo.name!r}")
     expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
     expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")

@@ -449,8 +449,8 @@ class Scene(ViewedScene):
 
     def _views(self, question: Question, row: int) -> tuple[list[Viewpoint], list[Viewpoint]]:
         """Return the training views that show a prompt, and all training views, both best first."""
-        place = (self.splats.means, question.relevancy[row], question.thresholds[row])
-        ranks = rank_views(self.visible, *place)
+        scores, threshold = question.relevancy[row], question.thresholds[row]
+        ranks = rank_views(self.visible, self.splats.means, scores, threshold)
         everything = [replace(view, camera=self.file.photo(view.name).camera) for view in ranks]
         return [view for view in everything if view.shown], everything
 
