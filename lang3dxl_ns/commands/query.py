@@ -88,7 +88,7 @@ class Query:
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         scene = scene.with_words(()) if self.without_taught else scene
         question = scene.ask(prompts)
-        prompts = question.prompts
+        prompts = list(question.prompts)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
         labels, views = CocoLabels([prompt.text for prompt in prompts]), []
         best = [(-1.0, "")] * len(prompts)
@@ -157,10 +157,10 @@ class CocoLabels:
                 part = numbers == number
                 rows, columns = place
                 box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
-                labeled = {"id": len(self._annotations) + 1, "image_id": image, "category_id": category}
                 outline = {"size": list(part.shape), "counts": run_lengths(part)}
-                labeled |= {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
-                self._annotations.append(labeled)
+                labeled = {"id": len(self._annotations) + 1, "image_id": image, "category_id": category}
+                found = {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
+                self._annotations.append({**labeled, **found})
 
     @property
     def content(self) -> dict[str, Any]:

@@ -405,7 +405,8 @@ class Scene(ViewedScene):
     def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
         """Parse prompts, and attach the taught words. Raises UserError if there are no prompts."""
         prompts = list[Prompt]()
-        for text in texts if isinstance(texts, list | tuple) else [texts]:
+        listed: Sequence[Any] = texts if isinstance(texts, list | tuple) else [texts]
+        for text in listed:
             if isinstance(text, Tensor | Array):
                 prompts.append(Prompt("vector", vector=self._vector(text)))
                 continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import tempfile
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -39,11 +40,11 @@ def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | No
 def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
     """Write the numbers of the selected Gaussians, from 0, as an array (.npy) or one per line (.txt). Raises
     UserError for another ending."""
-    save = {".npy": np.save, ".txt": partial(np.savetxt, fmt="%d")}.get(path.suffix.lower())
-    if save is None:
+    writers: dict[str, Callable] = {".npy": np.save, ".txt": partial(np.savetxt, fmt="%d")}
+    if (kind := path.suffix.lower()) not in writers:
         raise UserError(f"{path.name} names no kind of list: end it in .npy or .txt")
     content = io.BytesIO()
-    save(content, selected.nonzero()[:, 0].cpu().numpy())
+    writers[kind](content, selected.nonzero()[:, 0].cpu().numpy())
     write_atomically(path, content.getvalue())
 
 

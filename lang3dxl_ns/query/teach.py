@@ -76,7 +76,8 @@ class Example:
 
     def to_json(self) -> dict[str, Any]:
         """Convert the example to JSON, with masks as run lengths."""
-        described = {"photo": self.photo, "points": self.points, "not_points": self.not_points}
+        described: dict[str, Any] = {"photo": self.photo}
+        described |= {"points": self.points, "not_points": self.not_points}
         if self.mask is not None:
             described["mask"] = {"size": self.mask.shape, "counts": run_lengths(self.mask)}
         return described if self.box is None else described | {"box": self.box}
