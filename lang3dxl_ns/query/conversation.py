@@ -24,7 +24,7 @@ from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Conversation:
     """Questions to a model that may be in training in another thread.
 

@@ -148,7 +148,7 @@ def test_the_status_says_how_long_it_took(panel, viewer):
 
 def test_the_picture_of_the_codes_is_made_when_someone_looks(panel, viewer, monkeypatch):
     assert frame(viewer)["bottleneck"].std() < 1e-6
-    monkeypatch.setattr(panel.conversation, "_shown", lambda: {"bottleneck"})
+    monkeypatch.setattr(panel.conversation, "shown", lambda: {"bottleneck"})
     assert frame(viewer)["bottleneck"].std() > 0.01
 
 
