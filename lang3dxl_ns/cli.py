@@ -28,13 +28,10 @@ from lang3dxl_ns.common.settings_help import asked_for_all
 BENCHMARKS = {
     "ablation": (
         "lab.benchmarks.ablation:Ablation",
-        "The method, the baselines, and the method without each part.",
+        "The method, baselines, and ablations.",
     ),
     "training": ("lab.benchmarks.training:TrainingBenchmark", "A training step by its parts."),
-    "gpu": (
-        "lab.benchmarks.gpu:GpuBenchmark",
-        "A GPU: parity, numerics, time and memory, in one file to send.",
-    ),
+    "gpu": ("lab.benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time, memory, in one file to send."),
     "scale": ("lab.benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
     "holyscenes": ("lab.benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
@@ -51,19 +48,19 @@ COMMANDS = {
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
     "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),
-    "needs": ("commands.needs:Needs", "Which optional components a scene needs, and why."),
+    "needs": ("commands.prepare:Needs", "Which optional components a scene needs, and why."),
     "query": ("commands.query:Query", "Search a trained scene for texts: heat maps, masks, relevancy maps."),
     "export": (
         "commands.query:Export",
-        "Write a scene, or what matches a text, as a splat file or a web page.",
+        "Write a scene, or what matches a text, as a splat or a web page.",
     ),
     "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
     "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
-    "info": ("commands.info:Info", "Tell what a scene file holds, and where it comes from."),
+    "info": ("commands.view:Info", "Tell what a scene file holds, and where it comes from."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": (
         "lab.landmark.demo_scene:DemoScene",
-        "Generate a demo scene: photos of a procedural landmark.",
+        "Generate photos of a procedural landmark.",
     ),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),
     "preset": ("commands.preset:Preset", "Print the flags that train a benchmark's scene as in the paper."),
@@ -141,24 +138,18 @@ def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
     torch; the others only appear in the help."""
     kinds = []
     for name, (place, summary) in commands.items():
-        called = words[:1] == [name]
-        if called and isinstance(place, Mapping):
-            kind = _choice(place, words[1:])
-        elif called:
-            kind = settings_of(place)
-        else:
-            kind = make_dataclass("NotCalled", [])
-        described = summary if isinstance(place, Mapping) or not called else None
+        kind, described = make_dataclass("NotCalled", []), summary
+        if words[:1] == [name]:
+            group = isinstance(place, Mapping)
+            kind = _choice(place, words[1:]) if group else settings_of(place)
+            described = summary if group else None
         kinds.append(Annotated[kind, tyro.conf.subcommand(name, description=described)])
     return reduce(operator.or_, kinds)
 
 
 def settings_of(place: str) -> Any:
-    """Import a command's settings class from `module:class` of the package or of the lab beside it.
-
-    Raises:
-        UserError: the command belongs to the lab, which is not installed here.
-    """
+    """Import a command's settings class from `module:class` of the package or of the lab beside it. Raises
+    UserError if it belongs to the lab, which is not installed here."""
     module, _, name = place.partition(":")
     found = lab_module(module) if module.startswith("lab.") else import_module(f"lang3dxl_ns.{module}")
     return getattr(found, name)

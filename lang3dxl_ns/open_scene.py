@@ -10,8 +10,8 @@ import torch
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.query.find_run import OUTPUTS, find_config
 from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.run_file import OUTPUTS, find_config
 from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, describe_scene_file, read_scene
 
@@ -37,12 +37,11 @@ def load_scene(
     Raises:
         UserError: there is no scene, it is damaged, or `clip` is not the scene's CLIP.
     """
-    file = find_scene_file(path)
-    encode_texts = None
-    if clip is not None and file is not None:
-        about = replace(describe_scene_file(file)["scene"], clip=clip)
-        encode_texts = text_encoder(about, device or best_device())
-    if file is not None:
+    if (file := find_scene_file(path)) is not None:
+        encode_texts = None
+        if clip is not None:
+            about = replace(describe_scene_file(file)["scene"], clip=clip)
+            encode_texts = text_encoder(about, device or best_device())
         return read_scene(file, device, settings, encode_texts)
     from lang3dxl_ns.common.console import silence_libraries
 

@@ -17,7 +17,7 @@ def train(
     dense: str | None = None,
     scale: float | None = None,
 ) -> Scene:
-    """Train a scene from photos, as `ns-train lang3dxl` does without a viewer.
+    """Train a scene from photos, as `ns-train lang3dxl` does without a viewer, and return it.
 
     Args:
         data: folder of photos, with or without a COLMAP model or transforms.json, or a video.
@@ -27,9 +27,6 @@ def train(
             "none" to train colors only. The default is the one of `ns-train lang3dxl`.
         dense: dense encoder, with the same choices.
         scale: size of the photos that colors are trained on, as a fraction of the files' size.
-
-    Returns:
-        The trained scene.
 
     Raises:
         UserError: the photos cannot be used, or training was interrupted.
@@ -41,14 +38,9 @@ def train(
     from lang3dxl_ns.methods import lang3dxl, run_config
 
     usual = lang3dxl.config.pipeline.datamanager
-    config = run_config(
-        Path(data),
-        Path(out),
-        Path(data).stem,
-        iterations or lang3dxl.config.max_num_iterations,
-        clip or usual.clip,  # type: ignore[attr-defined]
-        dense or usual.dense,  # type: ignore[attr-defined]
-    )
+    models = clip or usual.clip, dense or usual.dense  # type: ignore[attr-defined]
+    steps = iterations or lang3dxl.config.max_num_iterations
+    config = run_config(Path(data), Path(out), Path(data).stem, steps, *models)
     if scale is not None:
         config.pipeline.datamanager.camera_res_scale_factor = scale
     config.set_timestamp()

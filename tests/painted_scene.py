@@ -14,8 +14,9 @@ from torch import Tensor
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Looks
+from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.query.scene import QueryConfig, Scene
+from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering.splats import Splats, harmonics_of
 from lang3dxl_ns.scene.camera import Lens, camera_to_world
 
@@ -129,7 +130,7 @@ def painted_scene(cache: Path | None = None, config: QueryConfig | None = None, 
         "decoder": Painted(),
         "codes": painted_codes(),
     }
-    parts |= {"encode_texts": encode_texts, "cache": cache, "config": config}
+    parts |= {"encode_texts": encode_texts, "cache": cache, "config": config or QueryConfig()}
     return Scene(**{**parts, **changes})
 
 

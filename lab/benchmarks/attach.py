@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from lang3dxl_ns.attachment.attach import AttachConfig, attach
+from lang3dxl_ns.attachment import AttachConfig
+from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.frames import camera_in
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError
@@ -19,7 +20,6 @@ from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
 from lang3dxl_ns.open_scene import find_scene_file
-from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import read_scene
 from lang3dxl_ns.scene.camera import Camera
@@ -76,7 +76,7 @@ def attached(scene: Scene, data: Path, out: Path) -> list[Path]:
         UserError: see `attach`.
     """
     assert scene.file.clip is not None
-    splat, config = out / "splat.ply", AttachConfig(preparation=PreparationConfig(clip=scene.file.clip))
+    splat, config = out / "splat.ply", AttachConfig(clip=scene.file.clip)
     found = {out / "with-photos.scene": data, out / "without-photos.scene": None}
     if not splat.is_file():
         scene.export(splat)

@@ -28,7 +28,6 @@ from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.query.engine import PerGaussian, QueryEngine, make_engine
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.scene_file import read_scene
 
@@ -90,8 +89,8 @@ def main(config: CompressedWords) -> None:
         rows, draw = torch.arange(count) % len(seen), torch.Generator().manual_seed(1)
         noisy = features[rows]
         noisy += NOISE * features.std(0) * torch.randn(noisy.shape, generator=draw)
-        unit = GaussianFeatures(F.normalize(noisy, dim=1).half(), None, torch.ones(count, dtype=torch.bool))
-        plain = score(PerGaussian(unit, temperature), rows)
+        unit = PerGaussian(F.normalize(noisy, dim=1).half(), temperature=temperature)
+        plain = score(unit, rows)
         del unit
         start, field = time.process_time(), CompressedField(SemanticFieldConfig("short"), features.shape[1])
         codes = field.learn_gaussians(noisy, mass[rows])

@@ -44,8 +44,7 @@ from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import TargetReader
-from lang3dxl_ns.query.engine import PerGaussian, QueryEngine
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
@@ -162,7 +161,7 @@ class Comparison:
 
 def engine_of(scene: Scene, features: Float[Tensor, "n c"]) -> PerGaussian:
     rows = F.normalize(torch.where(features.isfinite(), features, 0.0), dim=1).half()
-    return PerGaussian(GaussianFeatures(rows, None, (rows != 0).any(1)), scene.engine.temperature)
+    return PerGaussian(rows, temperature=scene.engine.temperature)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +214,7 @@ def gathered_crops(run: Path, scene: Scene) -> tuple[Float[Tensor, "n c"], Float
 
 
 @torch.no_grad()
-def words(scene: Scene, engine: QueryEngine, truth: GroundTruth) -> dict[str, float]:
+def words(scene: Scene, engine: PerGaussian | Averaged, truth: GroundTruth) -> dict[str, float]:
     """AP of each word over the labeled photos."""
     scene.__dict__["engine"] = engine
     figures, _ = score_scene(scene, truth, "all")
@@ -238,7 +237,7 @@ def compare(run: Path, teacher: Teacher) -> list[tuple[str, dict[str, float]]]:
 
     crops = gathered(lambda name: targets.clip(name).features.float())
     dense = gathered(lambda name: teacher.read(gathering.dense(name)))
-    rows: list[tuple[str, QueryEngine]] = [("crops", crops), ("dense", dense)]
+    rows: list[tuple[str, PerGaussian | Averaged]] = [("crops", crops), ("dense", dense)]
     rows.append(("both", Averaged((crops, dense))))
     found = []
     for name, engine in rows:

@@ -31,7 +31,7 @@ from lang3dxl_ns.components.compression import CompressedField, CompressionConfi
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import Camera
@@ -209,7 +209,7 @@ def words(count: int, size: tuple[int, int], steps: int) -> dict[str, float]:
     seconds["compress"] = time.perf_counter() - start
     known = mass > 0
     cosine = centered_cosine(features[known], field, codes[known.to(codes.device)], basis)
-    rows = GaussianFeatures.of(field, codes)
+    rows = PerGaussian.of(field, codes)
     text = torch.nn.functional.normalize(torch.randn(CLIP, 1, generator=draw), dim=0).cuda()
     ask = lambda: rows.rows.float() @ (text if rows.head is None else rows.head @ text)  # noqa: E731
     seconds["ask"] = median(interleaved_times({"ask": ask}, repeats=20)["ask"])

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame, side_by_side
+from lang3dxl_ns.attachment import AttachConfig
+from lang3dxl_ns.attachment.frames import camera_in, find_frame, side_by_side
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.attachment.learn import learn, prepare_photos, scene_file, settled
 from lang3dxl_ns.attachment.segment import segmented
-from lang3dxl_ns.attachment.views import Up, rendered_views
+from lang3dxl_ns.attachment.views import rendered_views
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
@@ -22,33 +22,15 @@ from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
-from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
+from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
 from lang3dxl_ns.rendering.splats import Splats
 
 _LIGHT = 0.15
 """Deviation of the photos' brightness (natural logarithm) above which a message reports it."""
 _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
-
-
-@dataclass
-class AttachConfig:
-    """Settings of `attach`."""
-
-    views: int = 48
-    """Number of views of the splat to render and learn from, without photos."""
-    up: Up = "auto"
-    """Axis of the splat that points up, without photos. With auto, it is estimated from the ground."""
-    cache_dir: Path | None = None
-    """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
-    segment: tuple[str, ...] = ()
-    """Words that a segmenter, `preparation.foreground_model`, finds in the photos and teaches the scene."""
-    preparation: PreparationConfig = field(default_factory=PreparationConfig)
-    """Settings of encoders, crops and foreground."""
 
 
 def attach(
@@ -58,9 +40,8 @@ def attach(
     config: AttachConfig | None = None,
     device: torch.device | str | None = None,
 ) -> Scene:
-    """Give a finished splat words: make a scene that answers any text.
-
-    Targets are kept beside the photos, so that an interrupted call continues when it is repeated.
+    """Give a finished splat words: make a scene that answers any text, with its Gaussians in the splat's own
+    frame and order. Targets are kept beside the photos, so that a repeated call continues an interrupted one.
 
     Args:
         splat: file or run of the splat, as `read_splats` takes it.
@@ -69,9 +50,6 @@ def attach(
         out: scene file to write; None (with `data`): none is written.
         config: settings.
         device: where to compute; by default a GPU if there is one.
-
-    Returns:
-        The scene, with its Gaussians in the splat's own frame and order.
 
     Raises:
         UserError: the splat or the photos cannot be read, or the photos do not show the splat.
@@ -82,7 +60,7 @@ def attach(
     if data is None and place is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
     option_prefix.set("--")
-    preparation = settled(config.preparation)
+    preparation = settled(config)
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
     stages = Stages(_SHARES if found is None else _SHARES | {"segment": 0.3})
@@ -132,9 +110,17 @@ def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path 
     no frame matches."""
     if collection.left_out:
         say(f"{len(collection.left_out)} photos are left out: {some(list(collection.left_out.values()), 3)}")
-    fit = find_frame(splats, collection, path)
+    fit, shown = find_frame(splats, collection, path), ""
     if not fit.fits:
-        raise UserError(_no_fit(splats, collection, fit, place))
+        if place is not None:
+            picture = place.with_name(f"{place.stem}.frame.png")
+            save_picture(side_by_side(splats, collection, fit), picture)
+            shown = f"; {picture} shows a photo beside the splat at its camera"
+        raise UserError(
+            f"the photos in {collection.folder} don't show this splat in any frame that programs use (the "
+            f"best, {fit.name}, agrees to {fit.score:.2f} of 1){shown}: give the photos and poses that the "
+            "splat was trained with, or leave out --data"
+        )
     say(f"the splat's frame is {fit.name}: renderings agree with their photos to {fit.score:.2f} (of 1)")
     if fit.lighting > _LIGHT:
         say(
@@ -142,16 +128,3 @@ def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path 
             "learned all the same; the scene keeps the splat's colors"
         )
     return fit.similarity
-
-
-def _no_fit(splats: Splats, collection: PhotoCollection, fit: Fit, place: Path | None) -> str:
-    shown = ""
-    if place is not None:
-        picture = place.with_name(f"{place.stem}.frame.png")
-        save_picture(side_by_side(splats, collection, fit), picture)
-        shown = f"; {picture} shows a photo beside the splat at its camera"
-    return (
-        f"the photos in {collection.folder} don't show this splat in any frame that programs use (the best, "
-        f"{fit.name}, agrees to {fit.score:.2f} of 1){shown}: give the photos and poses that the splat was "
-        "trained with, or leave out --data"
-    )

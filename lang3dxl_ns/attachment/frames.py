@@ -83,13 +83,9 @@ def camera_in(similarity: Similarity | Float[Tensor, "4 4"], tracked: TrackedPho
 def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
     """Find the frame in which renderings at the photos' cameras look like the photos.
 
-    The frames that programs use are tried first, then those from the scene's shape. The best of them are
-    refined by descent on the correlation. The result may be wrong, which `Fit.fits` shows.
-
-    Args:
-        splats: the Gaussians.
-        collection: the photos.
-        splat: file of the splat, for `known_frames`.
+    The frames that programs use are tried first (`known_frames`, by the splat's file), then those from the
+    scene's shape. The best of them are refined by descent on the correlation. The result may be wrong, which
+    `Fit.fits` shows.
     """
     small, large = _Comparison.of(collection, _FEW, _SMALL), _Comparison.of(collection, _MANY, _LARGE)
     best = _best(splats, small, known_frames(collection.reconstruction, splat))
@@ -165,10 +161,10 @@ class _Comparison:
 
     @classmethod
     def of(cls, collection: PhotoCollection, count: int, side: int) -> _Comparison:
-        everything = collection.photos
+        everything, tracked = collection.photos, collection.reconstruction.photos
         chosen = {round(i) for i in np.linspace(0, len(everything) - 1, min(count, len(everything)))}
-        tracked = collection.reconstruction.photos
-        return cls([_Compared.of(everything[i], tracked[everything[i].name], side) for i in sorted(chosen)])
+        photos = [everything[i] for i in sorted(chosen)]
+        return cls([_Compared.of(photo, tracked[photo.name], side) for photo in photos])
 
     @torch.no_grad()
     def fit(self, splats: Splats, name: str, similarity: Similarity) -> Fit:
@@ -189,8 +185,7 @@ class _Comparison:
         optimizer = torch.optim.Adam([values], lr=_RATE)
         best, lowest = start, np.inf
         for _ in range(steps):
-            change = _similarity(values, middle, size)
-            whole = change @ torch.from_numpy(start)
+            whole = _similarity(values, middle, size) @ torch.from_numpy(start)
             with torch.enable_grad():
                 loss = torch.stack([self._loss(splats, whole, photo) for photo in self.photos]).mean()
                 optimizer.zero_grad()

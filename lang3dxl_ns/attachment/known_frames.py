@@ -22,32 +22,26 @@ _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Rotation from COLMAP's y down to nerfstudio's z up."""
 _OLD_Z_UP = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """Rotation from COLMAP's y down to z up in nerfstudio before 1.0."""
-_STEPS = 30
-_POINTS = 2_000
-_GAUSSIANS = 20_000
+_SIGNS = {"x": (1.0, -1, -1, 1), "y": (-1.0, 1, -1, 1), "z": (-1.0, -1, 1, 1)}
+_HALF_TURNS = {name: np.diag(signs) for name, signs in _SIGNS.items()}
+_STEPS, _POINTS, _GAUSSIANS = 30, 2_000, 20_000
 
 
 def known_frames(reconstruction: Reconstruction, splat: Path) -> dict[str, Similarity]:
-    """List the possible frames of a splat, by the program that uses them.
-
-    Args:
-        reconstruction: the photos' poses, and points if there are some.
-        splat: file of the splat. In a run of nerfstudio, the file beside it gives the frame.
-    """
-    cameras = np.array(
-        [np.vstack([p.camera_from_world, [0, 0, 0, 1]]) for p in reconstruction.photos.values()]
-    )
-    poses = np.linalg.inv(cameras.astype(np.float64))
+    """List the possible frames of a splat, by the program that uses them. In a run of nerfstudio, a file
+    beside the splat gives the frame."""
+    cameras = [np.vstack([p.camera_from_world, [0, 0, 0, 1]]) for p in reconstruction.photos.values()]
+    poses = np.linalg.inv(np.array(cameras, np.float64))
     frames = _of_run(splat)
     frames["the photos' own, as in 3D Gaussian splatting"] = np.eye(4)
     for name, axes in {"": np.eye(4), "with z up": _Z_UP, "as before version 1.0": _OLD_Z_UP}.items():
         moved = axes @ poses
-        frames[f"nerfstudio's, {name}".rstrip(", ")] = _centered(moved, _upright(moved)) @ axes
+        frames[f"nerfstudio's, {name}".rstrip(", ")] = (
+            _centered(moved, _turned(-moved[:, :3, 1], (0, 0, 1))) @ axes
+        )
         frames[f"centered and scaled, {name}".rstrip(", ")] = _centered(moved, np.eye(4)) @ axes
     frames |= _gsplat(poses, reconstruction.points)
-    for name, signs in {"x": (1, -1, -1), "y": (-1, 1, -1), "z": (-1, -1, 1)}.items():
-        frames[f"the photos' own, turned about {name}"] = np.diag([*map(float, signs), 1.0])
-    return frames
+    return frames | {f"the photos' own, turned about {name}": turn for name, turn in _HALF_TURNS.items()}
 
 
 def _of_run(splat: Path) -> dict[str, Similarity]:
@@ -59,26 +53,14 @@ def _of_run(splat: Path) -> dict[str, Similarity]:
             continue
         own = np.vstack([rows, [0, 0, 0, 1]])
         # A transforms.json of ns-process-data already has turned axes.
-        return {
-            "the run's": own,
-            "the run's, of turned axes": own @ np.linalg.inv(_Z_UP),
-        }
+        return {"the run's": own, "the run's, of turned axes": own @ np.linalg.inv(_Z_UP)}
     return {}
 
 
-def _upright(poses: Float[Array, "n 4 4"]) -> Similarity:
-    """Compute the smallest rotation that takes the cameras' mean up direction to z."""
-    up = -poses[:, :3, 1].mean(axis=0)
-    return _between(up / max(np.linalg.norm(up), 1e-12), np.array([0.0, 0, 1]))
-
-
-def _between(source: Float[Array, "3"], target: Float[Array, "3"]) -> Similarity:
-    """Compute the smallest rotation that takes one direction to another."""
-    axis, cosine = np.cross(source, target), float(source @ target)
-    turn = np.eye(4)
-    opposite = cosine < -1 + 1e-8
-    skew = np.cross(np.eye(3), axis)  # its product with a vector is axis × vector
-    turn[:3, :3] = np.diag([1.0, -1, -1]) if opposite else np.eye(3) + skew + skew @ skew / (1 + cosine)
+def _turned(axes: Float[Array, "n 3"], target: tuple[int, int, int]) -> Similarity:
+    """Compute the smallest rotation that takes the mean of some directions to another direction."""
+    turn, mean = np.eye(4), axes.mean(axis=0)
+    turn[:3, :3] = Rotation.align_vectors([target], [mean / max(np.linalg.norm(mean), 1e-12)])[0].as_matrix()
     return turn
 
 
@@ -98,8 +80,7 @@ def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[s
     """Compute the normalization of gsplat's examples: up is −y, the origin is where the cameras look, and the
     median camera is at distance 1. With points, their principal axes follow, and the one of smallest variance
     becomes z."""
-    up = -poses[:, :3, 1].mean(axis=0)
-    turn = _between(up / max(np.linalg.norm(up), 1e-12), np.array([0.0, -1, 0]))
+    turn = _turned(-poses[:, :3, 1], (0, -1, 0))
     turned = turn @ poses
     places, forward = turned[:, :3, 3], turned[:, :3, 2]
     nearest = places - (forward * places).sum(1, keepdims=True) * forward
@@ -107,23 +88,15 @@ def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[s
     shift[:3, 3] = -np.median(nearest, axis=0)
     distance = np.median(np.linalg.norm(places + shift[:3, 3], axis=1))
     first = _scaled(1 / max(float(distance), 1e-12)) @ shift @ turn
-    frames = {"gsplat's, without points": first}
     if len(points) < 4:
-        return frames
-    moved = points @ first[:3, :3].T + first[:3, 3]
-    middle = np.median(moved, axis=0)
-    _, axes = np.linalg.eigh(np.cov(moved - middle, rowvar=False))
-    axes = axes[:, ::-1].copy()  # largest variance first
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
+        return {"gsplat's, without points": first}
+    middle, axes, _ = _principal(points @ first[:3, :3].T + first[:3, 3])
     principal = np.eye(4)
     principal[:3, :3], principal[:3, 3] = axes.T, -axes.T @ middle
     # Versions differ in the signs of the axes.
-    for name, signs in {"": (1, 1, 1), "x": (1, -1, -1), "y": (-1, 1, -1), "z": (-1, -1, 1)}.items():
-        frames[f"gsplat's, turned about {name}" if name else "gsplat's"] = (
-            np.diag([*map(float, signs), 1.0]) @ principal @ first
-        )
-    return frames
+    turns = {"gsplat's": np.eye(4)} | {f"gsplat's, turned about {n}": turn for n, turn in _HALF_TURNS.items()}
+    frames = {"gsplat's, without points": first}
+    return frames | {name: turn @ principal @ first for name, turn in turns.items()}
 
 
 def registered_frames(points: Float[Array, "m 3"], means: Float[Array, "n 3"]) -> dict[str, Similarity]:
@@ -168,9 +141,9 @@ def _closest(
 
 
 def _principal(points: Float[Array, "m 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"], float]:
-    """Return the middle of points, their principal axes as columns of a rotation, smallest variance first,
-    and their mean distance from the middle."""
+    """Return the middle of points, their principal axes as columns of a rotation, largest variance first, and
+    their mean distance from the middle."""
     middle = np.median(points, axis=0)
-    _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
+    axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))[1][:, ::-1].copy()
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     return middle, axes, float(np.linalg.norm(points - middle, axis=1).mean())

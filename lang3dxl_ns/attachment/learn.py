@@ -43,14 +43,8 @@ def settled(config: PreparationConfig) -> PreparationConfig:
 def prepare_photos(
     collection: PhotoCollection, config: PreparationConfig, cache: Path, device: torch.device | str
 ) -> tuple[PhotoCollection, TargetReader]:
-    """Prepare the photos' foreground and targets. Photos that cannot be read are left out.
-
-    Args:
-        collection: the photos.
-        config: settings from `settled`.
-        cache: folder of the targets, where training also finds them.
-        device: where the encoders run.
-    """
+    """Prepare the photos' foreground and targets with `settled` settings, in the folder `cache`, where
+    training also finds them. Photos that cannot be read are left out."""
     masked = with_foreground(collection.photos, config, collection.folder, cache, device, say)
     names = [photo.name for photo in masked]
     made = prepare_collection(
@@ -63,18 +57,11 @@ def prepare_photos(
 def learn(
     splats: Splats, collection: PhotoCollection, cameras: Mapping[str, Camera], targets: TargetReader
 ) -> tuple[Decoder, Float[Tensor, "n code"]]:
-    """Learn a decoder and the Gaussians' codes, which are NaN for Gaussians that no photo shows.
-
-    Args:
-        splats: the Gaussians, on the device to compute on.
-        collection: the photos.
-        cameras: camera of each photo, at the file's resolution, in the splat's frame.
-        targets: targets of the photos.
-    """
-    device = splats.means.device
-    decoder = make_decoder(
-        DecoderConfig(), SemanticFieldConfig(preset="short"), targets.clip_dim, 0, torch.zeros(3), 1.0
-    ).to(device)
+    """Learn a decoder and the Gaussians' codes, which are NaN for Gaussians that no photo shows, on the
+    splat's device. `cameras` holds the photos' cameras, at the files' resolution, in the splat's frame."""
+    field = SemanticFieldConfig(preset="short")
+    decoder = make_decoder(DecoderConfig(), field, targets.clip_dim, 0, torch.zeros(3), 1.0)
+    decoder = decoder.to(splats.means.device)
     names = [photo.name for photo in collection.photos]
     dense = partial(targets.dense_features, names) if targets.dense_dim else None
     with progress_bar() as bar:
@@ -114,22 +101,22 @@ def scene_file(
     """Describe what a scene keeps of its photos and of the frame, where splat's = similarity · photos'."""
     known, local = find_model(config.clip, CLIP_OPTION), expanded(config.clip)
     scale = float(torch.from_numpy(similarity[:3, :3]).double().det().pow(1 / 3))
+    photos = [
+        ScenePhoto(
+            name=photo.name,
+            split="train",
+            camera_to_world=camera_to_world(cameras[photo.name].view_matrix.double()).tolist(),
+            lens=photo.lens.scaled(min(1.0, LONGER_SIDE / max(photo.width, photo.height))),
+            mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
+            size=(photo.width, photo.height),
+        )
+        for photo in collection.photos
+    ]
     return SceneFile(
-        photos=[_scene_photo(photo, cameras[photo.name]) for photo in collection.photos],
+        photos=photos,
         clip=str(local.absolute()) if local.is_dir() else config.clip,
         clip_identity=known.identity,
         scale=scale,
         transform=(similarity[:3] / scale).tolist(),
         data=str(collection.folder),
-    )
-
-
-def _scene_photo(photo: Photo, camera: Camera) -> ScenePhoto:
-    return ScenePhoto(
-        name=photo.name,
-        split="train",
-        camera_to_world=camera_to_world(camera.view_matrix.double()).tolist(),
-        lens=photo.lens.scaled(min(1.0, LONGER_SIDE / max(photo.width, photo.height))),
-        mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
-        size=(photo.width, photo.height),
     )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.preparation.segmentation import TextSegmenter
-from lang3dxl_ns.query.marks import MARK_SIDE
+from lang3dxl_ns.query.learn_word import MARK_SIDE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
@@ -33,14 +33,8 @@ def segmented(
     """Teach a scene a word by a segmenter; if that finds nothing, say so and return the same scene.
 
     Each photo votes about the Gaussians that it shows, so the others outvote an error in one photo. The word
-    is then learned from the Gaussians with a majority, as from marks by a person.
-
-    Args:
-        scene: the scene.
-        word: the word to teach.
-        segmenter: segmenter that finds the word in photos.
-        photos: photos of the scene.
-        cameras: camera of each photo, at the file's resolution, in the scene's frame.
+    is then learned from the Gaussians with a majority, as from marks by a person. `cameras` holds the photos'
+    cameras, at the files' resolution, in the scene's frame.
     """
     masks: dict[str, Bool[Tensor, "h w"]] = {}
 

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -17,12 +16,13 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from lang3dxl_ns.attachment import Up
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
-from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.match import as_bytes, save_picture
+from lang3dxl_ns.query.visibility import fingerprint
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.rendering.projection import rotations
 from lang3dxl_ns.rendering.render import Rendering, composite, render
@@ -31,7 +31,6 @@ from lang3dxl_ns.scene.camera import Camera, Lens, resized
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
 
-Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
 LENS = Lens(480, 360, 384.0, 384.0, 240.0, 180.0)
 """Lens of the views, 64 degrees wide like a phone's."""
 BACKGROUND = (0.75, 0.8, 0.85)
@@ -103,16 +102,15 @@ def solids(splats: Splats) -> Splats:
 def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:
     """Find the up direction, near one of the axes, from the ground: of all flat things at an end of the
     scene, the ground is the largest."""
-    normals, area = _normals(solid)
-    near = (solid.means - center).norm(dim=1) < 4 * radius
-    normals, area, places = normals[near], area[near], solid.means[near] - center
+    solid = solid.select((solid.means - center).norm(dim=1) < 4 * radius)
+    (normals, area), places = _normals(solid), solid.means - center
     best, direction = -math.inf, _axis("z").to(normals)
     for name in ("z", "-z", "y", "-y", "x", "-x"):
-        axis = _axis(name).to(normals)
-        facing = (normals @ axis).abs() > math.cos(_TILT)
+        cosines = normals @ _axis(name).to(normals)
+        facing = cosines.abs() > math.cos(_TILT)
         if not facing.any():
             continue
-        turned = normals[facing] * (normals[facing] @ axis).sign()[:, None]
+        turned = normals[facing] * cosines[facing].sign()[:, None]
         own = F.normalize((turned * area[facing, None]).sum(0), dim=0)
         heights = places @ own
         ground = (heights - heights.quantile(0.03)).abs() < 0.15 * radius
@@ -137,18 +135,10 @@ def _axis(name: str) -> Float[Tensor, "3"]:
 
 
 def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCollection:
-    """Render pictures of a splat as a photo collection, in the splat's frame.
+    """Render this many pictures of a splat as a photo collection, in the splat's frame.
 
-    They are kept in `folder`, and rendered again only for another splat or other settings.
-
-    Args:
-        splats: the Gaussians.
-        count: number of views.
-        up: axis that points up.
-        folder: where the pictures go.
-
-    Raises:
-        UserError: no view shows the splat well.
+    They are kept in `folder`, and rendered again only for another splat or other settings. Raises UserError
+    if no view shows the splat well.
     """
     stamp = fingerprint(vars(splats.gaussians), [_RULE, count, up])
     kept = _kept(folder, stamp)
@@ -177,11 +167,8 @@ def _kept(folder: Path, stamp: str) -> list[Camera] | None:
     """Read the cameras of an earlier call for the same splat; None if there was none."""
     try:
         content = read_json(folder / "views.json")
-        if content["of"] != stamp:
-            return None
-        return [
-            LENS.camera(torch.tensor(view, dtype=torch.float32).reshape(4, 4)) for view in content["views"]
-        ]
+        views = torch.tensor(content["views"]).float().reshape(-1, 4, 4)
+        return [LENS.camera(view) for view in views] if content["of"] == stamp else None
     except DAMAGE:
         return None
 
@@ -193,9 +180,7 @@ def _tracked(name: str, view: Rendering, chosen: np.random.Generator) -> Tracked
     rows, columns = rows[some], columns[some]
     depth = view.depth.cpu().double().numpy()[rows, columns]
     pixels = np.column_stack([columns + 0.5, rows + 0.5])
-    rays = np.column_stack(
-        [(pixels[:, 0] - LENS.cx) / LENS.fx, (pixels[:, 1] - LENS.cy) / LENS.fy, np.ones(len(pixels))]
-    )
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(LENS.matrix.numpy()).T
     pose = view.camera.view_matrix.double().numpy()
     points = (rays * depth[:, None] - pose[:3, 3]) @ pose[:3, :3]
     return TrackedPhoto(name, LENS, pose[:3], points, pixels)
@@ -206,27 +191,21 @@ def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
 
     Candidates are placed around the scene and in it, at several heights and distances. Those that are too
     close to matter, show little, or show it blurred are dropped. From the rest, the one that adds most is
-    chosen, again and again.
-
-    Raises:
-        UserError: no candidate is left.
+    chosen, again and again. Raises UserError if no candidate is left.
     """
     sample = torch.linspace(0, len(splats) - 1, min(_SAMPLE, len(splats)), dtype=torch.float64).long()
     free = _FreeSpace(solids(splats), extent)
-    shown, sizes, cameras = [], [], []
+    views = list[tuple[Camera, Float[Tensor, " sample"], float]]()
     with progress("choosing views", _CANDIDATES * count) as advance:
         for camera in candidates(extent, free, _CANDIDATES * count):
             if (judged := _judged(splats, camera, extent)) is not None:
-                pixels, size = judged
-                shown.append(pixels[sample.to(pixels.device)].cpu())
-                sizes.append(size)
-                cameras.append(camera)
+                views.append((camera, judged[0][sample.to(judged[0].device)].cpu(), judged[1]))
             advance()
-    if not cameras:
+    if not views:
         raise UserError("no view shows this splat well: give its photos (--data)")
-    sharp = torch.tensor(sizes) <= _BLURRED * torch.tensor(sizes).median()
-    cameras = [camera for camera, keep in zip(cameras, sharp, strict=True) if keep]
-    found = _cover(torch.stack(shown)[sharp], min(count, len(cameras)))
+    blurred = _BLURRED * float(torch.tensor([size for *_, size in views]).median())
+    cameras, shown, _ = zip(*(view for view in views if view[-1] <= blurred), strict=True)
+    found = _cover(torch.stack(shown), min(count, len(cameras)))
     say(f"{len(found)} views chosen of {len(cameras)} that show the splat well")
     return [cameras[i] for i in found]
 
@@ -272,7 +251,7 @@ class _FreeSpace:
         self._extent, self._margin = extent, _NEAR * extent.radius
         self._tree = KDTree(solid.means.cpu().numpy())
         self._reach = solid.scales.amax(1).clamp_max(0.2 * extent.radius).cpu().numpy()
-        self._plan = torch.stack(_level(extent.up), dim=1)
+        self._plan = torch.stack([_level(extent.up), _level(extent.up, 0.25)], dim=1)
         self._from_above = KDTree((solid.means @ self._plan).cpu().numpy())
         self._heights = (solid.means @ extent.up).cpu().numpy()
         self._width = 2 * (self._margin + float(np.median(self._reach)))
@@ -308,8 +287,7 @@ def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], 
     angle, height, distance, *aim = torch.rand(6, generator=draw).tolist()
     elevation = math.radians(40) * height**2
     away = extent.radius * _RING[0] * (_RING[1] / _RING[0]) ** distance
-    side, front = _level(extent.up)
-    direction = math.cos(2 * math.pi * angle) * side + math.sin(2 * math.pi * angle) * front
+    direction = _level(extent.up, angle)
     floor = extent.center + (extent.ground + 0.08 * extent.radius) * extent.up
     place = floor + away * (math.cos(elevation) * direction + math.sin(elevation) * extent.up)
     offset = torch.tensor([2 * value - 1 for value in aim]).to(place)
@@ -320,19 +298,17 @@ def _inside(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], 
     """Draw a place over the ground within a radius, at a person's or a story's height, and a target
     around."""
     x, y, height, angle, tilt = torch.rand(5, generator=draw).tolist()
-    side, front = _level(extent.up)
+    side, front = _level(extent.up), _level(extent.up, 0.25)
     place = extent.center + extent.radius * ((2 * x - 1) * side + (2 * y - 1) * front)
     place = place + (extent.ground + extent.radius * (0.08 + 0.4 * height**2)) * extent.up
-    ahead = math.cos(2 * math.pi * angle) * side + math.sin(2 * math.pi * angle) * front
-    return place, place + ahead + (0.5 * tilt - 0.15) * extent.up
+    return place, place + _level(extent.up, angle) + (0.5 * tilt - 0.15) * extent.up
 
 
-def _level(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Return two directions along the ground."""
-    first = torch.zeros_like(up)
-    first[int(up.abs().argmin())] = 1.0
+def _level(up: Float[Tensor, "3"], turn: float = 0.0) -> Float[Tensor, "3"]:
+    """Return the direction along the ground at a fraction of a full turn."""
+    first = F.one_hot(up.abs().argmin(), 3).to(up)
     side = F.normalize(torch.linalg.cross(up, first), dim=0)
-    return side, torch.linalg.cross(up, side)
+    return math.cos(2 * math.pi * turn) * side + math.sin(2 * math.pi * turn) * torch.linalg.cross(up, side)
 
 
 def looking(

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
+from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.preparation.settings import PreparationConfig
 
 
 @showing(
@@ -19,7 +17,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
     *("workers", "cache_dir"),
 )
 @dataclass(kw_only=True)
-class Attach(PreparationConfig):
+class Attach(AttachConfig):
     """Give words to a finished splat: write a scene that answers any text, without training colors again.
 
     Reads PLY files of any program (also SuperSplat's compressed ones), .spz, .splat, gsplat's checkpoints,
@@ -37,24 +35,12 @@ class Attach(PreparationConfig):
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Texts to search for at the end ("windows; towers"). A picture of the best view of each is written
     beside the scene."""
-    views: int = 48
-    """Number of views to render without --data."""
-    up: Literal["auto", "x", "-x", "y", "-y", "z", "-z"] = "auto"
-    """Axis of the splat that points up, without --data. With auto, it is estimated from the ground."""
-    segment: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Word that --foreground-model finds in the photos and teaches the scene. Repeat the flag for more."""
-    cache_dir: Path | None = None
-    """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.attachment.attach import AttachConfig, attach
+        from lang3dxl_ns.attachment.attach import attach
 
         self.check()
-        if not 4 <= self.views <= 10_000:
-            raise UserError(f"--views is {self.views}: give a number from 4 to 10000")
-        settings = PreparationConfig(**{f.name: getattr(self, f.name) for f in fields(PreparationConfig)})
-        config = AttachConfig(self.views, self.up, self.cache_dir, tuple(self.segment), settings)
-        scene = attach(self.splat, self.data, self.out, config)
+        scene = attach(self.splat, self.data, self.out, self)
         if self.text:
             _show(scene, self.text, self.out)
         say(f'Ask it: lang3dxl query {self.out} --text "windows" --out found')

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 RUN = Path("run", "lang3dxl", "demo")
 """Folder of the run inside the demo's folder."""
-_STAGES = "stages.json"
 
 
 @showing("out", "quick", "steps", "seed")
@@ -78,7 +77,7 @@ class Demo:
             sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
-        scene, stages = out / "scene", Stages(SHARES, out / _STAGES)
+        scene, stages = out / "scene", Stages(_SHARES, out / "stages.json")
         if kept := (scene / "scene.json").exists():
             say("scene: kept from an earlier command")
         else:
@@ -136,18 +135,21 @@ class Demo:
             found = dict(read_json(path))
         except (OSError, ValueError, TypeError) as error:
             return f"{path} can't be read ({error})"
-        different = (n for n, value in self._wanted.items() if found.get(n, 0) != value)
-        if (name := next(different, None)) is None:
-            return None
-        return f"{path.parent} is a scene with {name} {found.get(name, 0)}, not {self._wanted[name]}"
+        for name, value in self._wanted.items():
+            if found.get(name, 0) != value:
+                return f"{path.parent} is a scene with {name} {found.get(name, 0)}, not {value}"
+        return None
 
     @property
     def _wanted(self) -> dict[str, Any]:
         """Settings that distinguish the requested scene from others, with their names in scene.json."""
         photos, views = (24, 8) if self.quick else (48, 24)
-        wanted: dict[str, Any] = {"seed": self.seed, "wild": self.wild}
-        wanted["photos"] = photos if self.photos is None else self.photos
-        wanted["test_views"] = views if self.test_views is None else self.test_views
+        wanted = {
+            "seed": self.seed,
+            "wild": self.wild,
+            "photos": photos if self.photos is None else self.photos,
+            "test_views": views if self.test_views is None else self.test_views,
+        }
         return wanted | ({} if self.family == "auto" else {"family": self.family})
 
     def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
@@ -192,11 +194,9 @@ class Demo:
         from lang3dxl_ns.evaluation.report import scene_table
 
         splits = "\n".join(f"#{scene_table(*split)}" for split in report["splits"].items())
-        cost = [
-            [stage, f"{seconds:.0f}", f"{report['peak_mb'][stage]:.0f}"]
-            for stage, seconds in report["seconds"].items()
-        ]
-        cost.append(["all", f"{sum(report['seconds'].values()):.0f}", ""])
+        seconds, memory = report["seconds"], report["peak_mb"]
+        cost = [[stage, f"{spent:.0f}", f"{memory[stage]:.0f}"] for stage, spent in seconds.items()]
+        cost.append(["all", f"{sum(seconds.values()):.0f}", ""])
         return f"""# A landmark and its words
 
     {report["command"]}
@@ -218,7 +218,7 @@ size, as published. Test views are novel cameras in plain light, no people. PSNR
 
 _BOUNDS = {"seed": (0, 2**63), "photos": (4, 9999), "steps": (1, 1e9), "test_views": (0, 9999)}
 
-SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluate": 0.28}
+_SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluate": 0.28}
 """Stages of the demo, with their usual shares of its time on a CPU."""
 
 
@@ -231,11 +231,6 @@ def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, matches: dict[
         size = next(iter(photo.maps.values())).shape
         truth = scorer.truth.masks(photo.name, (size[0], size[1]))
     codes = photo.images.get("bottleneck", rendered)
-    return PictureRow(
-        name=photo.name,
-        photo=real.numpy(),
-        rendering=rendered.numpy(),
-        codes=codes.cpu().numpy(),
-        matches=matches,
-        truth={prompt: mask for prompt, mask in truth.items() if mask.any() and prompt in matches},
-    )
+    truth = {prompt: mask for prompt, mask in truth.items() if mask.any() and prompt in matches}
+    pictures = (real.numpy(), rendered.numpy(), codes.cpu().numpy())
+    return PictureRow(photo.name, *pictures, matches, truth)

@@ -25,10 +25,16 @@ class Finding:
     """Result of one check."""
 
     what: str
-    verdict: Literal["ok", "note", "problem"]
     found: str
+    fine: bool
     remedy: str = ""
     """Remedy if the check did not pass."""
+    bad: Literal["note", "problem"] = "note"
+
+    @property
+    def verdict(self) -> Literal["ok", "note", "problem"]:
+        """Whether the check passed, and how bad it is if not."""
+        return "ok" if self.fine else self.bad
 
 
 @dataclass(kw_only=True)
@@ -45,53 +51,51 @@ class Doctor:
     """Compute capability to build for, such as 8.6. The default is the one of this machine's GPUs."""
 
     def main(self) -> None:
-        found = []
+        problems = 0
         for finding in findings():
-            found.append(finding)
+            problems += finding.verdict == "problem"
             print(f"[{finding.verdict:^7}] {finding.what}: {finding.found}")
-            if finding.remedy:
+            if not finding.fine:
                 print(f"{'':10}{finding.remedy}")
         if self.build:
-            build_now(self.arch)
-        problems = sum(finding.verdict == "problem" for finding in found)
+            self._build()
         if problems:
             sys.exit(f"Verdict: {problems} problem(s) found, see above")
         print("Verdict: ready")
 
+    def _build(self) -> None:
+        """Build and load gsplat's kernels. Raises UserError if something is missing."""
+        from lang3dxl_ns.rendering import gsplat_build
 
-def build_now(arch: str = "") -> None:
-    """Build and load gsplat's kernels for a compute capability, by default this machine's. Raises UserError
-    if something is missing."""
-    from lang3dxl_ns.rendering import gsplat_build
-
-    arch = arch or gsplat_build.device_arch()
-    if not arch:
-        raise UserError("torch sees no GPU to build for: name a compute capability, such as --arch 8.6")
-    folder = gsplat_build.build_folder(arch)
-    library = gsplat_build.build(gsplat_build.gsplat_extension(), folder, arch)
-    gsplat_build.load(library)
-    print(f"gsplat's kernels for {arch}: {library}, built in {(folder / 'done').read_text().strip()}")
+        arch = self.arch or gsplat_build.device_arch()
+        if not arch:
+            raise UserError("torch sees no GPU to build for: name a compute capability, such as --arch 8.6")
+        folder = gsplat_build.build_folder(arch)
+        library = gsplat_build.build(gsplat_build.gsplat_extension(), folder, arch)
+        gsplat_build.load(library)
+        print(f"gsplat's kernels for {arch}: {library}, built in {(folder / 'done').read_text().strip()}")
 
 
 def findings() -> Iterator[Finding]:
     """Run all checks, and yield each result."""
     yield from versions()
     yield from devices()
-    yield storage("memory", machine_memory(), LEAST_MEMORY, "--pipeline.datamanager.cache-gb 0.2")
-    free = shutil.disk_usage(Path.cwd()).free
-    yield storage("free disk here", free, LEAST_DISK, "another folder: --output-dir, --cache-dir, HF_HOME")
+    disk, folders = shutil.disk_usage(Path.cwd()).free, "another folder: --output-dir, --cache-dir, HF_HOME"
+    cache, memory = "--pipeline.datamanager.cache-gb 0.2", machine_memory()
+    yield Finding("memory", f"{memory / 1e9:.1f} GB", memory >= LEAST_MEMORY, f"little: use {cache}")
+    yield Finding("free disk here", f"{disk / 1e9:.1f} GB", disk >= LEAST_DISK, f"little: use {folders}")
     ffmpeg = shutil.which("ffmpeg")
-    remedy = "" if ffmpeg else "ns-render and videos need it: apt install ffmpeg, conda install ffmpeg"
-    yield Finding("ffmpeg", "ok" if ffmpeg else "note", ffmpeg or "not found", remedy)
+    remedy = "ns-render and videos need it: apt install ffmpeg, conda install ffmpeg"
+    yield Finding("ffmpeg", ffmpeg or "not found", ffmpeg is not None, remedy)
 
 
 def versions() -> Iterator[Finding]:
     """Check Python and the required packages, pycolmap among them, against this package's requirements."""
     from packaging.requirements import Requirement
 
-    fine = (3, 10) <= sys.version_info[:2] < (3, 13)
-    remedy = "" if fine else "nerfstudio needs 3.10, 3.11 or 3.12: make an environment of it"
-    yield Finding("Python", "ok" if fine else "problem", sys.version.split()[0], remedy)
+    fine, remedy = (3, 10) <= sys.version_info[:2] < (3, 13), "nerfstudio needs 3.10, 3.11 or 3.12"
+    remedy = f"{remedy}: make an environment of it"
+    yield Finding("Python", sys.version.split()[0], fine, remedy, "problem")
     for need in (Requirement(line) for line in requires("lang3dxl-ns") or []):
         if need.marker is not None:
             continue
@@ -99,16 +103,16 @@ def versions() -> Iterator[Finding]:
             found = version(need.name)
         except PackageNotFoundError:
             found = ""
-        good = found and need.specifier.contains(found.partition("+")[0], prereleases=True)
-        remedy = "" if good else f"pip install '{need.name}{need.specifier}'"
-        yield Finding(need.name, "ok" if good else "problem", found or "not installed", remedy)
+        good = found != "" and need.specifier.contains(found.partition("+")[0], prereleases=True)
+        remedy = f"pip install '{need.name}{need.specifier}'"
+        yield Finding(need.name, found or "not installed", good, remedy, "problem")
 
 
 def devices() -> Iterator[Finding]:
     """Check the GPUs, and what gsplat's kernels need. Without a GPU, report the CPU."""
-    cpu = Finding("device", "note", f"CPU, {os.cpu_count()} cores", "training is slower than on a GPU")
+    cpu = f"CPU, {os.cpu_count()} cores"
     if not (shutil.which("nvidia-smi") or glob("/dev/nvidia[0-9]*") or glob("/dev/kfd")):
-        yield cpu
+        yield Finding("device", cpu, False, "training is slower than on a GPU")
         return
     import torch  # takes seconds to import
 
@@ -116,20 +120,13 @@ def devices() -> Iterator[Finding]:
     from lang3dxl_ns.rendering import gsplat_build
 
     if trouble := unused_gpu():
-        yield Finding("device", "problem", cpu.found, trouble)
+        yield Finding("device", cpu, False, trouble, "problem")
         return
     for i in range(torch.cuda.device_count()):
         gpu = torch.cuda.get_device_properties(i)
-        yield Finding(f"device cuda:{i}", "ok", f"{gpu.name}, {gpu.total_memory / 1e9:.1f} GB")
+        yield Finding(f"device cuda:{i}", f"{gpu.name}, {gpu.total_memory / 1e9:.1f} GB", True)
     folder = gsplat_build.build_folder(gsplat_build.device_arch())
     if torch.version.hip is None and not gsplat_build.built(folder):
         for need in gsplat_build.needs(folder):
-            verdict: Literal["ok", "note"] = "note" if need.found is None else "ok"
-            remedy = need.remedy if need.found is None else ""
-            yield Finding(f"to build gsplat, {need.what}", verdict, need.found or "missing", remedy)
-
-
-def storage(what: str, size: float, least: float, remedy: str) -> Finding:
-    """Check whether there is enough of a kind of storage, in bytes."""
-    verdict: Literal["ok", "note"] = "ok" if size >= least else "note"
-    return Finding(what, verdict, f"{size / 1e9:.1f} GB", "" if size >= least else f"little: use {remedy}")
+            what, there = f"to build gsplat, {need.what}", need.found is not None
+            yield Finding(what, need.found or "missing", there, need.remedy)

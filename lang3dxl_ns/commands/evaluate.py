@@ -20,9 +20,19 @@ REPORT = "scores"
 """Name of the report's files, without suffix."""
 
 
+@dataclass(kw_only=True)
+class _Scored:
+    layout: Layout | Literal["auto"] = "auto"
+    """Layout of the ground truth; "auto" detects it."""
+    scene: str | None = None
+    """Name in the report (default: the name of the folder of the data, or of the ground truth)."""
+    out: Path
+    """Folder for the report."""
+
+
 @showing("maps", "ground_truth", "layout", "photos", "masks", "out")
 @dataclass(kw_only=True)
-class EvaluateMaps:
+class EvaluateMaps(_Scored):
     """Score relevancy maps made by any system, and write scores.md and scores.json.
 
     Maps are in a folder per prompt, as `<prompt>/<photo>.npy` (float) or a picture. `lang3dxl query` also
@@ -33,8 +43,6 @@ class EvaluateMaps:
     """Folder of the maps."""
     ground_truth: Path
     """Folder of the scene's ground truth, in any layout of docs/evaluation.md."""
-    layout: Layout | Literal["auto"] = "auto"
-    """Layout of the ground truth; "auto" detects it."""
     photos: Path | None = None
     """Text file with the names of the photos to score, one per line (default: all labeled photos)."""
     masks: Path | None = None
@@ -42,10 +50,6 @@ class EvaluateMaps:
     temperature: float = 1.0
     """Softmax temperature that the maps were made with: 20 for `lang3dxl query`, 10 in LERF's code. For the
     published processing, maps are converted to temperature 1, which it uses."""
-    scene: str | None = None
-    """Name in the report (default: the name of the ground truth's folder)."""
-    out: Path
-    """Folder for the report."""
 
     def main(self) -> None:
         from lang3dxl_ns.evaluation.predictions import score_predictions
@@ -57,11 +61,13 @@ class EvaluateMaps:
         photos, protocol = score_predictions(truth, self.maps, names, self.masks, self.temperature)
         results = average(list(photos.values()), with_deviation=True)
         results |= {"protocol": protocol, "photos": photos}
-        write_scores(self.out, self.scene or _scene_name(truth.folder.absolute()), results)
+        folder = truth.folder.absolute()
+        name = folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
+        write_scores(self.out, self.scene or name, results)
 
 
 @dataclass(kw_only=True)
-class EvaluateRun:
+class EvaluateRun(_Scored):
     """Score a trained run like `ns-eval`, but on photos and with ground truth of your choice.
 
     Writes scores.md and scores.json.
@@ -74,12 +80,6 @@ class EvaluateRun:
     """Photos to score: those held out of training, labeled training photos, or the run's test views."""
     ground_truth: Path | None = None
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
-    layout: Layout | Literal["auto"] = "auto"
-    """Layout of the ground truth; "auto" detects it."""
-    scene: str | None = None
-    """Name in the report (default: the data folder)."""
-    out: Path
-    """Folder for the report."""
 
     def main(self) -> None:
         if self.run is not None and self.run.suffix == ".scene":
@@ -186,11 +186,6 @@ def _told(name: str, protocol: dict[str, Any]) -> str:
     keys = ("evaluated_photos", "seen_in_training", "foreground")
     known = [f"{key.replace('_', ' ')}: {protocol[key]}" for key in keys if protocol.get(key) is not None]
     return f"- {name}: {', '.join(known) or 'its report does not tell how it was scored'}"
-
-
-def _scene_name(folder: Path) -> str:
-    """Derive the scene's name from a ground truth folder named after it, or one inside that."""
-    return folder.parent.name if folder.name in ("ground_truth", "label") else folder.name
 
 
 def write_scores(folder: Path, scene: str, results: dict[str, Any], device: Any = "cpu") -> None:

@@ -1,7 +1,10 @@
-"""`lang3dxl prepare`: make a scene's targets before training, or delete unused ones."""
+"""`lang3dxl prepare` and `lang3dxl needs`: a scene's targets, and the components that it needs."""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,7 +42,7 @@ class Prepare(PreparationConfig):
         check_data(self.data)
         if not self.clean:
             check_encoders(self.clip, self.dense)
-        datamanager = open_datamanager(self, self.data, self.cache_dir)
+        datamanager = _open_datamanager(self, self.data, self.cache_dir)
         if self.clean:
             files, freed = datamanager.clean_store()
             print(f"Deleted {files} files, {freed / 1e6:.1f} MB, from {datamanager.cache_dir}")
@@ -49,7 +52,29 @@ class Prepare(PreparationConfig):
             print(f"  {kind}: {files} files, {size / 1e6:.1f} MB")
 
 
-def open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:
+@showing("data", "json", "clip")
+@dataclass(kw_only=True)
+class Needs(PreparationConfig):
+    """Measure a scene's needs without training: which optional components will be built, and why.
+
+    `ns-train lang3dxl` measures the same, and applies it to every component left at "auto".
+    """
+
+    data: Path
+    """Folder with images/ and sparse/0/."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.preparation.needs import as_data, needs_table
+
+        # Keep nerfstudio's start-up output out of the answer.
+        with contextlib.redirect_stdout(sys.stderr):
+            needs = _open_datamanager(self, self.data, None).needs
+        print(json.dumps(as_data(needs), indent=2) if self.json else needs_table(needs))
+
+
+def _open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:
     """Open the data manager for a folder of photos with these settings. Nothing is prepared yet."""
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig

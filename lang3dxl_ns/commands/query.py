@@ -6,13 +6,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 from jaxtyping import Bool
 from numpy import ndarray as Array
 from PIL import Image
+from scipy.ndimage import find_objects, label
 
 from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say
@@ -21,20 +22,23 @@ from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomi
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.open_scene import load_scene, provenance_of
-from lang3dxl_ns.query.coco import CocoLabels
 from lang3dxl_ns.query.doubt import doubtful
-from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.match import Match, save_picture, together
+from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import read_camera_path
-from lang3dxl_ns.query.scene import QueryConfig, Scene
-from lang3dxl_ns.query.scene_file import Provenance, write_scene
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.scene_file import Provenance, with_words_of, write_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
+from lang3dxl_ns.query.teach import run_lengths
 from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
 from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
 
+_LEAST_PART = 1e-4
+"""Share of a photo below which a separate part of a mask is no label."""
+_NEAREST = Image.Resampling.NEAREST
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
@@ -86,37 +90,34 @@ class Query:
         question = scene.ask(prompts)
         prompts = list(question.prompts)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
-        labels = CocoLabels([prompt.text for prompt in prompts])
-        views, best = [], [-1.0] * len(prompts)
-        where = [""] * len(prompts)
+        labels, views = CocoLabels([prompt.text for prompt in prompts]), []
+        best = [(-1.0, "")] * len(prompts)
         with progress_bar() as bar:
             for name, place, asked in bar.track(self._places(scene, question), description="rendering"):
                 wanted = question if len(asked) == len(prompts) else scene.ask([prompts[i] for i in asked])
                 matches = scene.matches(wanted, place)
                 for i, match in zip(asked, matches, strict=True):
-                    write_match(match, folders[i] / name)
-                    if match.score > best[i]:
-                        best[i], where[i] = match.score, f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
+                    _write_match(match, folders[i] / name)
+                    where = f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
+                    best[i] = max(best[i], (match.score, where), key=lambda found: found[0])
                 if self.coco is not None and isinstance(place, str):
-                    labels.add(place, [of_file(scene, place, match.mask) for match in matches])
+                    size = scene.file.photo(place).file_size
+                    masks = [Image.fromarray(match.mask).resize(size, _NEAREST) for match in matches]
+                    labels.add(place, [np.asarray(mask) for mask in masks])
                 if len(matches) > 1:
                     save_picture(together(matches), shared / f"{name}.png")
                 views.append(_view_report(name, matches))
         if self.coco is not None:
             write_atomically(self.coco, json.dumps(labels.content) + "\n")
-        doubts, levels = question.doubts, question.thresholds
-        texts = zip(prompts, doubts, levels, folders, strict=True)
+        texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))
         report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
         write_atomically(self.out / "query.json", json.dumps(report, indent=2, ensure_ascii=False) + "\n")
-        found = zip(prompts, doubts, levels, folders, best, where, strict=True)
-        for prompt, doubt, level, folder, score, place in found:
-            closest = "" if score > level else " (no match; this view comes closest)"
-            by = "" if prompt.taught is None else " (taught)"
-            say(f"{prompt.text}{by}: {score:.2f} at {place}; {folder}{closest}")
+        for (prompt, doubt, level, folder), (score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
-            told = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
-            for advice in filter(None, told):
-                say(f"  {advice}")
+            closest = "" if score > level else " (no match; this view comes closest)"
+            say(f"{prompt.text}{' (taught)' if taught else ''}: {score:.2f} at {where}; {folder}{closest}")
+            warnings = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
+            say(*(f"  {advice}" for advice in warnings if advice))
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
         """List file name (no suffix), camera or photo, and prompts of every requested view."""
@@ -133,6 +134,43 @@ class Query:
         photos = list(dict.fromkeys(best))
         asked = [[i for i, b in enumerate(best) if b == photo] for photo in photos]
         return list(zip(file_names(photos), photos, asked, strict=True))
+
+
+class CocoLabels:
+    """A data set in COCO's format, with an annotation for each connected part of each mask."""
+
+    def __init__(self, categories: Sequence[str]) -> None:
+        self._images: list[dict[str, Any]] = []
+        self._annotations: list[dict[str, Any]] = []
+        self._categories = [{"id": i, "name": name} for i, name in enumerate(categories, start=1)]
+
+    def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
+        """Add a photo by name, with one mask per category, at the size of the photo's file."""
+        image, (height, width) = len(self._images) + 1, masks[0].shape
+        self._images.append({"id": image, "file_name": photo, "width": width, "height": height})
+        for category, mask in enumerate(masks, start=1):
+            numbers, _ = label(mask)
+            for number, place in enumerate(find_objects(numbers), start=1):
+                area = int(np.count_nonzero(numbers[place] == number))
+                if area < _LEAST_PART * mask.size:
+                    continue
+                part = numbers == number
+                rows, columns = place
+                box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
+                outline = {"size": list(part.shape), "counts": run_lengths(part)}
+                labeled = {"id": len(self._annotations) + 1, "image_id": image, "category_id": category}
+                found = {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
+                self._annotations.append({**labeled, **found})
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Content of the COCO file."""
+        return {
+            "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
+            "images": self._images,
+            "annotations": self._annotations,
+            "categories": self._categories,
+        }
 
 
 def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:
@@ -154,14 +192,7 @@ def file_names(photos: list[str]) -> list[str]:
     return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
 
 
-def of_file(scene: Scene, photo: str, mask: Bool[Array, "h w"]) -> Bool[Array, "H W"]:
-    """Resize a view's mask to the size of the photo's file."""
-    found = scene.file.photo(photo)
-    size = found.size or (found.lens.width, found.lens.height)
-    return np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.NEAREST))
-
-
-def write_match(match: Match, stem: Path) -> None:
+def _write_match(match: Match, stem: Path) -> None:
     """Write `stem`.overlay.png, .mask.png and .npy."""
     match.save(stem.with_name(f"{stem.name}.overlay.png"))
     save_picture(match.mask * np.uint8(255), stem.with_name(f"{stem.name}.mask.png"))
@@ -267,6 +298,6 @@ class Export:
 
     def _told(self) -> Provenance:
         """Return the provenance in the scene's own file, with what the flags override."""
-        own, program = provenance_of(self.scene), f"lang3dxl-ns {__version__}"
-        title, credit = self.title or own.title, self.credit or own.credit
-        return Provenance(title, credit, self.license or own.license, program, own.made_how)
+        flags = {"title": self.title, "credit": self.credit, "license": self.license}
+        told = {name: text for name, text in flags.items() if text}
+        return replace(provenance_of(self.scene), made_by=f"lang3dxl-ns {__version__}", **told)

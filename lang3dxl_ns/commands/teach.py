@@ -55,6 +55,7 @@ class Teach:
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
 
     def _example(self) -> Example:
+        from lang3dxl_ns.evaluation.annotations import read_gray
         from lang3dxl_ns.query.teach import Example
 
         box = None if self.box is None else _numbers(self.box, 4, "--box LEFT,TOP,RIGHT,BOTTOM")
@@ -62,7 +63,8 @@ class Teach:
             tuple((x, y) for x, y in (_numbers(text, 2, f"{flag} X,Y") for text in texts))
             for texts, flag in ((self.at, "--at"), (self.not_at, "--not-at"))
         )
-        mask = None if self.mask is None else read_mask(self.mask)
+        # A mask is true where the picture is at least half bright.
+        mask = None if self.mask is None else np.asarray(read_gray(self.mask, "mask")) >= 128
         return Example(self.photo, mask, box, points, others)  # type: ignore[arg-type]
 
 
@@ -103,11 +105,7 @@ class Words:
 
 
 def opened(path: Path | None) -> tuple[Scene, Path]:
-    """Open a scene, and find the file that keeps its words.
-
-    Raises:
-        UserError: there is no scene file.
-    """
+    """Open a scene, and find the file that keeps its words. Raises UserError if there is none."""
     from lang3dxl_ns.open_scene import find_scene_file
     from lang3dxl_ns.query.scene_file import read_scene
 
@@ -120,14 +118,13 @@ def opened(path: Path | None) -> tuple[Scene, Path]:
 
 
 def forgotten(scene: Scene, which: str) -> Scene:
-    """Return the scene without a word (doors), or without one of its examples (doors/2).
-
-    Raises:
-        UserError: the word or example was not taught.
-    """
+    """Return the scene without a word (doors), or without one of its examples (doors/2). Raises UserError if
+    it was not taught."""
     from lang3dxl_ns.query.teach import known_word
 
-    name, _, number = which.rpartition("/") if which.rpartition("/")[2].isdecimal() else (which, "", "")
+    name, _, number = which.rpartition("/")
+    if not number.isdecimal():
+        name, number = which, ""
     word = scene.words.get(known_word(name))
     if word is None or (number and not 1 <= int(number) <= len(word.examples)):
         raise UserError(f"{which!r} was not taught: lang3dxl words lists what was")
@@ -152,17 +149,10 @@ def described(word: TaughtWord) -> list[str]:
 
 
 def _marks(example: Example) -> str:
-    kind = "outline" if example.mask is not None else "box" if example.box is not None else ""
-    counted = ((len(example.points), "point"), (len(example.not_points), "point elsewhere"))
-    points = [f"{count} {what}" for count, what in counted if count]
-    return ", ".join([*([kind] if kind else []), *points])
-
-
-def read_mask(path: Path) -> np.ndarray:
-    """Read a picture as a mask, true where at least half bright. Raises UserError if it cannot be read."""
-    from lang3dxl_ns.evaluation.annotations import read_gray
-
-    return np.asarray(read_gray(path, "mask")) >= 128
+    counts = {"point": len(example.points), "point elsewhere": len(example.not_points)}
+    kinds = {"outline": example.mask is not None, "box": example.box is not None}
+    marked = [kind for kind, there in kinds.items() if there]
+    return ", ".join([*marked, *(f"{count} {what}" for what, count in counts.items() if count)])
 
 
 def _numbers(text: str, count: int, usage: str) -> tuple[float, ...]:

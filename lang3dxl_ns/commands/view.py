@@ -1,4 +1,4 @@
-"""`lang3dxl view`: exploring and querying a scene in the browser."""
+"""`lang3dxl view` and `lang3dxl info`: a scene in the browser, and what its file holds."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import tyro
 
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.common.settings_help import showing
 
@@ -50,3 +51,31 @@ class View:
         say(f"Open {server.access.address} ({who}). Ctrl-C ends it.")
         with contextlib.suppress(KeyboardInterrupt), server:
             server.serve_forever()
+
+
+@dataclass(kw_only=True)
+class Info:
+    """Print what a scene file holds and where it comes from."""
+
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.open_scene import find_scene_file
+        from lang3dxl_ns.query.scene_file import describe_scene_file
+
+        file = find_scene_file(self.scene)
+        if file is None:
+            raise UserError(
+                "the run has no scene file: `lang3dxl export RUN --scene-file NAME.scene` writes one"
+            )
+        told = describe_scene_file(file)
+        decoder, count = told["decoder"], told["gaussians"]
+        words = "none: colors alone" if decoder is None else f"CLIP {told['clip']}, decoder {decoder['name']}"
+        lines = {name.replace("_", " "): value for name, value in vars(told["provenance"]).items()} | {
+            "Gaussians": f"{count:,}",
+            "photos": f"{told['photos']}{', each with its lighting' if told['looks'] else ''}",
+            "words": words,
+            "size": f"{told['bytes'] / 1e6:.2f} MB, {told['bytes'] / max(count, 1):.0f} bytes a Gaussian",
+        }
+        say(*(f"{name:10} {value}" for name, value in lines.items() if value))

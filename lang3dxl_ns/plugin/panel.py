@@ -18,8 +18,7 @@ from lang3dxl_ns.common.worker import Worker
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.query.conversation import Conversation, plain
 from lang3dxl_ns.query.match import Found
-from lang3dxl_ns.query.overview import overview
-from lang3dxl_ns.query.run_file import SceneFile
+from lang3dxl_ns.query.run_file import SceneFile, overview
 from lang3dxl_ns.query.web.viewer_guard import Guard, guard_viewers
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera

@@ -23,9 +23,8 @@ from lang3dxl_ns.plugin.lift_features import learn_from_photos
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
-from lang3dxl_ns.query.answer import pictures
 from lang3dxl_ns.query.match import Match
-from lang3dxl_ns.query.question import Question
+from lang3dxl_ns.query.question import Question, pictures
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.rendering import Rendering

@@ -144,7 +144,7 @@ class RenderingModel(SplatfactoModel):
             None if codes is None else codes.detach().clone(),
             looks=None if looks is None else Looks(_frozen(looks.field)),
             background=self._get_background_color().clone(),
-            config=config,
+            config=config or QueryConfig(),
             encode_texts=encode_texts,
             cache=cache,
             backend=self.backend,

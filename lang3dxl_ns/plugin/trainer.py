@@ -38,10 +38,9 @@ from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.preparation.needs import write_needs
-from lang3dxl_ns.query.kept_words import with_words_of
 from lang3dxl_ns.query.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE
-from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, write_scene
+from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 6.0}
 """Duration of an iteration in renderings of its photo, by whether semantics are trained with the scene: 2.1

@@ -29,9 +29,8 @@ from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
-from lang3dxl_ns.query.find_run import find_config
 from lang3dxl_ns.query.run_checkpoint import check_checkpoint, latest_checkpoint
-from lang3dxl_ns.query.run_file import SCENE_FILE
+from lang3dxl_ns.query.run_file import SCENE_FILE, find_config
 from lang3dxl_ns.query.run_settings import load_configs, no_config, read_settings
 from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
 from lang3dxl_ns.scene.camera import Camera

@@ -6,7 +6,7 @@ import re
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -14,61 +14,54 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.query.answer import pictures
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.question import Question
+from lang3dxl_ns.query.question import Question, pictures
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 
 
+@dataclass(eq=False, repr=False)
 class Conversation:
     """Questions to a model that may be in training in another thread.
 
     Each question is put to a snapshot of the model, a separate scene, so that only taking the snapshot waits
     for training. If the model is in training and its decoder learns from lifted features, taking the snapshot
     learns words from the photos first.
-
-    Args:
-        model: a `Lang3DXLModel`, trained or in training.
-        file: photos, cameras and CLIP.
-        run: folder of the run, which keeps results that are computed once.
-        lock: held while using the model.
-        learning: returns whether the model still changes.
-        learn: makes the Gaussians' codes for the present model, for decoders that need it.
-        shown: returns the names of the outputs that the viewer shows.
-        watch: called with a short description of slow work.
     """
 
-    def __init__(
-        self,
-        model: Any,
-        file: SceneFile,
-        run: Path,
-        lock: AbstractContextManager,
-        learning: Callable[[], bool],
-        learn: Callable[[], None],
-        shown: Callable[[], set[str]],
-        watch: Callable[[str], None],
-    ) -> None:
-        self._asked: tuple[Scene, Question] | None = None
-        """The question with its snapshot: one tuple, replaced as a whole because other threads read it."""
-        self._drawn: tuple[Scene, Question] | None = None
-        """The question and the snapshot of the frame being drawn."""
-        self.found: list[Found] | None = None
-        """Matches of the question; None: not searched yet."""
-        self.seconds: float | None = None
-        """Duration of the latest frame in seconds, matches included."""
-        self._model, self._file, self._run, self._lock = model, file, run, lock
-        self._learning, self._learn, self._shown, self._watch = learning, learn, shown, watch
-        self._making = Lock()
-        self._scene: Scene | None = None
-        self._scene_step: int | None = None
-        """Iteration of the snapshot; None: training was over."""
-        self._encode_texts: EncodeTexts | None = None
+    model: Any
+    """A `Lang3DXLModel`, trained or in training."""
+    file: SceneFile
+    """Photos, cameras and CLIP."""
+    run: Path
+    """Folder of the run, which keeps results that are computed once."""
+    lock: AbstractContextManager
+    """Held while using the model."""
+    learning: Callable[[], bool]
+    """Returns whether the model still changes."""
+    learn: Callable[[], None]
+    """Makes the Gaussians' codes for the present model, for decoders that need it."""
+    shown: Callable[[], set[str]]
+    """Returns the names of the outputs that the viewer shows."""
+    watch: Callable[[str], None]
+    """Called with a short description of slow work."""
+    found: list[Found] | None = None
+    """Matches of the question; None: not searched yet."""
+    seconds: float | None = None
+    """Duration of the latest frame in seconds, matches included."""
+    _asked: tuple[Scene, Question] | None = None
+    """The question with its snapshot: one tuple, replaced as a whole because other threads read it."""
+    _drawn: tuple[Scene, Question] | None = None
+    """The question and the snapshot of the frame being drawn."""
+    _making: AbstractContextManager = field(default_factory=Lock)
+    _scene: Scene | None = None
+    _scene_step: int | None = None
+    """Iteration of the snapshot; None: training was over."""
+    _encode_texts: EncodeTexts | None = None
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -102,13 +95,13 @@ class Conversation:
         """Return a snapshot of the present model. After training there is one final snapshot; during training
         a snapshot is reused for at most a tenth of the run."""
         with self._making:
-            learning, step = self._learning(), self._model.step
-            behind = self._model.config.total_steps / 10
+            learning, step = self.learning(), self.model.step
+            behind = self.model.config.total_steps / 10
             kept = self._scene is not None and (
                 self._scene_step is None or (learning and step - self._scene_step <= behind)
             )
             if not kept:
-                self._encode_texts = self._encode_texts or text_encoder(self._file, self._model.device)
+                self._encode_texts = self._encode_texts or text_encoder(self.file, self.model.device)
                 self._scene = self._snapshot(learning)
                 self._scene_step = step if learning else None
             assert self._scene is not None
@@ -117,29 +110,29 @@ class Conversation:
     def _snapshot(self, learning: bool) -> Scene:
         # In training every snapshot is examined anew, so keep that brief.
         config = QueryConfig(views=24, view_side=160) if learning else QueryConfig()
-        cache = None if learning else self._run / "lang3dxl_visible.safetensors"
-        field = self._model.semantic_field
-        with self._lock, torch.no_grad():
-            training = self._model.training
-            self._model.train(False)
+        cache = None if learning else self.run / "lang3dxl_visible.safetensors"
+        field = self.model.semantic_field
+        with self.lock, torch.no_grad():
+            training = self.model.training
+            self.model.train(False)
             try:
                 if learning and field is not None and field.needs_lifting:
-                    self._watch("gathering the photos' features onto the present scene…")
-                    self._learn()
-                return self._model.scene(
-                    self._file, config=config, encode_texts=self._encode_texts, cache=cache, watch=self._watch
+                    self.watch("gathering the photos' features onto the present scene…")
+                    self.learn()
+                return self.model.scene(
+                    self.file, config=config, encode_texts=self._encode_texts, cache=cache, watch=self.watch
                 )
             finally:
                 if learning:
-                    self._model.forget_gathered_codes()
-                self._model.train(training)
+                    self.model.forget_gathered_codes()
+                self.model.train(training)
 
     # ── answering: called by the render thread, which holds the lock ────────────────────────────────
 
     @property
     def shows_bottleneck(self) -> bool:
         """Whether a viewer shows the picture of the codes."""
-        return "bottleneck" in self._shown()
+        return "bottleneck" in self.shown()
 
     def channels(self) -> Tensor | None:
         """Return the values that Gaussians carry in the next rendering; None if the question was asked in
@@ -177,7 +170,7 @@ class Conversation:
     def status(self) -> str:
         """Describe how long a frame takes, and what training still lacks."""
         parts = [] if self.seconds is None else [f"{self.seconds * 1e3:.0f} ms per frame"]
-        if self._scene_step is not None and self._learning():
+        if self._scene_step is not None and self.learning():
             parts.append(f"words as of iteration {self._scene_step}, since the model still learns")
         return " · ".join(parts)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -40,20 +41,14 @@ _AT_A_TIME = 4
 """Number of unrelated words that are queried together."""
 
 
+@dataclass(frozen=True)
 class Doubts:
-    """Doubt about prompts in one scene.
+    """Doubt about prompts in one scene."""
 
-    Args:
-        relevancy: computes every Gaussian's relevancy, 0 where unknown (`QueryEngine.of_gaussians`).
-        queries: encodes texts as they are, without synonyms (`TextEncoder.plain_queries`).
-    """
-
-    def __init__(
-        self,
-        relevancy: Callable[[Queries], Float[Tensor, "q n"]],
-        queries: Callable[[Sequence[str]], Queries],
-    ) -> None:
-        self._relevancy, self._queries = relevancy, queries
+    relevancy: Callable[[Queries], Float[Tensor, "q n"]]
+    """Computes every Gaussian's relevancy, 0 where unknown (`QueryEngine.of_gaussians`)."""
+    queries: Callable[[Sequence[str]], Queries]
+    """Encodes texts as they are, without synonyms (`TextEncoder.plain_queries`)."""
 
     def of(self, relevancy: Float[Tensor, "q n"]) -> list[float]:
         """Compute each prompt's doubt from the Gaussians' relevancy: the share of texts, itself among
@@ -69,9 +64,9 @@ class Doubts:
     def unrelated(self) -> Float[Tensor, " u"]:
         """Peaks of the unrelated words (`peaks`). A few words are queried at a time, since the relevancy of
         millions of Gaussians to all of them would take gigabytes."""
-        self._queries(UNRELATED)  # encodes all of them in one batch
+        self.queries(UNRELATED)  # encodes all of them in one batch
         parts = [UNRELATED[i : i + _AT_A_TIME] for i in range(0, len(UNRELATED), _AT_A_TIME)]
-        return torch.cat([peaks(self._relevancy(self._queries(part))) for part in parts])
+        return torch.cat([peaks(self.relevancy(self.queries(part))) for part in parts])
 
 
 def peaks(relevancy: Float[Tensor, "q n"]) -> Float[Tensor, " q"]:
@@ -86,13 +81,12 @@ def doubtful(text: str, doubt: float, taught: bool = False) -> str | None:
     """Describe a doubtful prompt; return None for the others. taught: whether it was taught by example."""
     if doubt <= DOUBTFUL:
         return None
+    unknown = "or the run's CLIP may not know the word"
     if taught:
-        return (
-            f"doubtful: {doubt:.0%} of what was not marked as {text!r} fits as well: mark it in more photos"
-        )
-    if doubt == 1.0:
-        return f"doubtful: {text!r} fits no place: it may be absent, or the run's CLIP may not know the word"
-    return (
-        f"doubtful: {doubt:.0%} of unrelated words fit this scene as well as {text!r}: it may not be here, "
-        f"or the run's CLIP may not know the word"
-    )
+        why = f"{doubt:.0%} of what was not marked as {text!r} fits as well: mark it in more photos"
+    elif doubt == 1.0:
+        why = f"{text!r} fits no place: it may be absent, {unknown}"
+    else:
+        fit = f"{doubt:.0%} of unrelated words fit this scene as well as {text!r}"
+        why = f"{fit}: it may not be here, {unknown}"
+    return f"doubtful: {why}"

@@ -37,18 +37,10 @@ def overlay(
     opacity: float = _OPACITY,
     color_map: str = "turbo",
 ) -> Float[Tensor, "h w 3"]:
-    """Draw the heat map over the pixels that match, and keep the image elsewhere.
+    """Draw the heat map over the pixels that match, and keep the image (colors 0…1) elsewhere.
 
-    Args:
-        image: colors, 0…1.
-        relevancy: relevancy of every pixel, 0…1.
-        mask: pixels that match.
-        threshold: relevancy of the color map's first color; the highest relevancy gets its last.
-        opacity: opacity of the heat map, 0…1.
-        color_map: name of a matplotlib color map.
-
-    Raises:
-        UserError: there is no such color map.
+    The threshold gets the first color of the matplotlib color map, and the highest relevancy its last. Raises
+    UserError if there is no such color map.
     """
     hot = color(heat(relevancy * mask, threshold), color_map)
     return torch.lerp(image, hot, opacity * mask.to(image)[..., None])

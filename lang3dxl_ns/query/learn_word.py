@@ -11,24 +11,30 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from statistics import fmean
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.engine import QueryEngine
-from lang3dxl_ns.query.marks import MARK_SIDE, marks
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import ScenePhoto
-from lang3dxl_ns.query.teach import Example, TaughtWord
+from lang3dxl_ns.query.teach import MASK_SIDE, Example, Point, TaughtWord
 from lang3dxl_ns.rendering.gathering import filled_parts
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import resized
 
+MARK_SIDE = 320
+"""Longer side in pixels of the views in which marks are gathered."""
+_REACH = 0.01
+"""Radius of a click, as a fraction of the photo's longer side."""
 _ROWS = 20_000
 """Most Gaussians of the word, and of the rest, that are fitted; of more, every k-th one is used."""
 _AXES = 64
@@ -49,23 +55,21 @@ _TRUST = 3
 
 @dataclass(frozen=True)
 class Weights:
-    """Pixels that each Gaussian fills in an example's photo."""
+    """Pixels that each Gaussian fills in an example's photo: those marked as the word, as something else, and
+    all."""
 
     word: Float[Tensor, " n"]
-    """Pixels of each Gaussian that are marked as the word."""
     other: Float[Tensor, " n"]
-    """Pixels of each Gaussian that are marked as something else."""
     seen: Float[Tensor, " n"]
-    """All pixels of each Gaussian."""
 
     @classmethod
     def of(cls, example: Example, photo: ScenePhoto, splats: Splats, backend: Backend = "auto") -> Weights:
-        """Measure what an example marks in its photo's foreground. Raises UserError as `marks` does."""
+        """Measure what an example marks in its photo's foreground. Raises UserError for marks outside it."""
         camera = resized(photo.full_camera, MARK_SIDE)
         size = (camera.height, camera.width)
         foreground = photo.foreground(size)
         shown = torch.ones(size) if foreground is None else foreground.float()
-        pixels = torch.cat([marks(example, photo, size) * shown, shown[None]]).permute(1, 2, 0)
+        pixels = torch.cat([_marks(example, photo, size) * shown, shown[None]]).permute(1, 2, 0)
         drawn = partial(composite, splats, camera, backend=backend)
         parts = filled_parts(drawn, pixels.to(splats.means.device), len(splats))
         return cls(*parts.unbind(1))
@@ -93,17 +97,10 @@ def learn(
     engine: QueryEngine,
     queries: Queries,
 ) -> TaughtWord:
-    """Learn a word from examples, whose order doesn't matter.
+    """Learn a word from examples, whose order doesn't matter, and from what the marks of each show.
 
-    Args:
-        name: the word.
-        examples: the marks, which the word keeps as a record.
-        weights: what the marks show, one per example.
-        engine: engine with the features of the scene's Gaussians, and the temperature of its relevancies.
-        queries: the query of the word's text, without synonyms.
-
-    Raises:
-        UserError: there is no example, or the marks show nothing, or everything.
+    queries: the query of the word's text, without synonyms. Raises UserError if there is no example, or the
+    marks show nothing, or everything.
     """
     if not examples:
         raise UserError(f"there is no example of {name!r}: mark it in a photo")
@@ -114,16 +111,14 @@ def learn(
     # Margin of the text: the cosine minus the best competitor's.
     text = queries.relevancy_of_cosines(queries.cosines(sample.float()), 1.0)[0].logit().double()
     everywhere = torch.linspace(0, len(weights[0].seen) - 1, _TYPICAL).long().to(rows.device)
-    axes = _Axes.of(engine.features(everywhere).double(), engine.head)
+    axes = _axes(engine.features(everywhere).double(), engine.head)
     fit = partial(_fitted, name, sample, text, axes, engine.temperature)
     word = fit(photos)
     # Each photo is judged by a word that the others teach.
     judges = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))] if len(photos) > 1 else [word]
-    precision = {
-        photo.name: photo.precision(judge.margins(sample, text))
-        for photo, judge in zip(photos, judges, strict=True)
-    }
-    doubt = _mean([1 - photo.separation(word.margins(sample, text)) for photo in photos])
+    judged = zip(photos, judges, strict=True)
+    precision = {photo.name: photo.precision(judge.margins(sample, text)) for photo, judge in judged}
+    doubt = fmean(1 - photo.separation(word.margins(sample, text)) for photo in photos)
     return replace(word, doubt=doubt, precision=precision, examples=tuple(examples))
 
 
@@ -177,10 +172,9 @@ def _sampled(
     first, second = (_spaced(torch.stack(parts).sum(0)) for parts in (words, rests))
     photos = []
     for example, one, word, rest in zip(examples, weights, words, rests, strict=True):
-        share = float(one.word.sum() / one.seen.sum())
-        word = torch.cat([word[first], torch.zeros_like(word[second])])
-        rest = torch.cat([torch.zeros_like(rest[first]), rest[second]])
-        kind = (share, example.evidence, example.complete)
+        word = F.pad(word[first], (0, len(second)))
+        rest = F.pad(rest[second], (len(first), 0))
+        kind = (float(one.word.sum() / one.seen.sum()), example.evidence, example.complete)
         photos.append(_Photo(example.photo, word / word.sum(), rest / rest.sum(), *kind))
     return torch.cat([first, second]), photos
 
@@ -190,44 +184,36 @@ def _spaced(weight: Float[Tensor, " n"]) -> Int[Tensor, " m"]:
     return rows[:: math.ceil(len(rows) / _ROWS)]
 
 
-@dataclass(frozen=True)
-class _Axes:
-    """Standardized coordinates of a scene's features."""
-
-    middle: Float[Tensor, " c"]
-    matrix: Float[Tensor, "c k"]
-
-    @classmethod
-    def of(cls, features: Float[Tensor, "n c"], head: Float[Tensor, "k c"] | None) -> _Axes:
-        """Build the axes from a scene's features and the rows that span them (None: principal components)."""
-        known = features[features.abs().sum(1) > 0]
-        middle = known.mean(0)
-        if head is None:
-            axes = torch.linalg.eigh((known - middle).T @ (known - middle)).eigenvectors[:, -_AXES:]
-        else:
-            axes = torch.linalg.pinv(head.to(known))
-        spread = ((known - middle) @ axes).square().mean(0).sqrt()
-        return cls(middle, axes * torch.where(spread > _LEAST_SPREAD * spread.max(), 1 / spread, 0.0))
-
-    def places(self, features: Float[Tensor, "m c"]) -> Float[Tensor, "m k"]:
-        """Compute the coordinates of features."""
-        return (features - self.middle) @ self.matrix
+def _axes(
+    features: Float[Tensor, "n c"], head: Float[Tensor, "k c"] | None
+) -> tuple[Float[Tensor, " c"], Float[Tensor, "c k"]]:
+    """Compute standardized coordinates of a scene's features, as an origin and a matrix, from the rows that
+    span the features (None: principal components)."""
+    known = features[features.abs().sum(1) > 0]
+    middle = known.mean(0)
+    if head is None:
+        axes = torch.linalg.eigh((known - middle).T @ (known - middle)).eigenvectors[:, -_AXES:]
+    else:
+        axes = torch.linalg.pinv(head.to(known))
+    spread = ((known - middle) @ axes).square().mean(0).sqrt()
+    return middle, axes * torch.where(spread > _LEAST_SPREAD * spread.max(), 1 / spread, 0.0)
 
 
 def _fitted(
     name: str,
     sample: Float[Tensor, "m c"],
     text: Float[Tensor, " m"],
-    axes: _Axes,
+    axes: tuple[Float[Tensor, " c"], Float[Tensor, "c k"]],
     temperature: float,
     photos: Sequence[_Photo],
 ) -> TaughtWord:
     word = torch.stack([photo.word for photo in photos]).mean(0)
     rest = torch.stack([photo.rest for photo in photos]).mean(0)
     evidence = sum(photo.evidence for photo in photos)
-    slope, bias = _logistic(axes.places(sample), word, rest, max(_RIDGE / evidence, _LEAST_RIDGE))
-    vector = axes.matrix @ slope / temperature
-    bias = bias / temperature - float(axes.middle @ vector)
+    middle, matrix = axes
+    slope, bias = _logistic((sample - middle) @ matrix, word, rest, max(_RIDGE / evidence, _LEAST_RIDGE))
+    vector = matrix @ slope / temperature
+    bias = bias / temperature - float(middle @ vector)
     trust = (evidence * _trust(text, photos) + _TRUST) / (evidence + _TRUST)
     taught = TaughtWord(name, vector.float(), bias, trust, 0.5)
     return replace(taught, bias=bias - _level(taught.margins(sample, text), photos))
@@ -238,8 +224,8 @@ def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     in photos where all of the word is marked, otherwise how far it ranks clicks above the rest."""
     complete = [photo.precision(text) for photo in photos if photo.complete]
     if complete:
-        return _GAIN * _mean(complete)
-    return max(_mean([2 * photo.separation(text) - 1 for photo in photos]), 0.0)
+        return _GAIN * fmean(complete)
+    return max(fmean([2 * photo.separation(text) - 1 for photo in photos]), 0.0)
 
 
 def _logistic(
@@ -260,8 +246,8 @@ def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     marks are complete; without any, part of the way from what is not clicked to what is."""
     complete = [photo for photo in photos if photo.complete]
     if not complete:
-        on = _mean([float(score @ photo.word) for photo in photos])
-        return _UP * on + (1 - _UP) * _mean([float(score @ photo.rest) for photo in photos])
+        on = fmean([float(score @ photo.word) for photo in photos])
+        return _UP * on + (1 - _UP) * fmean([float(score @ photo.rest) for photo in photos])
     order = score.argsort(descending=True, stable=True)
     overlap = torch.zeros_like(score)
     for photo in complete:
@@ -273,5 +259,48 @@ def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     return 0.5 * float(score[order[best]] + score[order[best + 1]])
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
+def _marks(example: Example, photo: ScenePhoto, size: tuple[int, int]) -> Float[Tensor, "2 h w"]:
+    """Compute the share of each pixel of a view (height, width) marked as the word, and as not the word.
+    Marks are drawn on the photo's file, while views are undistorted. Raises UserError if marks lie outside
+    the photo, or have other proportions."""
+    width, height = photo.file_size
+    labels = photo.photo().undistort_labels(_drawn(example, width, height))
+    chosen = torch.stack([labels == 1, labels == 2]).float()
+    return F.interpolate(chosen[None], size, mode="area")[0]
+
+
+def _drawn(example: Example, width: int, height: int) -> Int[Tensor, "h w"]:
+    """Draw 1 on the word, 2 on what is not the word, 0 elsewhere, on at most `MASK_SIDE` pixels a side."""
+    if example.mask is not None:
+        rows, columns = example.mask.shape
+        if abs(columns * height - rows * width) > 0.01 * rows * width + max(width, height):
+            raise UserError(
+                f"the mask of {example.photo} has {columns} × {rows} pixels, the photo {width} × {height}: "
+                "draw it on the whole photo"
+            )
+        labels = torch.from_numpy(example.mask.astype(np.int32))
+    else:
+        zoom = min(MASK_SIDE / max(width, height), 1.0)
+        labels = torch.zeros(max(round(height * zoom), 1), max(round(width * zoom), 1), dtype=torch.int32)
+    place = f"{example.photo} of {width} × {height} pixels"
+    x, y = labels.shape[1] / width, labels.shape[0] / height
+    if example.box is not None:
+        left, top = max(example.box[0], 0), max(example.box[1], 0)
+        right, bottom = min(example.box[2], width), min(example.box[3], height)
+        if not (left < right and top < bottom):
+            numbers = ", ".join(f"{x:g}" for x in example.box)
+            raise UserError(f"the box {numbers} marks nothing in {place}: give left, top, right and bottom")
+        across = slice(int(left * x), max(math.ceil(right * x), int(left * x) + 1))
+        labels[int(top * y) : max(math.ceil(bottom * y), int(top * y) + 1), across] = 1
+    for points, label in ((example.points, 1), (example.not_points, 2)):
+        for column, row in points:
+            if not (0 <= column <= width and 0 <= row <= height):
+                raise UserError(f"the point {column:g}, {row:g} lies outside {place}")
+            _draw_disk(labels, ((column + 0.5) * x, (row + 0.5) * y), label)
+    return labels
+
+
+def _draw_disk(labels: Int[Tensor, "h w"], center: Point, label: int) -> None:
+    rows, columns = torch.meshgrid(*(torch.arange(side) + 0.5 for side in labels.shape), indexing="ij")
+    radius = max(_REACH * max(labels.shape), 0.8)
+    labels[(columns - center[0]) ** 2 + (rows - center[1]) ** 2 <= radius**2] = label

@@ -18,7 +18,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS, overlay, tinted, with_legend
-from lang3dxl_ns.query.places import Box
+from lang3dxl_ns.query.places import Box, Viewpoint
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.rendering.render import Rendering
 from lang3dxl_ns.scene.camera import Camera
@@ -132,24 +132,6 @@ def together(matches: Sequence[Match]) -> UInt8[Array, "h+legend w 3"]:
     lowest = min(match.threshold for match in matches)
     picture = as_bytes(tinted(matches[0].view.rendering.rgb.cpu(), maps, masks, lowest))
     return with_legend(picture, [match.prompt.text for match in matches], PROMPT_COLORS)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Viewpoint:
-    """A training camera that shows a match."""
-
-    name: str
-    """Name of the training photo."""
-    camera: Camera
-    area: float
-    """Share of the view that matches."""
-    score: float
-    """Mean relevancy of the most relevant thousandth of the view."""
-    rank: float
-    """How well the view shows the match, 0…1, as computed by `rank_views`."""
-
-    def __repr__(self) -> str:
-        return f"Viewpoint({self.name!r}, rank {self.rank:.2f}, {self.area:.1%} of it matches)"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -55,18 +55,20 @@ def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:
     words: the prompt and its synonyms. A phrase is named by any of its words or their synonyms, singular or
     plural. If all phrases are named, all compete.
     """
-    named = {form for text in words for word in text.lower().split() for form in _singulars(word)}
+    named = {form for text in words for word in text.lower().split() for form in singulars(word)}
     chosen = [i for i, phrase in enumerate(phrases) if not named & _meanings(phrase)]
     return chosen or list(range(len(phrases)))
 
 
 def _meanings(phrase: str) -> set[str]:
-    own = [form for word in phrase.lower().split() for form in _singulars(word)]
+    own = [form for word in phrase.lower().split() for form in singulars(word)]
     return {*own, *(word for form in own for word in _NAMED.get(form, ()))}
 
 
-def _singulars(word: str) -> list[str]:
-    """Return a word and the words that it may be the plural of."""
-    endings = (("s", ""), ("es", ""), ("ies", "y"), ("ves", "f"))
-    word = word.strip(".,;:!?'\"()")
-    return [word, *(word.removesuffix(plural) + one for plural, one in endings if word.endswith(plural))]
+def singulars(words: str) -> list[str]:
+    """Return a word or term without punctuation, and those that it may be the plural of."""
+    endings = (("s", ""), ("es", ""), ("ies", "y"), ("ves", "f"), ("es", "is"), ("ia", "ion"), ("a", "um"))
+    irregular = {"oculi": "oculus", "abaci": "abacus"}
+    words = words.strip(".,;:!?'\"()")
+    forms = [words.removesuffix(plural) + one for plural, one in endings if words.endswith(plural)]
+    return [words, *forms, irregular.get(words, words)]

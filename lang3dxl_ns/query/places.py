@@ -1,18 +1,29 @@
-"""Places in 3D: boxes around matching Gaussians."""
+"""Where a match is: boxes around matching Gaussians, and views that show them, without rendering these."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64
-from numpy import ndarray as Array
+import torch
+from jaxtyping import Float
 from torch import Tensor
+
+from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.query.visibility import VisibleGaussians
+from lang3dxl_ns.scene.camera import Camera
 
 _OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
 STRONG = 0.5
 """Fraction of the way from the threshold to the highest relevancy from which Gaussians are the match."""
+PEAK = 1e-3
+"""Share of a view over which its peak is averaged, so that one stray Gaussian does not decide."""
+LARGE = 0.2
+"""Share of a view above which larger matches score no higher."""
+RIM = 0.25
+"""Weight of a match at a view's rim, where it is likely cut off; it is 1 in the middle half."""
 _CORE = 0.002
 """Share of a match's weight that a neighborhood must hold to belong to a group."""
 _MOST_POINTS = 20_000
@@ -38,6 +49,27 @@ class Box:
         return tuple((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Viewpoint:
+    """A training camera that shows a match."""
+
+    name: str
+    """Name of the training photo."""
+    camera: Camera
+    area: float
+    """Share of the view that matches."""
+    score: float
+    """Mean relevancy of the most relevant thousandth of the view."""
+    rank: float
+    """How well the view shows the match, 0…1: closeness of its peak to the scene's highest, times size, times
+    centering (`rank_views`)."""
+    shown: bool
+    """Whether the match fills at least one pixel."""
+
+    def __repr__(self) -> str:
+        return f"Viewpoint({self.name!r}, rank {self.rank:.2f}, {self.area:.1%} of it matches)"
+
+
 def strongest_match(
     means: Float[Tensor, "n 3"],
     scores: Float[Tensor, " n"],
@@ -48,14 +80,9 @@ def strongest_match(
     """Find the box of the connected Gaussians that match best; None if none does.
 
     Only Gaussians more than half-way from the threshold to the best count, so that weaker matches beside the
-    strongest don't widen its box. DBSCAN separates the groups.
+    strongest don't widen its box. DBSCAN separates groups that are more than `gap` world units apart.
 
-    Args:
-        means: centers, world units.
-        scores: relevancy of each Gaussian, 0…1.
-        mass: pixels that each Gaussian fills, over all views.
-        threshold: relevancy above which a Gaussian matches.
-        gap: world units that divide two groups.
+    scores: relevancy of each Gaussian, 0…1. mass: pixels that each Gaussian fills, over all views.
     """
     weights = (scores - threshold).clamp_min(0) * mass
     rows = (weights > 0).nonzero().squeeze(1)
@@ -67,13 +94,8 @@ def strongest_match(
 
 
 def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
-    """Group points, each within `gap` of others of its group, and return the groups' boxes.
-
-    Args:
-        means: centers, world units; at least one.
-        weight: weight of each point, above 0.
-        gap: world units that divide two groups.
-    """
+    """Group points (at least one, of weights above 0), each within `gap` world units of others of its group,
+    and return the groups' boxes."""
     heaviest = weight.argsort(descending=True)[:_MOST_POINTS]
     points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
     from sklearn.cluster import DBSCAN  # imported here, since the import takes a second
@@ -82,12 +104,12 @@ def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float)
     if (found < 0).all():  # no place is dense: take the heaviest Gaussian
         found = np.where(np.arange(len(found)) == share.argmax(), 0, -1)
     totals = np.bincount(found[found >= 0], weights=share[found >= 0]) / share.sum()
-    return [_around(points[found == i], float(total)) for i, total in enumerate(totals)]
-
-
-def _around(points: Float64[Array, "n 3"], share: float) -> Box:
-    low, high = np.quantile(points, (_OUTLIERS, 1 - _OUTLIERS), axis=0, method="nearest")
-    return Box(tuple(low.tolist()), tuple(high.tolist()), share)
+    boxes = []
+    for i, total in enumerate(totals.tolist()):
+        ends = np.quantile(points[found == i], (_OUTLIERS, 1 - _OUTLIERS), axis=0, method="nearest")
+        low, high = map(tuple, ends.tolist())
+        boxes.append(Box(low, high, total))
+    return boxes
 
 
 def _high(scores: Float[Tensor, " n"], mass: Float[Tensor, " n"]) -> float:
@@ -95,3 +117,63 @@ def _high(scores: Float[Tensor, " n"], mass: Float[Tensor, " n"]) -> float:
     order = scores.argsort(descending=True)
     share = mass[order].cumsum(0) / mass.sum()
     return float(scores[order][int((share < _OUTLIERS).sum().clamp_max(len(order) - 1))])
+
+
+def rank_views(
+    views: Mapping[str, VisibleGaussians],
+    means: Float[Tensor, "n 3"],
+    scores: Float[Tensor, " n"],
+    threshold: float,
+) -> list[Viewpoint]:
+    """Rank every view by the pixels that Gaussians fill in it (hidden ones fill none). Views that show the
+    match come first, best first.
+
+    The peak matters most: only Gaussians half-way or more from the threshold to the highest peak of all views
+    count as the match, so that four lukewarm windows don't outrank the one rose window. If no peak reaches
+    the threshold, the scene's median relevancy takes its place, and the views that come closest lead.
+    """
+    if not views:
+        return []
+    # Numbers stay on the device until the end, since reading each would wait for a GPU.
+    peaks = torch.stack([_peak(view, scores) for view in views.values()])
+    top = peaks.amax()
+    low = torch.where(top > threshold, threshold, scores.median())
+    level = low + STRONG * (top - low)
+    closeness = ((peaks - low) / (top - low).clamp_min(1e-9)).clamp(0, 1)
+    rows = []
+    for view in views.values():
+        values, shares = scores[view.rows], view.shares
+        strong = (values > level) * shares
+        size = (strong.sum() / LARGE).clamp_max(1.0).sqrt()
+        excess = (values - low) * strong
+        centered = (excess * _centeredness(view, means)).sum() / excess.sum().clamp_min(1e-12)
+        rows.append(torch.stack([((values > threshold) * shares).sum(), size * centered]))
+    areas, fitness = torch.stack(rows).unbind(1)
+    figures = torch.stack([areas, peaks, closeness * fitness], dim=1).tolist()
+    ranks = [
+        Viewpoint(name, view.camera, area, peak, rank, shown=area * view.size >= 1)
+        for (name, view), (area, peak, rank) in zip(views.items(), figures, strict=True)
+    ]
+    return sorted(ranks, key=lambda view: (view.shown, view.rank), reverse=True)
+
+
+def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+    """Compute the mean relevancy of the most relevant share `PEAK` of a view."""
+    order = scores[view.rows].argsort(descending=True)
+    shares = view.shares[order]
+    before = shares.cumsum(0) - shares
+    counted = (PEAK - before).clamp_min(0).minimum(shares)
+    return (scores[view.rows][order] * counted).sum() / PEAK
+
+
+def _centeredness(view: VisibleGaussians, means: Float[Tensor, "n 3"]) -> Float[Tensor, " m"]:
+    """Compute weights of 1 for Gaussians in the middle half of a view, falling to `RIM` at its rim."""
+    camera = view.camera
+    pose = to_device(camera.view_matrix.to(means.dtype), means.device)
+    points = means[view.rows] @ pose[:3, :3].T + pose[:3, 3]
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    x, y = (points[:, axis] / points[:, 2] for axis in (0, 1))
+    off = torch.maximum(
+        (2 * (x * fx + cx) / camera.width - 1).abs(), (2 * (y * fy + cy) / camera.height - 1).abs()
+    )
+    return 1 - (1 - RIM) * ((off - 0.5) / 0.5).nan_to_num(1.0).clamp(0, 1)

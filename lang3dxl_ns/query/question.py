@@ -6,6 +6,7 @@ restriction to a foreground are therefore decided here and nowhere else.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,11 +15,42 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 from lang3dxl_ns.query.engine import QueryEngine
+from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.query.threshold import COVERED, matching
 from lang3dxl_ns.rendering.render import Rendering
+
+EVEN = 0.5
+"""Relevancy where prompt and negatives match equally well."""
+SHARE = 0.3
+"""Where matches begin, as a fraction of the way from the median Gaussian's relevancy to a prompt's peak.
+Tuned on the validation landmarks (docs/lab/words.md)."""
+COVERED = 0.3
+"""Share of a pixel that matching Gaussians must cover; under half, as most are small and edges blend."""
+
+
+def match_thresholds(
+    relevancy: Float[Tensor, "q n"], doubts: Sequence[float], named: Sequence[bool]
+) -> tuple[float, ...]:
+    """Compute for each prompt the relevancy above which Gaussians match.
+
+    Small and thin things blur with their surroundings in CLIP's crops, and seldom beat every negative there.
+    So the threshold is relative to the scene, and never above `EVEN`. Doubtful prompts use `EVEN`, because
+    their peaks carry no information. So do the `named` ones, which have negatives of their own to beat.
+    """
+    if relevancy.shape[1] == 0:
+        return (EVEN,) * len(relevancy)
+    low = relevancy.median(dim=1).values
+    levels = (low + SHARE * (peaks(relevancy) - low)).clamp_max(EVEN).tolist()
+    strict = [doubt > DOUBTFUL or names for doubt, names in zip(doubts, named, strict=True)]
+    return tuple(EVEN if one else level for one, level in zip(strict, levels, strict=True))
+
+
+def matching(maps: Float[Tensor, "q ..."], thresholds: Sequence[float]) -> Bool[Tensor, "q ..."]:
+    """Return where each prompt's relevancy exceeds its threshold."""
+    return maps > maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,3 +122,15 @@ class Question:
         if not len(within):
             return wanted
         return wanted * matching(within, self.foreground_thresholds).any(0)
+
+
+@torch.no_grad()
+def pictures(rendering: Rendering, question: Question | None) -> dict[str, Float[Tensor, "h w k"]]:
+    """Draw a view's answers for viewers: `overlay`, all prompts' heat over the colors, and `relevancy_0` …
+    [h, w, 1]. Without a question, or its channels in the rendering, the overlay is the rendering itself."""
+    if question is None or rendering.channels is None:
+        return {"overlay": rendering.rgb}
+    maps, masks = question.maps(rendering)
+    best, _ = strongest(maps, masks)
+    heat = overlay(rendering.rgb, best, masks.any(0), min(question.thresholds))
+    return {"overlay": heat} | {f"relevancy_{i}": one[..., None] for i, one in enumerate(maps)}

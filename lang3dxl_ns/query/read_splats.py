@@ -39,11 +39,8 @@ _ALL_BANDS = 16
 
 
 def find_splats(path: str | Path) -> Path:
-    """Find the file of a splat: the path itself, or the latest file in a run's folder.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Find the file of a splat: the path itself, or the latest file in a run's folder. Raises UserError if
+    there is none."""
     path = expanded(path)
     if path.is_file():
         return path
@@ -52,7 +49,8 @@ def find_splats(path: str | Path) -> Path:
     found = [file for pattern in _IN_FOLDERS for file in path.glob(pattern)]
     if not found:
         raise UserError(f"{path} holds no splat: name one ({KINDS})")
-    return max(found, key=lambda file: (_number(file), file.name))
+    digits = {file: re.findall(r"\d+", str(Path(*file.parts[-2:]))) for file in found}
+    return max(found, key=lambda file: (max(map(int, digits[file]), default=0), file.name))
 
 
 def read_splats(path: str | Path) -> Splats:
@@ -88,10 +86,6 @@ def read_splats(path: str | Path) -> Splats:
 
 class _OtherKindError(Exception):
     """Raised for an undamaged file that holds no Gaussians."""
-
-
-def _number(file: Path) -> int:
-    return max((int(digits) for digits in re.findall(r"\d+", str(Path(*file.parts[-2:])))), default=0)
 
 
 def _finite(splats: Splats, path: Path) -> Splats:
@@ -220,8 +214,8 @@ def _of_table(table: Any) -> Splats:
     scales = columns("scale_0", "scale_1")
     # A flat Gaussian (2D Gaussian splatting) has only two scales.
     third = columns("scale_2") if "scale_2" in known else scales.amin(1, keepdim=True) - 5
-    quats, harmonics = columns("rot_0", "rot_1", "rot_2", "rot_3"), torch.cat([first, others], dim=1)
-    scales = torch.cat([scales, third], dim=1)
+    quats, scales = columns("rot_0", "rot_1", "rot_2", "rot_3"), torch.cat([scales, third], dim=1)
+    harmonics = torch.cat([first, others], dim=1)
     return _activated(columns("x", "y", "z"), scales, quats, columns("opacity"), harmonics)
 
 
@@ -237,9 +231,8 @@ def _supersplat(path: Path, tables: _Tables) -> Splats:
 
 
 def _of_gsply(data: Any) -> Splats:
-    first = np.asarray(data.sh0).reshape(len(data.means), 1, 3)
-    rest = np.zeros((len(first), 0, 3), np.float32) if data.shN is None else np.asarray(data.shN)
-    bands = np.concatenate([first, rest.reshape(len(first), -1, 3)], axis=1)
+    parts = [np.asarray(part) for part in (data.sh0, data.shN) if part is not None]
+    bands = np.concatenate([part.reshape(len(data.means), -1, 3) for part in parts], axis=1)
     return _activated(data.means, data.scales, data.quats, data.opacities, bands)
 
 

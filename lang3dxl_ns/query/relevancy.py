@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 import torch.nn.functional as F
@@ -23,22 +23,9 @@ SPREAD = 0.272
 _LEAST_SPREAD = 1e-4
 Decode = Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]]
 """Function from codes to raw CLIP features, such as `SemanticField.decode_clip`."""
-_CPU_CHUNK = 8192
-"""Codes decoded at a time on a CPU."""
-
-
-@dataclass(frozen=True)
-class Probe:
-    """A linear score of features, learned from examples, that is added to the margin of a prompt's text."""
-
-    row: int
-    """Row of the score's direction among the vectors."""
-    length: float
-    """Margin per unit of the cosine with the direction."""
-    bias: float
-    """Margin where the cosine is 0."""
-    text: float
-    """Weight of the text's own margin, at least 0."""
+_CPU_MB, _GPU_MB = 48, 256
+"""Megabytes of the features that are decoded at a time. On a CPU, small parts stay in its cache and take half
+the time."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +36,13 @@ class Queries:
     """
 
     vectors: Float[Tensor, "v c"]
-    """Vectors of unit length."""
+    """Unit vectors, and those of learned words."""
     positive: tuple[tuple[int, ...], ...]
     """For every prompt, the rows of its synonyms."""
     negative: tuple[tuple[int, ...], ...]
     """For every prompt, the rows it competes with: shared phrases and its own negatives."""
-    probes: tuple[Probe | None, ...] = ()
-    """For every prompt, the score learned from examples, or None; empty if no prompt has one."""
+    learned: Mapping[int, TaughtWord] = field(default_factory=dict)
+    """Words learned from examples, by the index of their prompt. Their vectors, of any length, come last."""
 
     @classmethod
     def of(
@@ -85,21 +72,11 @@ class Queries:
         return cls(F.normalize(torch.cat(blocks), dim=-1), tuple(positive), tuple(negative))
 
     def taught(self, words: Sequence[TaughtWord | None]) -> Queries:
-        """Return the prompts with learned words, whose margin is vector · unit feature + bias + text ·
-        (margin of the text).
-
-        Args:
-            words: one per prompt; None for prompts without a learned word.
-        """
-        rows, probes = [self.vectors], list[Probe | None]()
-        for word in words:
-            probe = None
-            if word is not None:
-                vector = word.vector.to(self.vectors)
-                probe = Probe(len(self.vectors) + len(rows) - 1, float(vector.norm()), word.bias, word.text)
-                rows.append(F.normalize(vector, dim=0)[None])
-            probes.append(probe)
-        return replace(self, vectors=torch.cat(rows), probes=tuple(probes))
+        """Return the prompts with learned words, one per prompt or None. Their margin is
+        vector · unit feature + bias + text · (margin of the text)."""
+        learned = {i: word for i, word in enumerate(words) if word is not None}
+        rows = [word.vector.to(self.vectors)[None] for word in learned.values()]
+        return replace(self, vectors=torch.cat([self.vectors, *rows]), learned=learned)
 
     def __len__(self) -> int:
         return len(self.positive)
@@ -122,10 +99,9 @@ class Queries:
             _largest(cosines, mine) - _largest(cosines, theirs)
             for mine, theirs in zip(self.positive, self.negative, strict=True)
         ]
-        for i, probe in enumerate(self.probes):
-            if probe is not None:
-                learned = probe.length * cosines[..., probe.row] + probe.bias
-                margins[i] = learned + probe.text * margins[i]
+        first = len(self.vectors) - len(self.learned)
+        for row, (i, word) in enumerate(self.learned.items(), start=first):
+            margins[i] = cosines[..., row] + word.bias + word.text * margins[i]
         return torch.sigmoid(temperature * torch.stack(margins))
 
 
@@ -141,12 +117,8 @@ def calibrated(temperature: float, cosines: Float[Tensor, "n w"]) -> float:
     """Compute the temperature at which an encoder's margins mean what the built-in CLIP's mean.
 
     Encoders differ in how widely their cosines vary: by ±.5 or by ±.05. A relevancy at the calibrated
-    temperature does not change if all cosines are scaled or shifted.
-
-    Args:
-        temperature: temperature for the built-in CLIP; returned unchanged if the spread is 0.
-        cosines: cosines of a scene's features with words for present and absent things
-            (`TextEncoder.yardstick`).
+    temperature does not change if all cosines (with `TextEncoder.yardstick`) are scaled or shifted. If their
+    spread is 0, the temperature for the built-in CLIP is returned unchanged.
     """
     own = spread(cosines)
     return temperature * SPREAD / max(own, _LEAST_SPREAD) if own else temperature
@@ -166,40 +138,25 @@ def relevancy(
     canonical: Float[Tensor, "p c"],
     temperature: float = TEMPERATURE,
 ) -> Float[Tensor, "q ..."]:
-    """Compute min_c exp(τ s_q) / (exp(τ s_q) + exp(τ s_c)) = sigmoid(τ (s_q − max_c s_c)), s = cosine.
-
-    The result is in 0…1, above 0.5 where the query beats every canonical phrase. Vectors need not have unit
-    length. A zero feature (nothing rendered) gives 0.5. Source: LERF, Kerr et al. 2023.
-    """
+    """Compute min_c exp(τ s_q) / (exp(τ s_q) + exp(τ s_c)) = sigmoid(τ (s_q − max_c s_c)), s = cosine (LERF,
+    Kerr et al. 2023). A zero feature gives 0.5. Vectors need not have unit length."""
     prompts = Queries.of(queries[:, None].unbind(), canonical)
     return prompts.relevancy_of_cosines(prompts.cosines(features), temperature)
 
 
+def in_chunks(
+    work: Callable[[Tensor], Tensor], values: Float[Tensor, "n d"], width: int, max_mb: float
+) -> Float[Tensor, "n k"]:
+    """Do work on a part of the rows at a time, so that three float32 copies of its `width` numbers per row
+    take at most `max_mb` megabytes, or less if memory is short."""
+    rows = max(int(max_mb * 2**20 / (3 * 4 * width)), 1)
+    return with_less_memory(lambda rows: torch.cat([work(part) for part in values.split(rows)]), rows)
+
+
 @torch.no_grad()
 def cosines_of_codes(
-    decode: Decode, codes: Float[Tensor, "n code"], queries: Queries, max_mb: float = 256.0
+    decode: Decode, codes: Float[Tensor, "n code"], queries: Queries, max_mb: float | None = None
 ) -> Float[Tensor, "n v"]:
-    """Compute the exact cosines of codes, decoded in chunks to avoid a feature map of the whole image.
-
-    max_mb: approximate memory of a chunk's features (three float32 copies exist at once). Chunks are smaller
-    if memory is short, and on a CPU, where small chunks stay in its cache and take half the time.
-    """
-    chunk = max(int(max_mb * 2**20 / (3 * 4 * queries.vectors.shape[-1])), 1)
-    if not codes.is_cuda:
-        chunk = min(chunk, _CPU_CHUNK)
-    return with_less_memory(
-        lambda rows: torch.cat([queries.cosines(decode(part)) for part in codes.split(rows)]), chunk
-    )
-
-
-def relevancy_of_codes(
-    decode: Decode,
-    codes: Float[Tensor, "... code"],
-    queries: Queries,
-    temperature: float = TEMPERATURE,
-    max_mb: float = 256.0,
-) -> Float[Tensor, "q ..."]:
-    """Compute the exact relevancy of rendered codes (`cosines_of_codes`)."""
-    flat = codes.reshape(-1, codes.shape[-1])
-    cosines = cosines_of_codes(decode, flat, queries, max_mb)
-    return queries.relevancy_of_cosines(cosines, temperature).reshape(len(queries), *codes.shape[:-1])
+    """Compute the exact cosines of codes, decoded `in_chunks` to avoid a feature map of an image."""
+    most = (_GPU_MB if codes.is_cuda else _CPU_MB) if max_mb is None else max_mb
+    return in_chunks(lambda part: queries.cosines(decode(part)), codes, queries.vectors.shape[-1], most)

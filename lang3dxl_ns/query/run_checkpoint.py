@@ -40,12 +40,13 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     shape = {"pipeline": dict, "step": int}
     if not isinstance(state, dict) or not all(isinstance(state.get(k), v) for k, v in shape.items()):
         raise _no_checkpoint(path, "it has no pipeline and step")
-    for name, value in state["pipeline"].items():
-        if isinstance(value, Tensor) and value.layout != torch.strided:
+    tensors = {name: value for name, value in state["pipeline"].items() if isinstance(value, Tensor)}
+    for name, value in tensors.items():
+        if value.layout != torch.strided:
             raise _no_checkpoint(path, f"{name} is a sparse tensor")
-        if isinstance(value, Tensor) and value.nbytes > value.untyped_storage().nbytes():
+        if value.nbytes > value.untyped_storage().nbytes():
             raise _no_checkpoint(path, f"{name} is larger than what is stored of it")
-        if name.endswith(".means") and isinstance(value, Tensor) and not value.isfinite().any():
+        if name.endswith(".means") and not value.isfinite().any():
             raise _no_checkpoint(path, "no Gaussian has a position that is a number")
     return state
 

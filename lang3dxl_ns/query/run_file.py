@@ -1,6 +1,6 @@
-"""Scene description in a run's folder: the photos' names and cameras, and the CLIP.
+"""A run's folder: its search, and its scene description with the photos' names and cameras, and the CLIP.
 
-It is written when training starts, so that a finished run can be queried without its photos.
+The description is written when training starts, so that a finished run can be queried without its photos.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float64
 from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import read_json, write_atomically
+from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.photo import Photo
@@ -32,6 +32,10 @@ from lang3dxl_ns.scene.photo import Photo
 SCENE_FILE = "lang3dxl_scene.json"
 """Name of the scene description, which lies beside config.yml."""
 _VERSION = 2
+OUTPUTS = Path("outputs")
+"""Folder in which `ns-train` creates runs."""
+_DEEPEST = 4
+"""Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -62,16 +66,12 @@ class ScenePhoto:
     @property
     def camera(self) -> Camera:
         """The camera for the rasterizer, at training resolution."""
-        return self.lens.camera(self._view_matrix)
+        return self.lens.camera(view_matrix(torch.tensor(self.camera_to_world, dtype=torch.float32)))
 
     @property
     def full_camera(self) -> Camera:
         """The camera at the file's resolution, for the rasterizer."""
-        return self.lens.resized(*self.file_size).camera(self._view_matrix)
-
-    @property
-    def _view_matrix(self) -> Float[Tensor, "4 4"]:
-        return view_matrix(torch.tensor(self.camera_to_world, dtype=torch.float32))
+        return self.lens.resized(*self.file_size).camera(self.camera.view_matrix)
 
     @property
     def pose(self) -> Float64[Array, "4 4"]:
@@ -81,23 +81,17 @@ class ScenePhoto:
     def photo(self, folder: Path = Path()) -> Photo:
         """Return the photo in its folder, without its mask if the mask's file is gone."""
         mask = Path(self.mask) if isinstance(self.mask, str) else None
-        return Photo(
-            name=self.name,
-            path=folder / self.name,
-            mask_path=mask if mask is not None and mask.is_file() else None,
-            lens=self.lens,
-        )
+        mask = mask if mask is not None and mask.is_file() else None
+        return Photo(self.name, folder / self.name, mask, self.lens)
 
     def foreground(self, size: tuple[int, int] | None = None) -> Bool[Tensor, "h w"] | None:
         """Read the photo's undistorted foreground; None if it has no mask, or the mask is gone.
 
         size: height and width in pixels; default: the size of the stored mask.
         """
+        mask = None if isinstance(self.mask, bytes) else self.photo().read_mask()
         if isinstance(self.mask, bytes):
-            pixels = np.array(Image.open(io.BytesIO(self.mask)).convert("1"))
-            mask: Bool[Tensor, "h w"] | None = torch.from_numpy(pixels)
-        else:
-            mask = self.photo().read_mask()
+            mask = torch.from_numpy(np.array(Image.open(io.BytesIO(self.mask)).convert("1")))
         if mask is None or size is None:
             return mask
         return F.interpolate(mask[None, None].float(), size, mode="nearest-exact")[0, 0].bool()
@@ -157,10 +151,8 @@ class SceneFile:
 
 
 def scene_from_json(content: dict[str, Any]) -> SceneFile:
-    """Build the description from a JSON object, after validating all its values.
-
-    Raises ValueError, KeyError, TypeError or AttributeError for anything else.
-    """
+    """Build the description from a JSON object, after validating all its values. Raises ValueError, KeyError,
+    TypeError or AttributeError for anything else."""
     photos = [_photo(**photo) for photo in content["photos"]]
     scene = SceneFile(**{**content, "photos": photos})
     expect(photos != [], "it lists no photo")
@@ -175,8 +167,8 @@ def scene_from_json(content: dict[str, Any]) -> SceneFile:
 
 
 def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
-    distortion, size = tuple(lens.pop("distortion")), None if size is None else tuple(size)
-    photo = ScenePhoto(lens=Lens(**lens, distortion=distortion), size=size, **rest)
+    lens, size = lens | {"distortion": tuple(lens["distortion"])}, None if size is None else tuple(size)
+    photo = ScenePhoto(lens=Lens(**lens), size=size, **rest)
     expect(is_name(photo.name), f"a photo is called {photo.name!r}")
     expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
     expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
@@ -186,6 +178,18 @@ def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
     width, height = photo.file_size
     replace(photo.lens, width=width, height=height).check()
     return photo
+
+
+def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePhoto:
+    """Choose the farthest photo that sees the scene's center near its own, or else the first photo."""
+    best, farthest = photos[0], 0.0
+    for photo in photos:
+        camera, lens = photo.camera, photo.lens
+        x, y, z = camera.view_matrix[:3, :3] @ torch.tensor(middle) + camera.view_matrix[:3, 3]
+        wide, high = abs(x) * lens.fx / lens.width, abs(y) * lens.fy / lens.height
+        if z > farthest and max(wide, high) < z / 4:
+            best, farthest = photo, float(z)
+    return best
 
 
 def read_camera_path(path: Path) -> Sequence[Camera]:
@@ -209,3 +213,33 @@ def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
     lens = Lens(width, height, focal, focal, width / 2, height / 2)
     lens.check()
     return lens.camera(view_matrix(pose[:3]))
+
+
+def find_config(run: str | Path | None = None) -> Path:
+    """Find the config.yml of a run.
+
+    run: the file, the run's folder, or a folder above it, whose newest run is taken; None: the newest run
+    under outputs/. Runs of other methods, which lack a scene description, are skipped. Raises UserError if
+    there is no run.
+    """
+    place = OUTPUTS if run is None else expanded(run)
+    if place.is_dir():
+        if place.joinpath("config.yml").is_file():
+            return place / "config.yml"
+        found = (path for n in range(1, _DEEPEST + 1) for path in place.glob("*/" * n + "config.yml"))
+        configs = [path for path in found if path.is_file()]
+        ours = [path for path in configs if path.with_name(SCENE_FILE).is_file()]
+        if ours:
+            return max(ours, key=lambda path: path.stat().st_mtime)
+        others = f" of this method ({len(configs)} of others)" if configs else ""
+        raise UserError(
+            f"{place} holds no run{others}: name the folder of one, or train with ns-train lang3dxl --data "
+            "FOLDER"
+        )
+    if run is None:
+        raise UserError(
+            "there is no outputs/ here: name a run's folder, or train with ns-train lang3dxl --data FOLDER"
+        )
+    if not place.is_file():
+        raise UserError(f"{place} is not a file or folder: pass a run's folder, or its config.yml")
+    return place

@@ -22,11 +22,8 @@ from lang3dxl_ns.common.files import read_text
 TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
 _PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
 _MOVED = {
-    f"lang3dxl_ns.plugin.{old}": f"lang3dxl_ns.plugin.{new}"
-    for old, new in {
-        "datamanager_config.Lang3DXLDataManagerConfig": "datamanager.Lang3DXLDataManagerConfig",
-        "model_config.Lang3DXLModelConfig": "model.Lang3DXLModelConfig",
-    }.items()
+    f"lang3dxl_ns.plugin.{module}_config.{name}": f"lang3dxl_ns.plugin.{module}.{name}"
+    for module, name in (("datamanager", "Lang3DXLDataManagerConfig"), ("model", "Lang3DXLModelConfig"))
 }
 """New module paths of settings classes that earlier versions kept elsewhere."""
 _REMOVED = {"DecoderConfig": ("start",)}
@@ -53,14 +50,9 @@ def read_settings(path: Path, places: Sequence[Sequence[str]], complete: bool = 
     """Read settings from a run's config.yml. The file is parsed as data only: settings, paths, and classes by
     name from nerfstudio and this package (nerfstudio's own commands call whatever a file names).
 
-    Args:
-        path: the file.
-        places: the settings to read, each as a path of names from the outermost in; () for all. The result is
-            None where there are none.
-        complete: give missing settings their defaults.
-
-    Raises:
-        UserError: the file is missing, damaged, or of another version, or requests more than settings.
+    Each place is a path of names from the outermost in; () stands for all settings. The result is None where
+    there are none. With `complete`, missing settings get their defaults. Raises UserError if the file is
+    missing, damaged, or of another version, or requests more than settings.
     """
     try:
         found = _construct(read_text(path), places)
@@ -71,13 +63,9 @@ def read_settings(path: Path, places: Sequence[Sequence[str]], complete: bool = 
             f"{path} can't be read ({error}): it is damaged, or from a version of lang3dxl-ns whose settings "
             "are no longer known; restore it, open it with that version, or train anew"
         ) from error
-    for settings in found if complete else ():
-        if is_dataclass(settings):
-            _complete(settings)
-    odd = (line for settings in found if is_dataclass(settings) for line in _differences(settings))
-    if first := next(odd, None):
+    if odd := [line for part in found if is_dataclass(part) for line in _differences(part, complete)]:
         raise UserError(
-            f"{path} {first}: it is truncated, or from another version of lang3dxl-ns; copy it again, open "
+            f"{path} {odd[0]}: it is truncated, or from another version of lang3dxl-ns; copy it again, open "
             "it with that version, or train anew"
         )
     return found
@@ -105,35 +93,25 @@ def no_config(path: Path) -> UserError:
     return UserError(f"{path} is not the config.yml of a nerfstudio run")
 
 
-def _differences(settings: Any, place: str = "") -> Iterator[str]:
-    """Yield a description of each setting that a file lacks or should not have, by its dotted name."""
-    known = {field.name for field in fields(settings)}
-    hints = _hints(type(settings))  # type: ignore[arg-type]
-    yield from (f"lacks the setting {place}{name}" for name in sorted(known - set(vars(settings))))
-    yield from (f"has the unknown setting {place}{name}" for name in sorted(set(vars(settings)) - known))
-    for name in sorted(known):
+def _differences(settings: Any, complete: bool, place: str = "") -> Iterator[str]:
+    """Yield a description of each setting that a file lacks or should not have, by its dotted name. With
+    `complete`, settings that it lacks get their defaults instead."""
+    known = {field.name: field for field in fields(settings)}
+    hints, own = _hints(type(settings)), set(vars(settings))  # type: ignore[arg-type]
+    if not complete:
+        yield from (f"lacks the setting {place}{name}" for name in sorted(known.keys() - own))
+    yield from (f"has the unknown setting {place}{name}" for name in sorted(own - known.keys()))
+    for name, field in sorted(known.items()):
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        if name not in own:
+            setattr(settings, name, default)
         value = getattr(settings, name)
-        if name == "_target" and value is not _default(settings, name):
+        if name == "_target" and value is not default:
             yield f"would start {place}{name} {value!r}"
         if is_dataclass(value) and not isinstance(value, type):
-            yield from _differences(value, f"{place}{name}.")
-        elif name in hints and not _fits(value, hints[name]) and _fits(_default(settings, name), hints[name]):
+            yield from _differences(value, complete, f"{place}{name}.")
+        elif name in hints and not _fits(value, hints[name]) and _fits(default, hints[name]):
             yield f"sets {place}{name} to {str(value)[:40]!r}, of another kind than this setting"
-
-
-def _complete(settings: Any) -> None:
-    """Give the settings that a file lacks their defaults."""
-    for field in fields(settings):
-        if field.name not in vars(settings):
-            setattr(settings, field.name, _default(settings, field.name))
-        value = getattr(settings, field.name)
-        if is_dataclass(value) and not isinstance(value, type):
-            _complete(value)
-
-
-def _default(settings: Any, name: str) -> Any:
-    (known,) = (field for field in fields(settings) if field.name == name)
-    return known.default if known.default_factory is MISSING else known.default_factory()
 
 
 @cache

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,28 +19,22 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.learn_word import Weights, learn
-from lang3dxl_ns.query.match import Found, Match, Viewpoint
+from lang3dxl_ns.query.match import Found, Match
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING
-from lang3dxl_ns.query.places import strongest_match
-from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.question import Question
-from lang3dxl_ns.query.rank_views import rank_views
+from lang3dxl_ns.query.places import Viewpoint, rank_views, strongest_match
+from lang3dxl_ns.query.question import Question, match_thresholds
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched, texts_of
-from lang3dxl_ns.query.threshold import match_thresholds
 from lang3dxl_ns.query.viewed_scene import Place, ViewedScene
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary
-from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import composite
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, resized
 
 _ROWS = 65_536
@@ -50,48 +44,28 @@ Text: TypeAlias = str | Prompt | Float[Tensor, " c"] | Float[Array, " c"]
 """A text as `parse_prompts` reads it, or a vector in the space of the scene's CLIP."""
 
 
+@dataclass(eq=False, repr=False)
 class Scene(ViewedScene):
     """A scene: Gaussians, what they mean, and the photos they were made from.
 
     The scene never changes. Results that are computed from it once (decoded features, the Gaussians that each
     photo shows) are kept. Any number of threads may use one scene.
-
-    Args:
-        splats, looks, background, cache, backend, watch: see `ViewedScene`.
-        file: photos, cameras, and the CLIP that the features come from.
-        decoder: turns codes into features; None for a scene with colors only.
-        codes: semantic values of the Gaussians, a row each; NaN for those visible in no photo.
-        config: defaults of queries.
-        encode_texts: the scene's CLIP, if it is already loaded; otherwise it is loaded at the first text that
-            is not among `vectors`.
-        vectors: unit vectors of common words, which need no CLIP.
-        words: words taught by example, see `teach`.
     """
 
-    def __init__(
-        self,
-        splats: Splats,
-        file: SceneFile,
-        decoder: Decoder | None = None,
-        codes: Float[Tensor, "n d"] | None = None,
-        *,
-        looks: Looks | None = None,
-        background: Float[Tensor, "3"] | None = None,
-        config: QueryConfig | None = None,
-        encode_texts: EncodeTexts | None = None,
-        vectors: Mapping[str, Float[Tensor, " c"]] | None = None,
-        cache: Path | None = None,
-        backend: Backend = "auto",
-        watch: Callable[[str], None] | None = None,
-        words: Iterable[TaughtWord] = (),
-    ) -> None:
-        super().__init__(splats, file, looks, background, config, cache, backend, watch)
-        self.words: Mapping[str, TaughtWord] = {known_word(word.name): word for word in words}
-        """Taught words, by their names in lower case."""
-        self.decoder, self.codes = decoder, codes
-        self._encode_texts, self._vectors = encode_texts, vectors
-        self._doubt_alone: dict[str, float] = {}
-        """Doubt about texts without their synonyms, by text."""
+    decoder: Decoder | None = None
+    """Turns codes into features; None for a scene with colors only."""
+    codes: Float[Tensor, "n d"] | None = None
+    """Semantic values of the Gaussians, a row each; NaN for those visible in no photo."""
+    _: KW_ONLY
+    encode_texts: EncodeTexts | None = None
+    """The scene's CLIP, if it is already loaded; otherwise it is loaded at the first text that is not among
+    `vectors`."""
+    vectors: Mapping[str, Float[Tensor, " c"]] | None = None
+    """Unit vectors of common words, which need no CLIP."""
+    words: Mapping[str, TaughtWord] = field(default_factory=dict)
+    """Words taught by example, by their names in lower case; see `with_words`."""
+    _doubt_alone: dict[str, float] = field(default_factory=dict, init=False)
+    """Doubt about texts without their synonyms, by text."""
 
     def __repr__(self) -> str:
         held_out = sum(photo.split == "eval" for photo in self.photos)
@@ -187,19 +161,19 @@ class Scene(ViewedScene):
         """
         start = time.perf_counter()
         channels = question.channels
-        seconds = time.perf_counter() - start
+        asked = time.perf_counter()
         camera, name = self.camera(place, size), self._name(place)
         small = resized(camera, self.trained_side)
         enlarged = small.width < camera.width
         view = self._view(camera, name, channels=None if enlarged else channels)
-        start = time.perf_counter()
+        rendered = time.perf_counter()
         rendering = view.rendering
         if enlarged:
             rendering = replace(rendering, channels=composite(self.splats, small, channels, self.backend))
         foreground = None if name is None else self.file.photo(name).foreground()
         maps, masks = question.maps(rendering, foreground)
         found = maps.cpu().float().numpy(), masks.cpu().numpy()
-        seconds += time.perf_counter() - start
+        seconds = asked - start + time.perf_counter() - rendered
         rows = zip(question.prompts, question.doubts, *found, question.thresholds, strict=True)
         return [
             Match(prompt, self.synonyms(prompt), doubt, view, relevancy, mask, level, seconds)
@@ -237,24 +211,28 @@ class Scene(ViewedScene):
 
     def places(self, question: Question, most: int = 10) -> list[Found]:
         """Find matches of a question's prompts in the scene; see `find`."""
-        return [self._found(question, i, most) for i in range(len(question.prompts))]
+        found = []
+        for row, prompt in enumerate(question.prompts):
+            scores, threshold = question.relevancy[row], question.thresholds[row]
+            views, closest = self._views(question, row)
+            box = None
+            if views:
+                box = strongest_match(self.splats.means, scores, self.mass, threshold, self.gap)
+            relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
+            shown = (views[:most], box, relevancy, matching)
+            found.append(Found(prompt, *shown, question.doubts[row], threshold, closest[:most]))
+        return found
 
     def best_views(self, question: Question) -> list[str]:
         """Return for each prompt the name of the training photo whose view shows it best, or comes closest.
-
-        Raises:
-            UserError: the scene has no training photos.
-        """
+        Raises UserError if the scene has no training photos."""
         if not self.visible:
             raise UserError("this scene has no training photos to choose from: name a photo or a camera")
         return [self._views(question, row)[1][0].name for row in range(len(question.prompts))]
 
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Compute the relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
-
-        Raises:
-            UserError: see `ask`; or the text holds several prompts.
-        """
+        Raises UserError as `ask` does, and for a text that holds several prompts."""
         return self._one(text).relevancy[0].cpu().float().numpy()
 
     def export(
@@ -267,7 +245,8 @@ class Scene(ViewedScene):
         look: str | None = None,
         index: str | Path | None = None,
     ) -> int:
-        """Write the Gaussians as a .ply or .spz file for splat viewers, in the scene's order.
+        """Write the Gaussians as a .ply or .spz file for splat viewers, in the scene's order, and return how
+        many were written.
 
         Args:
             path: the file.
@@ -278,9 +257,6 @@ class Scene(ViewedScene):
             index: with a text, a .npy or .txt file for the numbers of the matching Gaussians: their
                 positions, from 0, in the scene, and so in the splat that it was attached to.
 
-        Returns:
-            The number of Gaussians written.
-
         Raises:
             UserError: nothing matches, or see `ask` and `write_splats`.
         """
@@ -290,7 +266,13 @@ class Scene(ViewedScene):
         question = self._one(text, threshold)
         relevancy, keep = question.relevancy[0], question.gaussians[0]
         if not everything:
-            _expect_match(question)
+            if not keep.any():
+                level = question.thresholds[0]
+                raise UserError(
+                    f"no Gaussian matches {question.prompts[0].text!r}: the best reaches "
+                    f"{float(relevancy.max()):.2f}; lower --threshold, now {level:.2f}, or write all with "
+                    "their relevancy (--all)"
+                )
             splats, relevancy = splats.select(keep), relevancy[keep]
         if index is not None:
             write_index(Path(index), keep)
@@ -336,20 +318,7 @@ class Scene(ViewedScene):
             UserError: the pixel lies outside the view.
         """
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
-        feature = self._feature_at(self.camera(place, size), x, y)
-        if feature is None:
-            return []
-        queries, negatives = self.text.plain_queries(words).to(self.device), self.text.config.negatives
-        cosines = queries.cosines(feature)
-        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature).tolist()
-        named = sorted(zip(words, scores, strict=True), key=lambda pair: pair[1], reverse=True)
-        clear = any(score > CLEAR for word, score in named if word != "sky")
-        if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
-            return []
-        return named[: max(most, 0)]
-
-    def _feature_at(self, camera: Camera, x: float, y: float) -> Float[Tensor, " c"] | None:
-        """Blend the features that a pixel shows, unnormalized; None where too little of it has a meaning."""
+        camera = self.camera(place, size)
         if not (0 <= x < camera.width and 0 <= y < camera.height):
             raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
         pixel = torch.zeros(camera.height, camera.width, device=self.device)
@@ -357,8 +326,16 @@ class Scene(ViewedScene):
         share = self._fill(camera, pixel)
         rows = share.nonzero().squeeze(1)
         features = self.engine.features(rows)
-        meant = float(share[rows] @ (features != 0).any(1).float())
-        return None if meant < self.config.min_alpha else share[rows] @ features
+        if float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
+            return []
+        queries, negatives = self.text.plain_queries(words).to(self.device), self.text.config.negatives
+        cosines = queries.cosines(share[rows] @ features)
+        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature).tolist()
+        named = sorted(zip(words, scores, strict=True), key=lambda pair: pair[1], reverse=True)
+        clear = any(score > CLEAR for word, score in named if word != "sky")
+        if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
+            return []
+        return named[: max(most, 0)]
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 
@@ -384,10 +361,8 @@ class Scene(ViewedScene):
         (prompt,) = parse_prompts(f'"{word}"')
         listed = [examples] if isinstance(examples, Example) else list(examples)
         photos = [self.file.photo(example.photo) for example in listed]
-        weights = [
-            Weights.of(example, photo, self.splats, self.backend)
-            for example, photo in zip(listed, photos, strict=True)
-        ]
+        pairs = zip(listed, photos, strict=True)
+        weights = [Weights.of(example, photo, self.splats, self.backend) for example, photo in pairs]
         if selection is not None:
             weights = [Weights(w.seen * selection, torch.zeros_like(w.seen), w.seen) for w in weights]
         queries = self.text.plain_queries([prompt.text]).to(self.device)
@@ -403,11 +378,8 @@ class Scene(ViewedScene):
 
     def carrying(self, word: TaughtWord) -> Scene:
         """Return a scene with a word taught elsewhere. If it was taught in these photos, it is learned anew;
-        if not, or if its marks no longer show anything, it is kept as it was learned there.
-
-        Raises:
-            UserError: the word was learned with another CLIP.
-        """
+        if not, or if its marks no longer show anything, it is kept as it was learned there. Raises UserError
+        if it was learned with another CLIP."""
         if word.examples and word.scene == Path(self.file.data).name:
             with suppress(UserError):
                 return self.teach(word.name, word.examples)
@@ -416,11 +388,8 @@ class Scene(ViewedScene):
         return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
 
     def unsure(self, word: str) -> str:
-        """Find the training photo in which a taught word is least certain, the best one to mark next.
-
-        Raises:
-            UserError: the word was not taught.
-        """
+        """Find the training photo in which a taught word is least certain, the best one to mark next. Raises
+        UserError if the word was not taught."""
         taught = self.words.get(known_word(word))
         if taught is None:
             raise UserError(f"{word!r} was not taught: see lang3dxl words")
@@ -431,22 +400,19 @@ class Scene(ViewedScene):
         unsure = {name: view.pixels @ open_question[view.rows.long()] for name, view in views.items()}
         return max(unsure, key=lambda name: float(unsure[name]))
 
-    def _with_taught(self, prompt: Prompt) -> Prompt:
-        taught = self.words.get(known_word(prompt.text))
-        return prompt if taught is None or prompt.vector is not None else replace(prompt, taught=taught)
-
     # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
 
     def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
         """Parse prompts, and attach the taught words. Raises UserError if there are no prompts."""
-        prompts: list[Prompt] = []
-        for text in _listed(texts):
-            if isinstance(text, Prompt):
-                prompts.append(self._with_taught(text))
-            elif isinstance(text, Tensor | Array):
+        prompts = list[Prompt]()
+        listed: Sequence[Any] = texts if isinstance(texts, list | tuple) else [texts]
+        for text in listed:
+            if isinstance(text, Tensor | Array):
                 prompts.append(Prompt("vector", vector=self._vector(text)))
-            else:
-                prompts += map(self._with_taught, parse_prompts(text))
+                continue
+            for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text):
+                word = None if prompt.vector is not None else self.words.get(known_word(prompt.text))
+                prompts.append(prompt if word is None else replace(prompt, taught=word))
         return prompts or parse_prompts("")
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
@@ -484,20 +450,10 @@ class Scene(ViewedScene):
 
     def _views(self, question: Question, row: int) -> tuple[list[Viewpoint], list[Viewpoint]]:
         """Return the training views that show a prompt, and all training views, both best first."""
-        ranks = rank_views(self.visible, self.splats.means, question.relevancy[row], question.thresholds[row])
-        everything = [
-            Viewpoint(name, self.file.photo(name).camera, found.area, found.peak, found.rank)
-            for name, found in ranks.items()
-        ]
-        return [view for view in everything if ranks[view.name].shown], everything
-
-    def _found(self, question: Question, row: int, most: int) -> Found:
         scores, threshold = question.relevancy[row], question.thresholds[row]
-        views, closest = self._views(question, row)
-        box = strongest_match(self.splats.means, scores, self.mass, threshold, self.gap) if views else None
-        relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
-        prompt, doubt = question.prompts[row], question.doubts[row]
-        return Found(prompt, views[:most], box, relevancy, matching, doubt, threshold, closest[:most])
+        ranks = rank_views(self.visible, self.splats.means, scores, threshold)
+        everything = [replace(view, camera=self.file.photo(view.name).camera) for view in ranks]
+        return [view for view in everything if view.shown], everything
 
     # ── computed once ───────────────────────────────────────────────────────────────────────────────
 
@@ -516,12 +472,12 @@ class Scene(ViewedScene):
     def text(self) -> TextEncoder:
         """The encoder of prompts, which loads the scene's CLIP at the first text that it doesn't know."""
         self._semantics()
-        return TextEncoder(self._encode, self.config.text, self._vectors)
+        return TextEncoder(self._encode, self.config.text, self.vectors)
 
     def _encode(self, texts: list[str]) -> Float[Tensor, "n c"]:
-        if self._encode_texts is None:
-            self._encode_texts = text_encoder(self.file, self.device)
-        return self._encode_texts(texts)
+        if self.encode_texts is None:
+            self.encode_texts = text_encoder(self.file, self.device)
+        return self.encode_texts(texts)
 
     @cached_property
     def doubts(self) -> Doubts:
@@ -539,20 +495,6 @@ def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
             f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
         )
     return encoder.encode_texts
-
-
-def _expect_match(question: Question) -> None:
-    """Raise UserError if no Gaussian matches the first prompt."""
-    if not question.gaussians[0].any():
-        best, level = float(question.relevancy[0].max()), question.thresholds[0]
-        raise UserError(
-            f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
-            f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
-        )
-
-
-def _listed(texts: Any) -> list[Any]:
-    return list(texts) if isinstance(texts, list | tuple) else [texts]
 
 
 def _several(texts: Any, found: Sequence[Any]) -> bool:

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded, write_atomically
@@ -34,10 +35,10 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, scene_from_json
+from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
-from lang3dxl_ns.query.teach import TaughtWord
+from lang3dxl_ns.query.teach import TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering.splats import Splats
@@ -76,19 +77,8 @@ class Provenance:
 
 
 def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) -> int:
-    """Write a scene as one file, atomically.
-
-    Args:
-        path: the file; its name ends in .scene.
-        scene: the scene. Foreground masks are read from their files and stored with it.
-        provenance: the scene's origin, as the file describes it.
-
-    Returns:
-        The number of bytes written.
-
-    Raises:
-        UserError: the name doesn't end in .scene.
-    """
+    """Write a scene as one file, atomically, with foreground masks read from their files. Return the number
+    of bytes. Raises UserError if the name doesn't end in .scene."""
     if path.suffix != SUFFIX:
         raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}")
     from safetensors.numpy import save
@@ -109,17 +99,30 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         "taught": [word.to_json() for word in scene.words.values()],
     }
     if scene.decoder is not None and scene.codes is not None:
-        described |= {"decoder": _described(scene.decoder), "words": list(common_words())}
+        settings = getattr(getattr(scene.decoder, "field", scene.decoder), "settings", None)
+        described["decoder"] = {
+            "name": scene.decoder.name,
+            "clip_dim": scene.decoder.clip_dim,
+            "dense_dim": scene.decoder.dense_dim,
+            "settings": None if settings is None else asdict(settings),
+        }
+        described["words"] = list(common_words())
         content |= _stored_state("decoder", scene.decoder)
-        content["codes"] = _stored_codes(scene.codes, scene.decoder.bounded)
+        content["codes"] = _array(scene.codes, np.float32)
+        if scene.decoder.bounded:  # 16-bit coordinates in (0, 1), which the hash grid reads
+            places = 1 + (scene.codes.double().sigmoid() * _STEPS).round()
+            known = scene.codes.isfinite().all(1, keepdim=True)
+            content["codes"] = _array(torch.where(known, places, 0), np.uint16)
         content["words"] = _array(scene.text.vectors(described["words"]), np.float16)
     if scene.looks is not None:
         field = scene.looks.field
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
     for i, photo in enumerate(scene.photos):
-        if photo.mask is not None and (mask := _stored_mask(photo)):
-            content[f"mask.{i}"] = np.frombuffer(mask, np.uint8)
+        camera, picture = resized(photo.camera, _MASK_SIDE), io.BytesIO()
+        if (mask := photo.foreground((camera.height, camera.width))) is not None:
+            Image.fromarray(mask.cpu().numpy()).save(picture, "PNG", optimize=True)
+            content[f"mask.{i}"] = np.frombuffer(picture.getvalue(), np.uint8)
     photos = [replace(photo, mask=None) for photo in scene.photos]
     described["scene"] = asdict(replace(scene.file, photos=photos, data=Path(scene.file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
@@ -128,33 +131,38 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
 
 
 def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
-    """Replace the taught words in a scene file, atomically; nothing else in it changes.
+    """Replace the taught words in a scene file, atomically; nothing else in it changes. Raises UserError as
+    `read_scene` does."""
+    from safetensors.numpy import save
 
-    Args:
-        path: the scene file.
-        words: the words that it holds afterwards.
-
-    Raises:
-        UserError: the file is missing, damaged, or of a newer version.
-    """
-    with _opened(path):
-        content = path.read_bytes()
-        begin = 8 + int.from_bytes(content[:8], "little")
-        header = json.loads(content[8:begin])
-        described = json.loads(header["__metadata__"][_KEY])
-        described["taught"] = [word.to_json() for word in words]
-        header["__metadata__"][_KEY] = json.dumps(described)
-        start = json.dumps(header).encode()
-        start += b" " * (-len(start) % 8)  # keep tensors aligned
-    write_atomically(path, len(start).to_bytes(8, "little") + start + content[begin:])
+    with _opened(path) as file:
+        described = file.about | {"taught": [word.to_json() for word in words]}
+        content = {name: file.array(name) for name in file.shapes}
+    write_atomically(path, save(content, {_KEY: json.dumps(described)}))
 
 
-def _stored_codes(codes: Float[Tensor, "n d"], bounded: bool) -> Shaped[Array, "n d"]:
-    """Convert bounded codes to the 16-bit coordinates in (0, 1) that the hash grid reads; keep others."""
-    if not bounded:
-        return _array(codes, np.float32)
-    places = 1 + (codes.double().sigmoid() * _STEPS).round()
-    return _array(torch.where(codes.isfinite().all(1, keepdim=True), places, 0), np.uint16)
+def with_words_of(scene: Scene, earlier: Path) -> Scene:
+    """Return the scene with the taught words of the file that it replaces, where it doesn't know them. Log
+    which are kept and how, and which are lost. A missing file has no words."""
+    if not earlier.is_file():
+        return scene
+    try:
+        words = describe_scene_file(earlier)["taught"]
+    except UserError as error:
+        say(f"Words taught in {earlier.name} are lost: {error}")
+        return scene
+    for word in words:
+        if (name := known_word(word.name)) in scene.words:
+            continue
+        try:
+            scene = scene.carrying(word)
+        except UserError as error:
+            say(f"The taught word {word.name!r} is lost: {error}")
+            continue
+        count = len(scene.words[name].examples)
+        how = f"learned anew from its examples ({count})" if count else "as it was: check it in a few photos"
+        say(f"The taught word {word.name!r} is kept, {how}")
+    return scene
 
 
 def _stored_state(name: str, module: torch.nn.Module) -> dict[str, Shaped[Array, "..."]]:
@@ -166,26 +174,6 @@ def _stored_state(name: str, module: torch.nn.Module) -> dict[str, Shaped[Array,
             half = many and float(values.abs().max()) < _LARGEST_HALF
             stored[f"{name}.{key}"] = _array(values.half() if half else values)
     return stored
-
-
-def _stored_mask(photo: ScenePhoto) -> bytes | None:
-    camera = resized(photo.camera, _MASK_SIDE)
-    mask = photo.foreground((camera.height, camera.width))
-    if mask is None:
-        return None
-    content = io.BytesIO()
-    Image.fromarray(mask.cpu().numpy()).save(content, "PNG", optimize=True)
-    return content.getvalue()
-
-
-def _described(decoder: Decoder) -> dict[str, Any]:
-    settings = getattr(getattr(decoder, "field", decoder), "settings", None)
-    return {
-        "name": decoder.name,
-        "clip_dim": decoder.clip_dim,
-        "dense_dim": decoder.dense_dim,
-        "settings": None if settings is None else asdict(settings),
-    }
 
 
 def _array(tensor: Tensor, kind: Any = None) -> Shaped[Array, "..."]:
@@ -204,14 +192,9 @@ def read_scene(
 ) -> Scene:
     """Read a scene file. Nothing in it is executed, and no memory is allocated beyond what it holds.
 
-    Args:
-        path: the file.
-        device: default: a GPU if there is one.
-        config: defaults of queries.
-        encode_texts: the scene's CLIP, if it is already loaded, or is not where the scene file says.
-
-    Raises:
-        UserError: the file is missing, damaged, cut short, or of a newer version.
+    device: by default a GPU if there is one. encode_texts: the scene's CLIP, if it is already loaded, or is
+    not where the scene file says. Raises UserError if the file is missing, damaged, cut short, or of a newer
+    version.
     """
     path, device = expanded(path), torch.device(device or best_device())
     with _opened(path) as file:
@@ -230,17 +213,15 @@ def read_scene(
     background = None if file.background is None else torch.tensor(file.background, device=device)
     return Scene(
         splats, replace(file.scene, photos=photos), decoder, codes,
-        looks=looks, background=background, config=config, encode_texts=encode_texts,
-        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"), words=file.taught,
-    )  # fmt: skip
+        looks=looks, background=background, config=config or QueryConfig(), encode_texts=encode_texts,
+        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
+    ).with_words(file.taught)  # fmt: skip
 
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
-    """Describe a scene file: `provenance`, `scene`, `gaussians`, `photos`, `clip`, `decoder`, `looks`,
-    `taught` (the words taught by example) and `bytes`.
-
-    No tensor is read. Raises UserError as `read_scene` does.
-    """
+    """Describe a scene file, without reading a tensor: `provenance`, `scene`, `gaussians`, `photos`, `clip`,
+    `decoder`, `looks`, `taught` (the words taught by example) and `bytes`. Raises UserError as `read_scene`
+    does."""
     path = expanded(path)
     with _opened(path) as file:
         return {
@@ -260,15 +241,14 @@ class _File:
     """An open safetensors file with a scene: its description, and tensors whose shapes are checked first."""
 
     def __init__(self, opened: Any) -> None:
-        self._opened = opened
+        self.array = opened.get_tensor
         self.shapes = {name: opened.get_slice(name).get_shape() for name in opened.keys()}  # noqa: SIM118
         self.about: dict[str, Any] = json.loads((opened.metadata() or {})[_KEY])
         if self.about["version"] != VERSION:
             raise _NewerError(self.about["version"])
         self.scene: SceneFile = scene_from_json(self.about["scene"])
         self.provenance = Provenance(**self.about["provenance"])
-        texts = vars(self.provenance).values()
-        expect(all(isinstance(text, str) for text in texts), "its origin is no text")
+        expect(all(isinstance(t, str) for t in vars(self.provenance).values()), "its origin is no text")
         self.background: list[float] | None = self.about["background"]
         if self.background is not None:
             channels = [0 <= float(x) <= 1 for x in self.background]
@@ -278,7 +258,7 @@ class _File:
     def tensor(self, name: str, *shape: int) -> Tensor:
         """Read a tensor of any type with this shape. Raises ValueError for another shape."""
         expect(self.shapes[name] == list(shape), f"{name} has the shape {self.shapes[name]}")
-        values = self._opened.get_tensor(name)
+        values = self.array(name)
         return torch.from_numpy(values.astype(np.int32) if values.dtype == np.uint16 else values)
 
     def mask(self, photo: int) -> bytes | None:

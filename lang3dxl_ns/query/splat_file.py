@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import tempfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,18 +24,11 @@ LEAST_OPACITY = 1e-6
 
 
 def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | None = None) -> int:
-    """Write a .ply or .spz file.
+    """Write a .ply or .spz file, without Gaussians that have a NaN or infinite value. Return the number of
+    Gaussians written.
 
-    Args:
-        path: the file; its ending names the format.
-        splats: the Gaussians; those with a NaN or infinite value are left out.
-        relevancy: relevancy of each Gaussian to a prompt, 0…1, written to a PLY as the property `relevancy`.
-
-    Returns:
-        The number of Gaussians written.
-
-    Raises:
-        UserError: the ending names another kind of file, or gsply is missing for .spz.
+    relevancy: relevancy of each Gaussian to a prompt, 0…1, written to a PLY as the property `relevancy`.
+    Raises UserError if the ending names another kind of file, or gsply is missing for .spz.
     """
     check_splat_name(path)
     sound = splats.sound()
@@ -43,19 +38,14 @@ def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | No
 
 
 def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
-    """Write the numbers of the selected Gaussians, from 0, as an array (.npy) or one per line (.txt).
-
-    Raises UserError for another ending.
-    """
-    numbers = selected.nonzero()[:, 0].cpu().numpy()
-    if path.suffix.lower() == ".npy":
-        content = io.BytesIO()
-        np.save(content, numbers)
-        write_atomically(path, content.getvalue())
-    elif path.suffix.lower() == ".txt":
-        write_atomically(path, "".join(f"{number}\n" for number in numbers))
-    else:
+    """Write the numbers of the selected Gaussians, from 0, as an array (.npy) or one per line (.txt). Raises
+    UserError for another ending."""
+    writers: dict[str, Callable] = {".npy": np.save, ".txt": partial(np.savetxt, fmt="%d")}
+    if (kind := path.suffix.lower()) not in writers:
         raise UserError(f"{path.name} names no kind of list: end it in .npy or .txt")
+    content = io.BytesIO()
+    writers[kind](content, selected.nonzero()[:, 0].cpu().numpy())
+    write_atomically(path, content.getvalue())
 
 
 def check_splat_name(path: Path) -> None:

@@ -19,7 +19,6 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
-from lang3dxl_ns.query.coco import mask_of, run_lengths
 from lang3dxl_ns.scene.camera import MOST_PIXELS
 
 Point = tuple[float, float]
@@ -78,11 +77,10 @@ class Example:
     def to_json(self) -> dict[str, Any]:
         """Convert the example to JSON, with masks as run lengths."""
         described: dict[str, Any] = {"photo": self.photo}
+        described |= {"points": self.points, "not_points": self.not_points}
         if self.mask is not None:
-            described["mask"] = {"size": list(self.mask.shape), "counts": run_lengths(self.mask)}
-        if self.box is not None:
-            described["box"] = list(self.box)
-        return described | {"points": [*map(list, self.points)], "not_points": [*map(list, self.not_points)]}
+            described["mask"] = {"size": self.mask.shape, "counts": run_lengths(self.mask)}
+        return described if self.box is None else described | {"box": self.box}
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Example:
@@ -99,6 +97,23 @@ class Example:
             tuple((float(x), float(y)) for x, y in content[name]) for name in ("points", "not_points")
         )
         return cls(str(content["photo"]), mask, box, points, others)
+
+
+def run_lengths(mask: Bool[Array, "h w"]) -> list[int]:
+    """Return the lengths of a mask's alternating runs, column by column, beginning with the pixels outside,
+    as in COCO's uncompressed RLE."""
+    flat = mask.ravel(order="F")
+    ends = np.flatnonzero(np.diff(flat)) + 1
+    lengths = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
+    return [0, *lengths] if flat.size and flat[0] else lengths
+
+
+def mask_of(lengths: Sequence[int], size: tuple[int, int]) -> Bool[Array, "h w"]:
+    """Build the mask (height, width) with these `run_lengths`. Raises ValueError if the sizes differ."""
+    counts = np.asarray(lengths, np.int64)
+    if (counts < 0).any() or counts.sum() != size[0] * size[1]:
+        raise ValueError("run lengths don't fit the size of their mask")
+    return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(size, order="F")
 
 
 def _kept(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:

@@ -18,9 +18,9 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.query.doubt import UNRELATED
-from lang3dxl_ns.query.negatives import NEGATIVES, competitors
+from lang3dxl_ns.query.negatives import NEGATIVES, competitors, singulars
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.teach import TaughtWord
+from lang3dxl_ns.query.teach import TaughtWord, known_word
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
@@ -75,8 +75,8 @@ def parse_prompts(typed: str) -> list[Prompt]:
 
 
 def _parse_prompt(part: str) -> Prompt:
-    negatives = [_tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
-    text = _tidy(_NEGATIVES.sub(" ", part))
+    negatives = [tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
+    text = tidy(_NEGATIVES.sub(" ", part))
     if found := re.fullmatch(r"(.+) not (.+)", text, re.IGNORECASE):
         say(
             f"{text} is searched for as it stands. To tell one thing from another: "
@@ -87,7 +87,8 @@ def _parse_prompt(part: str) -> Prompt:
     return Prompt(text, tuple(negative for negative in negatives if negative))
 
 
-def _tidy(text: str) -> str:
+def tidy(text: str) -> str:
+    """Return a phrase without quotes and extra spaces."""
     return " ".join(text.replace('"', " ").replace("\0", " ").split())
 
 
@@ -149,28 +150,15 @@ def synonym_table() -> dict[str, list[str]]:
 
 def synonyms_of(text: str) -> list[str]:
     """Return synonyms of a term in singular or plural, with or without an article; none for other texts."""
-    words, table = re.sub(r"^(an?|the)\s+", "", " ".join(text.lower().split())), synonym_table()
-    return next((table[form] for form in _singulars(words) if form in table), [])
-
-
-def _singulars(words: str) -> list[str]:
-    """Return the possible singulars of these words, and the words themselves."""
-    endings = (("", ""), ("s", ""), ("es", ""), ("ies", "y"), ("es", "is"), ("ia", "ion"), ("a", "um"))
-    irregular = {"oculi": "oculus", "abaci": "abacus"}
-    forms = [words.removesuffix(plural) + single for plural, single in endings if words.endswith(plural)]
-    return [*forms, irregular.get(words, words)]
+    words, table = re.sub(r"^(an?|the)\s+", "", known_word(text)), synonym_table()
+    return next((table[form] for form in singulars(words) if form in table), [])
 
 
 # ── vectors ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
 class TextEncoder:
-    """Encoder of prompts to `Queries`, which encodes every string once.
-
-    Args:
-        encode: text encoder of the CLIP that made the targets, `ImageTextEncoder.encode_texts`.
-        known: unit vectors of texts that need not be encoded.
-    """
+    """Encoder of prompts to `Queries`, which encodes every string once, except for `known` unit vectors."""
 
     def __init__(
         self,
@@ -189,16 +177,23 @@ class TextEncoder:
         return [word for word in found if word.lower() != text.lower()]
 
     def queries(self, prompts: Sequence[Prompt], known: Collection[str] = ()) -> Queries:
-        """Encode prompts, with synonyms combined as configured, and their competitors.
-
-        known: texts that are encoded without synonyms.
-        """
-        return Queries.of(
-            [self._positive(p, [] if p.text in known else self.synonyms(p.text)) for p in prompts],
-            self.vectors(self.config.negatives),
-            [self.vectors(prompt.negatives) for prompt in prompts],
-            [self._against(p.text) if p.vector is None else self._against_all_but(p.vector) for p in prompts],
-        ).taught([prompt.taught for prompt in prompts])
+        """Encode prompts, with synonyms (but for `known` texts) combined as configured, and competitors."""
+        negatives, positive, against = self.vectors(self.config.negatives), [], []
+        for prompt in prompts:
+            if prompt.vector is not None:
+                vector = prompt.vector.to(negatives)
+                other = negatives @ F.normalize(vector, dim=0) < _SAME  # phrases with another meaning
+                positive.append(vector[None])
+                against.append(other.nonzero().flatten().tolist() or list(range(len(negatives))))
+                continue
+            words = [] if prompt.text in known else self.synonyms(prompt.text)
+            words.append(searched(prompt.text) if prompt.taught is None else prompt.text)
+            joined = self.config.combine == "joined"
+            positive.append(self.vectors([", ".join(words)] if joined else words))
+            against.append(self._against(prompt.text))
+        own = [self.vectors(prompt.negatives) for prompt in prompts]
+        queries = Queries.of(positive, negatives, own, against)
+        return queries.taught([prompt.taught for prompt in prompts])
 
     def plain_queries(self, texts: Sequence[str]) -> Queries:
         """Encode texts without synonyms, and the configured negatives."""
@@ -216,18 +211,6 @@ class TextEncoder:
 
     def _against(self, text: str) -> list[int]:
         return competitors(self.config.negatives, [searched(text), *self.synonyms(text)])
-
-    def _against_all_but(self, vector: Float[Tensor, " c"]) -> list[int]:
-        """Return the indices of the negatives that a vector competes with: those with another meaning."""
-        phrases = self.vectors(self.config.negatives)
-        cosines = phrases @ F.normalize(vector.to(phrases), dim=0)
-        return (cosines < _SAME).nonzero().flatten().tolist() or list(range(len(phrases)))
-
-    def _positive(self, prompt: Prompt, synonyms: list[str]) -> Float[Tensor, "s c"]:
-        if prompt.vector is not None:
-            return prompt.vector.to(self.vectors(self.config.negatives))[None]
-        words = [*synonyms, searched(prompt.text) if prompt.taught is None else prompt.text]
-        return self.vectors([", ".join(words)] if self.config.combine == "joined" else words)
 
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:
         """Encode texts as unit vectors."""

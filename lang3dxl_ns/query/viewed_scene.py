@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,12 +17,16 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import watched
 from lang3dxl_ns.components.looks import Look, Looks, render_in_look
-from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.match import View
-from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, overview
+from lang3dxl_ns.query.visibility import (
+    VisibleGaussians,
+    fingerprint,
+    load_visible,
+    save_visible,
+    spread,
+)
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import Rendering, composite
@@ -35,36 +39,30 @@ Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4
 """A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
 
 
+@dataclass(eq=False, repr=False)
 class ViewedScene:
     """Gaussians and the photos they were made from.
 
     The scene never changes. What each photo shows is computed once. Any number of threads may use it.
-
-    Args:
-        splats: the Gaussians, in the model's frame.
-        file: photos and cameras.
-        looks: lighting of the photos; None if all share one.
-        background: color behind the scene, 0…1; None for black.
-        config: sizes of pictures, and of the views that `visible` measures.
-        cache: file that keeps which Gaussians the photos show; if None, every process measures them.
-        backend: the rasterizer, see `rasterize`.
-        watch: called with a short description of slow work; if None, a progress bar is shown.
     """
 
-    def __init__(
-        self,
-        splats: Splats,
-        file: SceneFile,
-        looks: Looks | None = None,
-        background: Float[Tensor, "3"] | None = None,
-        config: QueryConfig | None = None,
-        cache: Path | None = None,
-        backend: Backend = "auto",
-        watch: Callable[[str], None] | None = None,
-    ) -> None:
-        self.splats, self.file, self.config = splats, file, config or QueryConfig()
-        self.looks, self.background, self.backend = looks, background, backend
-        self._cache, self._watch = cache, watch
+    splats: Splats
+    """The Gaussians, in the model's frame."""
+    file: SceneFile
+    """Photos, cameras, and the CLIP that the features come from."""
+    _: KW_ONLY
+    looks: Looks | None = None
+    """Lighting of the photos; None if all share one."""
+    background: Float[Tensor, "3"] | None = None
+    """Color behind the scene, 0…1; None for black."""
+    config: QueryConfig = field(default_factory=QueryConfig)
+    """Defaults of queries, sizes of pictures, and of the views that `visible` measures."""
+    cache: Path | None = None
+    """File that keeps which Gaussians the photos show; if None, every process measures them."""
+    backend: Backend = "auto"
+    """The rasterizer, see `rasterize`."""
+    watch: Callable[[str], None] | None = None
+    """Called with a short description of slow work; if None, a progress bar is shown."""
 
     @property
     def device(self) -> torch.device:
@@ -85,8 +83,7 @@ class ViewedScene:
         """Build a camera of the scene.
 
         Args:
-            place: a camera; a photo by name; or a pose (camera → world in the model's frame, nerfstudio's
-                axes), which gets the first photo's lens.
+            place: a camera; a photo by name; or a pose, which gets the first photo's lens.
             size: longer side in pixels; by default a camera keeps its size, and a photo has its file's, at
                 most 1920.
             fov: vertical field of view in degrees; by default the lens's.
@@ -122,13 +119,8 @@ class ViewedScene:
     def draw(
         self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
     ) -> Rendering:
-        """Render a camera as tensors on the scene's device.
-
-        Args:
-            camera: the camera to render from.
-            channels: further values of the Gaussians to composite.
-            look: the lighting; by default the scene's rule chooses for this view.
-        """
+        """Render a camera, and further values of the Gaussians, as tensors on the scene's device. Without a
+        look, the scene's rule chooses the lighting for this view."""
         if look is None and self.looks is not None:
             look = self.looks.of_view(camera)
         return render_in_look(
@@ -159,30 +151,31 @@ class ViewedScene:
     def baked(self, look: str | None = None) -> Splats:
         """Return the Gaussians with a training photo's look in their colors, for viewers that know no looks.
 
-        Args:
-            look: the photo; by default the overview photo. A scene without looks returns its Gaussians
-                unchanged.
+        look: the photo; by default the overview photo. Raises UserError if there is no look of this photo.
         """
+        chosen = self._look(look)
         if self.looks is None:
-            if look is not None:
-                self._look(look)
             return self.splats
         camera = self.overview.camera
-        return (self._look(look) or self.looks.of_view(camera)).apply(self.splats, camera)
+        return (chosen or self.looks.of_view(camera)).apply(self.splats, camera)
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 
     @cached_property
     def visible(self) -> Mapping[str, VisibleGaussians]:
         """The Gaussians visible in each training view. They are measured once, with a progress bar."""
-        cameras = self._small_cameras
-        views = load_visible(self._cache, self._views_key, cameras, self.device) if self._cache else None
-        if views is None:
-            what = "measuring which Gaussians the photos show, once"
-            shown = watched(cameras.items(), what, self._watch)
-            views = {name: self._visible(name, camera) for name, camera in shown}
-            if self._cache:
-                save_visible(self._cache, views, self._views_key)
+        count, side = self.config.views, self.config.view_side
+        chosen = spread([photo for photo in self.photos if photo.split == "train"], count)
+        cameras = {photo.name: resized(photo.camera, side) for photo in chosen}
+        key = ""
+        if self.cache is not None:
+            key = fingerprint(vars(self.splats.gaussians), [asdict(self.file), count, side])
+            if (kept := load_visible(self.cache, key, cameras, self.device)) is not None:
+                return kept
+        shown = watched(cameras.items(), "measuring which Gaussians the photos show, once", self.watch)
+        views = {name: self._visible(name, camera) for name, camera in shown}
+        if self.cache is not None:
+            save_visible(self.cache, views, key)
         return views
 
     def _visible(self, name: str, camera: Camera) -> VisibleGaussians:
@@ -212,20 +205,12 @@ class ViewedScene:
     def gap(self) -> float:
         """Distance in world units below which matches are connected: 3 % of the median distance at which the
         scene is seen, about eight pixels of a small view; 0 if no training photo shows anything."""
-        distances = torch.tensor([view.distance(self.splats.means) for view in self.visible.values()])
-        return 0.03 * float(distances.nanmedian().nan_to_num())
-
-    @cached_property
-    def _small_cameras(self) -> dict[str, Camera]:
-        photos = [photo for photo in self.photos if photo.split == "train"]
-        count = min(self.config.views, len(photos))
-        chosen = [photos[i * len(photos) // count] for i in range(count)]
-        return {photo.name: resized(photo.camera, self.config.view_side) for photo in chosen}
-
-    @cached_property
-    def _views_key(self) -> str:
-        c, shapes = self.config, vars(self.splats.gaussians)
-        return fingerprint(shapes, [asdict(self.file), c.views, c.view_side])
+        distances = []
+        for view in self.visible.values():
+            pose, means = view.camera.view_matrix.to(self.splats.means), self.splats.means[view.rows]
+            if len(means):
+                distances.append(float((means @ pose[2, :3] + pose[2, 3]).median()))
+        return 0.03 * float(torch.tensor(distances).nanmedian()) if distances else 0.0
 
 
 def _pose(place: Any) -> Float[Tensor, "rows 4"]:

@@ -1,20 +1,31 @@
-"""Visible Gaussians per view and their sizes, for ranking views without rendering them."""
+"""Visible Gaussians per view and their sizes, for ranking views without rendering them, and their cache."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.query.cache import load_tensors, save_tensors
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.files import check_regular, write_atomically
 from lang3dxl_ns.scene.camera import Camera
 
 _LEAST = 1e-3
 """Pixels below which a Gaussian counts as not visible in a view."""
+Item = TypeVar("Item")
+
+
+def spread(items: Sequence[Item], most: int) -> list[Item]:
+    """Choose at most this many of the items, evenly spaced."""
+    count = min(most, len(items))
+    return [items[i * len(items) // count] for i in range(count)]
 
 
 @dataclass(frozen=True)
@@ -43,30 +54,50 @@ class VisibleGaussians:
         """Number of pixels in the view."""
         return self.camera.width * self.camera.height
 
-    def distance(self, means: Float[Tensor, "n 3"]) -> float:
-        """Compute the median depth of the visible Gaussians in world units; NaN if there are none."""
-        view = self.camera.view_matrix.to(means)
-        depths = means[self.rows] @ view[2, :3] + view[2, 3]
-        return float(depths.median()) if len(depths) else float("nan")
+
+def fingerprint(state: Mapping[str, Tensor], settings: object) -> str:
+    """Hash tensors and settings (as JSON) to 16 hex digits."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
+    for name, value in sorted(state.items()):
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()[:16]
 
 
 def save_visible(path: Path, views: Mapping[str, VisibleGaussians], key: str) -> None:
-    """Write the views, with one concatenated tensor per field."""
-    parts = {
-        "rows": torch.cat([view.rows for view in views.values()]),
-        "shares": torch.cat([view.shares for view in views.values()]),
+    """Write the views, with a key that detects changes. If that fails, log it; they are made again."""
+    from safetensors.torch import save
+
+    tensors = {
+        "rows": torch.cat([view.rows for view in views.values()]).cpu(),
+        "shares": torch.cat([view.shares for view in views.values()]).cpu(),
+        "counts": torch.tensor([len(view.rows) for view in views.values()]),
     }
-    save_tensors(path, parts, key, [len(view.rows) for view in views.values()])
+    try:
+        write_atomically(path, save(tensors, {"key": key, "checksum": fingerprint(tensors, key)}))
+    except OSError as error:
+        say(f"{path} can't be cached ({error.strerror}): it will be made again the next time")
 
 
 def load_visible(
     path: Path, key: str, cameras: Mapping[str, Camera], device: torch.device | str
 ) -> dict[str, VisibleGaussians] | None:
-    """Load the views cached under this key, which covers names and cameras; None if there are none."""
-    found = load_tensors(path, key)
-    if found is None or "shares" not in found[0]:  # written by an earlier version
+    """Load the views cached under this key, which covers names and cameras; None if there are none, or the
+    file is damaged."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        check_regular(path)
+        with safe_open(path, "pt") as file:
+            metadata: dict[str, Any] = file.metadata() or {}
+            if metadata.get("key") != key:
+                return None
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if metadata["checksum"] != fingerprint(tensors, key):
+            return None
+        counts = tensors["counts"].tolist()
+        rows, shares = (tensors[name].to(device).split(counts) for name in ("rows", "shares"))
+    except (OSError, SafetensorError, ValueError, KeyError):
         return None
-    tensors, sizes = found
-    rows, shares = (tensors[name].to(device).split(sizes) for name in ("rows", "shares"))  # type: ignore[arg-type]
     named = zip(cameras.items(), rows, shares, strict=True)
-    return {name: VisibleGaussians(camera, r, p) for (name, camera), r, p in named}
+    return {name: VisibleGaussians(camera, r, share) for (name, camera), r, share in named}

@@ -8,11 +8,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.negatives import NEGATIVES
 from lang3dxl_ns.query.relevancy import CANONICAL
+from lang3dxl_ns.query.text import synonym_table
 
 _COMMON = (
     "wall", "window", "door", "roof", "tower", "dome", "sky", "tree", "grass", "street", "people", "car",
@@ -26,7 +26,7 @@ _WHOLE = re.compile(r"(?P<end>[a-z]{3,})</w>|[▁Ġ](?P<start>[a-z]{3,})")
 @lru_cache(maxsize=1)
 def shipped_vocabulary() -> tuple[str, ...]:
     """Return words and terms of architecture and its surroundings, in the singular, without repetition."""
-    terms: dict[str, list[str]] = load_preset("synonyms/architecture")
+    terms = synonym_table()
     listed = [*_COMMON, *terms, *(word for words in terms.values() for word in words)]
     return tuple(dict.fromkeys(listed))
 
@@ -46,16 +46,9 @@ def _plural(word: str) -> str:
 
 
 def whole_words(clip: str | Path) -> tuple[str, ...]:
-    """List the lower-case words of three letters or more that a CLIP's tokenizer has as single tokens.
-
-    Args:
-        clip: folder or name of the CLIP.
-
-    Raises:
-        UserError: there is no such CLIP on this machine.
-    """
-    folder = find_model(clip, CLIP_OPTION).folder
-    tokens: Any = {}
+    """List the lower-case words of three letters or more that a CLIP's tokenizer has as single tokens. Raises
+    UserError if there is no CLIP of this name or folder on this machine."""
+    folder, tokens = find_model(clip, CLIP_OPTION).folder, list[Any]()
     if (folder / "tokenizer.json").is_file():
         tokens = json.loads((folder / "tokenizer.json").read_text(encoding="utf-8"))["model"]["vocab"]
     elif (folder / "vocab.json").is_file():

@@ -8,21 +8,19 @@ import torch
 from box_splat import box_splat
 from scenes import write_scene
 
-from lang3dxl_ns.attachment.attach import AttachConfig, attach
+from lang3dxl_ns.attachment import AttachConfig
+from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.known_frames import known_frames
 from lang3dxl_ns.commands.attach import _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.photo_collection import read_collection
-from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.read_splats import read_splats
 from lang3dxl_ns.query.scene_file import read_scene
 from lang3dxl_ns.query.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.query.splat_file import write_splats
 from lang3dxl_ns.query.teach import Example
 
-SETTINGS = AttachConfig(
-    views=6, up="z", preparation=PreparationConfig(clip="builtin", dense="builtin", dense_tokens=16)
-)
+SETTINGS = AttachConfig(views=6, up="z", clip="builtin", dense="builtin", dense_tokens=16)
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +111,7 @@ def test_a_segmented_word_is_kept_in_the_scene(place, monkeypatch):
 
 
 def test_a_segmenter_that_is_not_there_is_told_before_any_work(place, tmp_path):
-    model = replace(SETTINGS.preparation, foreground_model=str(tmp_path / "none"))
-    config = replace(SETTINGS, segment=("windows",), preparation=model)
+    config = replace(SETTINGS, segment=["windows"], foreground_model=str(tmp_path / "none"))
     with pytest.raises(UserError, match="--foreground-model"):
         attach(place / "box.ply", place / "photos", tmp_path / "a.scene", config)
     assert list(tmp_path.iterdir()) == []

@@ -3,22 +3,31 @@
 import torch
 
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.query.cache import load_tensors, save_tensors
+from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
+from lang3dxl_ns.scene.camera import Lens
 
 
 def test_a_cache_with_any_damage_counts_as_absent(tmp_path):
-    path, notes = tmp_path / "kept.safetensors", [3, 4]
-    save_tensors(path, {"rows": torch.arange(7), "pixels": torch.ones(7)}, "key", notes)
-    tensors, said = load_tensors(path, "key")
-    assert said == notes and tensors["rows"].tolist() == list(range(7))
-    assert load_tensors(path, "another") is None
+    path, camera = tmp_path / "kept.visible", Lens(4, 3, 5.0, 5.0, 2.0, 1.5).camera(torch.eye(4))
+    cameras = {"a.jpg": camera, "b.jpg": camera}
+    views = {
+        name: VisibleGaussians(camera, torch.arange(count), torch.ones(count))
+        for name, count in (("a.jpg", 3), ("b.jpg", 4))
+    }
+    save_visible(path, views, "key")
+
+    def rows(key="key"):
+        found = load_visible(path, key, cameras, "cpu")
+        return None if found is None else {name: view.rows.tolist() for name, view in found.items()}
+
+    expected = {"a.jpg": [0, 1, 2], "b.jpg": [0, 1, 2, 3]}
+    assert rows() == expected and rows("another") is None
     whole = path.read_bytes()
     for place in range(0, len(whole), 3):
         path.write_bytes(whole[:place])
-        assert load_tensors(path, "key") is None
+        assert rows() is None
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
-        found = load_tensors(path, "key")  # a flipped bit in padding changes nothing
-        assert found is None or torch.equal(found[0]["rows"], tensors["rows"])
+        assert rows() in (None, expected)  # a flipped bit in padding changes nothing
 
 
 def test_a_target_whose_settings_are_lost_or_altered_counts_as_absent(tmp_path):

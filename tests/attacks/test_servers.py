@@ -259,8 +259,8 @@ def test_any_phrase_is_answered_in_the_scenes_numbers(page):
             json.loads(answer.content),
             scene.text.plain_queries([phrase.replace('"', " ").strip()]),
         )
-        cosines = scene.engine.decoded.rows.float() @ torch.tensor(found["own"])
-        torch.testing.assert_close(cosines, scene.engine.decoded.cosines(queries)[:, -1], atol=1e-4, rtol=0)
+        cosines = scene.engine.rows.float() @ torch.tensor(found["own"])
+        torch.testing.assert_close(cosines, scene.engine.cosines(queries)[:, -1], atol=1e-4, rtol=0)
         assert found["against"] == list(queries.negative[0])
 
 

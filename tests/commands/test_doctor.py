@@ -46,7 +46,7 @@ def test_what_gsplat_needs_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(gsplat_build, "needs", lambda _: needs)
     with fake_gpu():
         found = list(doctor.devices())
-    assert [finding.remedy for finding in found if finding.remedy] == ["get ninja"]
+    assert [finding.remedy for finding in found if not finding.fine] == ["get ninja"]
     assert found[0].what == "device cuda:0"
 
 

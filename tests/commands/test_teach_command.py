@@ -11,8 +11,9 @@ from PIL import Image
 
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
-from lang3dxl_ns.query.coco import CocoLabels, mask_of, run_lengths
+from lang3dxl_ns.commands.query import CocoLabels
 from lang3dxl_ns.query.scene_file import read_scene, write_scene
+from lang3dxl_ns.query.teach import mask_of, run_lengths
 
 DOME = "61,61,77,77"
 """Box of the dome in all/0003.jpg, a little large."""

@@ -13,7 +13,6 @@ from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.engine import PerGaussian
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, gather
@@ -100,7 +99,7 @@ def _relevancy(width: int) -> Problem:
 
     def compute(given: Maps) -> Maps:
         fixed = {name: value.detach() for name, value in given.items()}
-        engine = PerGaussian(GaussianFeatures.of(field.float(), fixed["codes"].float()))
+        engine = PerGaussian.of(field.float(), fixed["codes"].float())
         asked = queries(torch.zeros(1))
         carried = engine.channels(asked).to(fixed["means"])
         return {"relevancy": engine.maps(_drawn(fixed, carried), asked)}

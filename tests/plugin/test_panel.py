@@ -18,8 +18,8 @@ from scenes import view_of, write_scene
 from lang3dxl_ns.plugin.panel import INVITATION, least_size
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 from lang3dxl_ns.query import conversation as session
-from lang3dxl_ns.query.overview import overview
 from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.run_file import overview
 from lang3dxl_ns.scene.stand import stand_of
 
 
@@ -148,7 +148,7 @@ def test_the_status_says_how_long_it_took(panel, viewer):
 
 def test_the_picture_of_the_codes_is_made_when_someone_looks(panel, viewer, monkeypatch):
     assert frame(viewer)["bottleneck"].std() < 1e-6
-    monkeypatch.setattr(panel.conversation, "_shown", lambda: {"bottleneck"})
+    monkeypatch.setattr(panel.conversation, "shown", lambda: {"bottleneck"})
     assert frame(viewer)["bottleneck"].std() > 0.01
 
 
@@ -214,7 +214,7 @@ def test_while_the_model_learns_its_words_are_gathered_when_they_are_asked_for(t
     model.step += 10
     conversation.ask("dome")
     assert len(learned) == 2
-    assert conversation._scene is not before and conversation._scene._cache is None
+    assert conversation._scene is not before and conversation._scene.cache is None
     assert model.training
     assert trainer.train_lock.acquire(blocking=False)
     trainer.train_lock.release()

@@ -5,8 +5,8 @@ import pytest
 import torch
 from painted_scene import painted_scene
 
-from lang3dxl_ns.query.answer import pictures
 from lang3dxl_ns.query.heat_maps import overlay
+from lang3dxl_ns.query.question import pictures
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ import torch.nn.functional as F
 from painted_scene import Painted, encode_texts, painted_codes, painted_scene
 
 from lang3dxl_ns.query.engine import PerGaussian, PerPixel
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
 from lang3dxl_ns.query.relevancy import SPREAD, TEMPERATURE, Queries, calibrated, spread
 from lang3dxl_ns.query.text import TextEncoder
 
@@ -78,9 +77,8 @@ def test_scenes_that_say_nothing_stay_finite(cosines):
 def test_both_engines_are_calibrated_alike():
     features = F.normalize(torch.randn(500, 16, generator=torch.Generator().manual_seed(1)), dim=1)
     words = Queries(F.normalize(torch.randn(30, 16), dim=1), (), ())
-    rows = GaussianFeatures(features, None, torch.ones(500, dtype=torch.bool))
     each, pixel = (
-        PerGaussian(rows).calibrated(words),
+        PerGaussian(features).calibrated(words),
         PerPixel(lambda codes: codes, features).calibrated(words),
     )
     assert each.temperature == pytest.approx(pixel.temperature, rel=1e-4)

@@ -10,7 +10,12 @@ from lang3dxl_ns.query.relevancy import Queries
 CHANNELS, GAUSSIANS = 16, 1_000
 
 
-def scene_of(features: torch.Tensor, words: dict[str, torch.Tensor]) -> Doubts:
+class Asked(Doubts):
+    def ask(self, *texts):
+        return self.of(self.relevancy(self.queries(texts)))
+
+
+def scene_of(features: torch.Tensor, words: dict[str, torch.Tensor]) -> Asked:
     """Doubts of a scene with these features; unrelated words point anywhere."""
     generator = torch.Generator().manual_seed(1)
     negatives = torch.randn(4, CHANNELS, generator=generator)
@@ -20,9 +25,7 @@ def scene_of(features: torch.Tensor, words: dict[str, torch.Tensor]) -> Doubts:
         return Queries.of([vectors[text][None] for text in texts], negatives)
 
     relevancy = lambda q: q.relevancy_of_cosines(q.cosines(features))  # noqa: E731
-    doubts = Doubts(relevancy, queries)
-    doubts.ask = lambda *texts: doubts.of(relevancy(queries(texts)))  # type: ignore[attr-defined]
-    return doubts
+    return Asked(relevancy, queries)
 
 
 def random(count: int, seed: int) -> torch.Tensor:
@@ -57,10 +60,9 @@ def test_the_best_gaussians_decide_whatever_their_order():
 def test_no_more_than_a_few_words_are_asked_together():
     """All of them to millions of Gaussians would take gigabytes; the answers are the same."""
     doubts, asked = scene_of(random(GAUSSIANS, 3), {}), []
-    whole = peaks(doubts._relevancy(doubts._queries(UNRELATED)))
-    relevancy = doubts._relevancy
-    doubts._relevancy = lambda queries: asked.append(len(queries.vectors)) or relevancy(queries)
-    torch.testing.assert_close(doubts.unrelated, whole, rtol=1e-5, atol=1e-6)
+    whole = peaks(doubts.relevancy(doubts.queries(UNRELATED)))
+    watched = Doubts(lambda q: asked.append(len(q.vectors)) or doubts.relevancy(q), doubts.queries)
+    torch.testing.assert_close(watched.unrelated, whole, rtol=1e-5, atol=1e-6)
     assert max(asked) <= 8 and sum(asked) >= len(UNRELATED)
 
 

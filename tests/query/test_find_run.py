@@ -5,8 +5,7 @@ import os
 import pytest
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.find_run import find_config
-from lang3dxl_ns.query.run_file import SCENE_FILE
+from lang3dxl_ns.query.run_file import SCENE_FILE, find_config
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ import torch.nn.functional as F
 
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.query.engine import make_engine
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.engine import PerGaussian, make_engine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.scene.camera import Camera
@@ -32,7 +31,7 @@ def test_the_low_rank_product_is_the_full_one(channels):
     """Narrower and wider than the hidden layer; 16 bits cost less than 1e-3."""
     field, asked = decoder(channels), queries(channels)
     codes = torch.randn(500, 3)
-    features = GaussianFeatures.of(field, codes)
+    features = PerGaussian.of(field, codes)
     assert features.rows.shape[1] <= 65
     exact = F.normalize(field.double().decode_clip(codes.double()), dim=1) @ asked.vectors.double().T
     torch.testing.assert_close(features.cosines(asked).double(), exact.detach(), atol=1e-3, rtol=0)
@@ -41,10 +40,10 @@ def test_the_low_rank_product_is_the_full_one(channels):
 def test_what_is_unknown_answers_nothing_and_changes_nothing():
     field, asked = decoder(512), queries(512)
     codes = torch.randn(20, 3)
-    alone = GaussianFeatures.of(field, codes).relevancy(asked)
+    alone = PerGaussian.of(field, codes).of_gaussians(asked)
     codes = torch.cat([codes, torch.full((2, 3), torch.nan)])
-    features = GaussianFeatures.of(field, codes)
-    found = features.relevancy(asked)
+    features = PerGaussian.of(field, codes)
+    found = features.of_gaussians(asked)
     assert features.known.tolist() == [True] * 20 + [False] * 2
     assert (found[:, -2:] == 0).all()
     torch.testing.assert_close(found[:, :-2], alone, atol=1e-3, rtol=0)
@@ -55,15 +54,15 @@ def test_features_that_all_but_vanish_say_nothing(monkeypatch):
     field = decoder(512)
     weight, bias = field.clip_head()
     monkeypatch.setattr(field, "clip_head", lambda: (weight * 1e-9, bias * 1e-9))
-    features = GaussianFeatures.of(field, torch.randn(20, 3))
-    assert features.rows.isfinite().all() and features.relevancy(queries(512)).isfinite().all()
+    features = PerGaussian.of(field, torch.randn(20, 3))
+    assert features.rows.isfinite().all() and features.of_gaussians(queries(512)).isfinite().all()
 
 
 def test_memory_for_decoding_changes_no_answer(monkeypatch):
     field, asked, codes = decoder(512), queries(512), torch.randn(300, 3)
-    whole = GaussianFeatures.of(field, codes).relevancy(asked)
-    monkeypatch.setattr("lang3dxl_ns.query.gaussian_relevancy._CHUNK_MB", 0.05)
-    parts = GaussianFeatures.of(field, codes).relevancy(asked)
+    whole = PerGaussian.of(field, codes).of_gaussians(asked)
+    monkeypatch.setattr("lang3dxl_ns.query.engine._CHUNK_MB", 0.05)
+    parts = PerGaussian.of(field, codes).of_gaussians(asked)
     torch.testing.assert_close(parts, whole, atol=1e-3, rtol=0)  # 16 bits may round otherwise
 
 

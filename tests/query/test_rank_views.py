@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lang3dxl_ns.query.rank_views import rank_views
+from lang3dxl_ns.query.places import rank_views
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.scene.camera import Camera
 
@@ -38,7 +38,7 @@ def ranks(pictures: dict[str, torch.Tensor], threshold: float = 0.5) -> list[str
         for i, (name, (_, seen, _)) in enumerate(parts.items())
     }
     found = rank_views(views, means, scores, threshold)
-    return sorted(found, key=lambda name: found[name].rank, reverse=True)
+    return [view.name for view in sorted(found, key=lambda view: view.rank, reverse=True)]
 
 
 def test_the_peak_comes_before_the_area():
@@ -66,14 +66,14 @@ def test_what_is_hidden_does_not_count():
     means, seen, scores = view(spot(16))
     shown = scores < 0.5
     hidden = VisibleGaussians(seen.camera, seen.rows[shown], seen.shares[shown])
-    found = rank_views({"seen": seen, "hidden": hidden}, means, scores, 0.5)
+    found = {v.name: v for v in rank_views({"seen": seen, "hidden": hidden}, means, scores, 0.5)}
     assert found["hidden"].area == 0 and found["seen"].rank > found["hidden"].rank
 
 
 def test_without_a_match_the_view_that_comes_closest_is_first():
     assert ranks({"far": spot(16, 0.25), "near": spot(16, 0.4)})[0] == "near"
     means, seen, scores = view(spot(16, 0.4))
-    assert rank_views({"near": seen}, means, scores, 0.5)["near"].area == 0
+    assert rank_views({"near": seen}, means, scores, 0.5)[0].area == 0
 
 
 def test_a_gaussian_that_fills_a_large_view_has_a_rank():
@@ -81,5 +81,5 @@ def test_a_gaussian_that_fills_a_large_view_has_a_rank():
     camera = Camera(torch.eye(4), torch.tensor([[300.0, 0, 150], [0, 300, 150], [0, 0, 1]]), 300, 300)
     wall = VisibleGaussians.of(camera, torch.tensor([90_000.0, 3e-3]))
     torch.testing.assert_close(wall.pixels, torch.tensor([90_000.0, 3e-3]))
-    found = rank_views({"wall": wall}, torch.tensor([[0.0, 0, 1]] * 2), torch.tensor([0.9, 0.1]), 0.5)
-    assert 0 < found["wall"].rank <= 1 and found["wall"].area == pytest.approx(1)
+    (found,) = rank_views({"wall": wall}, torch.tensor([[0.0, 0, 1]] * 2), torch.tensor([0.9, 0.1]), 0.5)
+    assert 0 < found.rank <= 1 and found.area == pytest.approx(1)

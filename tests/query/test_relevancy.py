@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
-from lang3dxl_ns.query.relevancy import Queries, relevancy, relevancy_of_codes
+from lang3dxl_ns.query.relevancy import Queries, cosines_of_codes, relevancy
 
 
 @pytest.fixture
@@ -62,8 +62,8 @@ def test_chunks_change_nothing(vectors, max_mb):
     _, queries, canonical = vectors
     expected = relevancy(field.decode_clip(codes).detach(), queries, canonical)
     prompts = Queries.of(queries[:, None].unbind(), canonical)
-    chunked = relevancy_of_codes(field.decode_clip, codes, prompts, max_mb=max_mb)
-    torch.testing.assert_close(chunked, expected)
+    cosines = cosines_of_codes(field.decode_clip, codes.flatten(0, 1), prompts, max_mb)
+    torch.testing.assert_close(prompts.relevancy_of_cosines(cosines), expected.flatten(1))
 
 
 def test_any_synonym_may_fit(vectors):

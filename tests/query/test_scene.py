@@ -22,7 +22,8 @@ from painted_scene import (
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.scene import QueryConfig, Scene
+from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering.rasterize import rasterize
 from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.scene.camera import camera_to_world

@@ -20,7 +20,7 @@ from painted_scene import (
 from PIL import Image
 
 from lang3dxl_ns.baselines.decoders import NAMES, DecoderConfig, make_decoder
-from lang3dxl_ns.commands.info import Info
+from lang3dxl_ns.commands.view import Info
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.relevancy import TEMPERATURE

@@ -75,7 +75,7 @@ def test_a_word_is_found_from_behind(scene):
     taught = scene.teach("gizmo", Example(ALL, box=box(scene, ALL, *DOME_BOX)))
     turned = torch.diag(torch.tensor([1.0, 1.0, -1.0]))  # mirrored: the cameras look at the wall's back
     mirrored = replace(scene.splats, means=scene.splats.means @ turned)
-    behind = painted_scene(splats=mirrored, words=taught.words.values())
+    behind = painted_scene(splats=mirrored, words=taught.words)
     assert np.allclose(behind.relevancy("gizmo"), taught.relevancy("gizmo"), atol=1e-5)
 
 
@@ -124,7 +124,7 @@ def test_a_taught_word_survives_its_file_and_serves_another_scene(scene, tmp_pat
     save_words(tmp_path / "w.json", list(taught.words.values()))
     (read,) = load_words(tmp_path / "w.json")
     assert np.array_equal(read.examples[0].mask, mask) and read.examples[0].not_points == ((3.0, 4.5),)
-    other = painted_scene(words=[read])
+    other = painted_scene().with_words([read])
     assert np.allclose(other.relevancy("gizmo"), taught.relevancy("gizmo"), atol=1e-6)
 
 
@@ -133,7 +133,7 @@ def test_an_outline_of_a_large_photo_survives_its_files(scene, tmp_path):
     mask = np.kron(outline(scene, ALL, DOME_BOX), np.ones((20, 20), bool))
     taught = scene.teach("gizmo", Example(ALL, mask))
     save_words(tmp_path / "w.json", list(taught.words.values()))
-    write_scene(tmp_path / "a.scene", Scene(taught.splats, taught.file, words=taught.words.values()))
+    write_scene(tmp_path / "a.scene", Scene(taught.splats, taught.file, words=taught.words))
     for (word,) in (load_words(tmp_path / "w.json"), read_scene(tmp_path / "a.scene").words.values()):
         assert word.examples[0].mask.shape == (1024, 1024)
         assert word.examples[0].mask.mean() == pytest.approx(mask.mean(), rel=0.02)

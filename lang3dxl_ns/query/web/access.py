@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from http import HTTPStatus
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "::1")
@@ -16,13 +16,6 @@ EVERYWHERE = ("", "0.0.0.0", "::")
 """Addresses at which a server is reachable under all names of this machine."""
 _TOKEN = "token"
 Response = tuple[HTTPStatus, dict[str, str], bytes]
-
-
-class Headers(Protocol):
-    """Headers of a request, from `http.server` or websockets."""
-
-    def get_all(self, name: str, /) -> Any:
-        """Return all values of this name; an empty list or None if there are none."""
 
 
 def is_local(host: str) -> bool:
@@ -59,11 +52,14 @@ class Access:
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?{_TOKEN}={self.token}" if self.needs_token else "")
 
-    def refusal(self, path: str, headers: Headers) -> Response | None:
-        """Return the response to a refused request; None for one that may proceed."""
+    def refusal(self, path: str, headers: Any) -> Response | None:
+        """Return the response to a refused request; None for one that may proceed. headers: as read by
+        `http.server` or websockets, whose `get_all` returns all values of a name."""
         try:
             host, origin = _only(headers, "Host") or "", _only(headers, "Origin")
-            if not self._is_ours(host) or (origin is not None and not self._same_site(origin, host)):
+            # With a token any name passes.
+            ours = self.needs_token or urlsplit(f"//{host}").hostname in (*LOCAL_NAMES, self.host)
+            if not ours or (origin is not None and not self._same_site(origin, host)):
                 return _refused(f"This page is not served to {origin or host}.")
             if not self.needs_token or self._knows_token(headers):
                 return None
@@ -72,31 +68,23 @@ class Access:
         except ValueError as error:
             return HTTPStatus.BAD_REQUEST, {"Content-Type": "text/plain"}, f"{error}\n".encode()
         # Remove the token from the address, which the page could pass on.
-        cookie = f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+        cookie = f"viewer-{self.port}={self.token}; Path=/; HttpOnly; SameSite=Strict"
         return HTTPStatus.SEE_OTHER, {"Set-Cookie": cookie, "Location": "/"}, b""
-
-    @property
-    def _cookie(self) -> str:
-        return f"viewer-{self.port}"
-
-    def _is_ours(self, host: str) -> bool:
-        """Return whether the host name is this server's; with a token any name passes."""
-        return self.needs_token or urlsplit(f"//{host}").hostname in (*LOCAL_NAMES, self.host)
 
     def _same_site(self, origin: str, host: str) -> bool:
         site = urlsplit(origin)
         own = site.scheme in ("http", "https") and site.netloc.lower() == host.lower()
         return own or (self.public and (site.hostname or "").endswith(".viser.studio"))
 
-    def _knows_token(self, headers: Headers) -> bool:
+    def _knows_token(self, headers: Any) -> bool:
         pairs = (pair.strip() for line in headers.get_all("Cookie") or [] for pair in line.split(";"))
-        return any(self._is_token(pair.removeprefix(f"{self._cookie}=")) for pair in pairs)
+        return any(self._is_token(pair.removeprefix(f"viewer-{self.port}=")) for pair in pairs)
 
     def _is_token(self, offered: str) -> bool:
         return secrets.compare_digest(offered.encode("utf-8", "replace"), self.token.encode())
 
 
-def _only(headers: Headers, name: str) -> str | None:
+def _only(headers: Any, name: str) -> str | None:
     """Return a header's value, if any. Raises ValueError if it is given twice."""
     values = headers.get_all(name) or []
     if len(values) > 1:

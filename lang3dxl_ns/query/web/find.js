@@ -15,7 +15,7 @@ export function readViews(about, buffer) {
   });
 }
 
-/** Rank views by how well they show a match; see rank_views.py. */
+/** Rank views by how well they show a match; see places.py. */
 export function rankViews(views, centers, relevancy, threshold) {
   const peaks = views.map((view) => peakOf(view, relevancy)), top = Math.max(...peaks);
   const low = top > threshold ? threshold : relevancy.slice().sort()[(relevancy.length - 1) >> 1];

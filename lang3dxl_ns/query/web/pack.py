@@ -5,7 +5,6 @@ Numbers are little-endian. docs/share.md lists the files.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +19,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.hash_grid import HASH_PRIMES
 from lang3dxl_ns.components.semantic_field import SemanticField
-from lang3dxl_ns.query.gaussian_relevancy import GaussianFeatures
+from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera
@@ -44,12 +43,8 @@ def pack_splats(
 
     The bytes are: red, green, blue, opacity; half-precision means; two octahedral coordinates of the
     rotation's axis; three logarithmic scales; the rotation's angle. Gaussians with a NaN or infinite value
-    become invisible, so that row numbers stay those of the scene.
-
-    Args:
-        splats: the Gaussians.
-        center: origin of the packed means, world units: half precision is finest close to it.
-        toward: viewing position for which colors are computed, world units.
+    become invisible, so that row numbers stay those of the scene. Half precision is finest close to `center`,
+    the origin of the packed means. Colors are those seen from `toward` (both in world units).
     """
     sound = splats.sound()[:, None]
     means = torch.where(sound, splats.means - center, 0.0).cpu().numpy().astype("<f2")
@@ -106,12 +101,9 @@ class PackedMeaning:
 
 
 def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
-    """Pack codes and a small field or, for wide decoders, decoded rows.
-
-    Raises:
-        UserError: the rows of a wide decoder are too large for a page.
-    """
-    decoded = GaussianFeatures.of(decoder, codes)
+    """Pack codes and a small field or, for wide decoders, decoded rows. Raises UserError if these are too
+    large for a page."""
+    decoded = PerGaussian.of(decoder, codes)
     rows = decoded.rows.cpu()
     width = rows.shape[1]
     gram = None if decoded.head is None else (decoded.head @ decoded.head.T).flatten().tolist()
@@ -133,20 +125,15 @@ def _is_small(field: SemanticField) -> bool:
     """Return whether the page can decode this field: bounded codes, one pass through the grid, small
     layers."""
     settings = field.settings
-    products = sum(layer.weight.numel() for layer in _linear_layers(field))
+    products = sum(layer.weight.numel() for layer in field.layers if isinstance(layer, torch.nn.Linear))
     return settings.bounding == "sigmoid" and not settings.indexed and products <= _MOST_PRODUCTS
 
 
-def _linear_layers(field: SemanticField) -> list[torch.nn.Linear]:
-    return [layer for layer in field.layers if isinstance(layer, torch.nn.Linear)]
-
-
 def _packed_field(field: SemanticField) -> tuple[dict[str, Any], dict[str, bytes]]:
-    grid, settings, layers = field.grid, field.settings, _linear_layers(field)
-    table = grid.table.detach()
+    grid, settings, table = field.grid, field.settings, field.grid.table.detach()
+    layers = [layer for layer in field.layers if isinstance(layer, torch.nn.Linear)]
     if field.level_weights is not None:
-        ends = [*grid.offsets.tolist()[1:], grid.entries]
-        sizes = torch.tensor([end - start for start, end in zip(grid.offsets.tolist(), ends, strict=True)])
+        sizes = torch.tensor([*grid.offsets.tolist(), grid.entries]).diff()
         table = table * field.level_weights.cpu().repeat_interleave(sizes)[:, None].to(table)
     described = {
         "dimensions": settings.code_dim,
@@ -192,9 +179,3 @@ def halves(values: Tensor) -> bytes:
 
 def _array(values: Tensor) -> Shaped[Array, "..."]:
     return values.detach().float().cpu().numpy()
-
-
-def spread(items: Sequence[Any], most: int) -> list[Any]:
-    """Choose at most this many of the items, evenly spaced."""
-    count = min(most, len(items))
-    return [items[i * len(items) // count] for i in range(count)]

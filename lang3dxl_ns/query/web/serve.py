@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socketserver import TCPServer
@@ -37,36 +37,25 @@ _HEADERS = {
 
 
 class PageServer(ThreadingHTTPServer):
-    """Server of one page from memory, until `shutdown`.
-
-    Args:
-        page: the page, with `live` set.
-        host: address to serve at.
-        port: the port; None: the first free one from 7007 on.
-
-    Raises:
-        UserError: the port is taken, or the address is not this machine's.
-    """
+    """Server of one live page from memory, until `shutdown`. Without a port, it takes the first free one from
+    7007 on. Raises UserError if the port is taken, or the address is not this machine's."""
 
     daemon_threads = True
 
     def __init__(self, page: Page, host: str = "127.0.0.1", port: int | None = None) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self.access = Access(host, 0)
-        self.page = page
-        self.files: Mapping[str, bytes] = {}
-        self._bind_first(host, [*range(FIRST_PORT, FIRST_PORT + PORTS), 0] if port is None else [port])
-        self.access.port = self.server_port
-        self.files = page.files()
-
-    def _bind_first(self, host: str, ports: Sequence[int]) -> None:
-        for port in ports:
+        self.access, self.page = Access(host, 0), page
+        for tried in [*range(FIRST_PORT, FIRST_PORT + PORTS), 0] if port is None else [port]:
             try:
-                return super().__init__((host, port), Handler)
+                super().__init__((host, tried), Handler)
+                break
             except (OSError, OverflowError) as error:
                 reason = error
-        ask = f"port {ports[0]} of {host}" if len(ports) == 1 else host
-        raise UserError(f"nothing can be served at {ask} ({reason}): choose another --port or --host")
+        else:
+            ask = host if port is None else f"port {port} of {host}"
+            raise UserError(f"nothing can be served at {ask} ({reason}): choose another --port or --host")
+        self.access.port = self.server_port
+        self.files = page.files()
 
     def server_bind(self) -> None:
         """Bind without resolving this machine's name, which may take seconds."""
@@ -78,11 +67,8 @@ class PageServer(ThreadingHTTPServer):
         place = urlsplit(path)
         values = dict(parse_qsl(place.query))
         if place.path == "/api/encode":
-            return (
-                HTTPStatus.OK,
-                _KINDS["json"],
-                json.dumps(self.page.answer(values.get("text", ""))).encode(),
-            )
+            answer = self.page.answer(values.get("text", ""))
+            return HTTPStatus.OK, _KINDS["json"], json.dumps(answer).encode()
         if place.path == "/api/look":
             return HTTPStatus.OK, _BYTES, self.page.colors(values.get("photo", ""))
         name = place.path.removeprefix("/") or "index.html"

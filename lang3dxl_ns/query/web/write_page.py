@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,11 +20,12 @@ from lang3dxl_ns.common.reports import watched
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
+from lang3dxl_ns.query.question import EVEN, SHARE
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.scene_file import Provenance
 from lang3dxl_ns.query.teach import known_word
-from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.query.threshold import EVEN, SHARE
+from lang3dxl_ns.query.text import Prompt, tidy
+from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
 from lang3dxl_ns.query.web.pack import (
     LEAST_PIXELS,
@@ -35,7 +37,6 @@ from lang3dxl_ns.query.web.pack import (
     pack_meaning,
     pack_splats,
     pack_view,
-    spread,
 )
 
 _HERE = Path(__file__).parent
@@ -43,12 +44,8 @@ _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _RULES = {
-    "best": BEST,
-    "doubtful": DOUBTFUL,
-    "least_peak": LEAST_PEAK,
-    "even": EVEN,
-    "share": SHARE,
-    "clear": CLEAR,
+    **{"best": BEST, "doubtful": DOUBTFUL, "least_peak": LEAST_PEAK},
+    **{"even": EVEN, "share": SHARE, "clear": CLEAR},
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
 _TEXTS = 256
@@ -57,36 +54,31 @@ MOST_TEXT = 2_000
 """Most characters of a phrase, of which CLIP reads about 300."""
 
 
+@dataclass
 class Page:
-    """The web page of one scene.
+    """The web page of one scene."""
 
-    Args:
-        scene: the scene.
-        texts: prompts that the page opens with, as `Scene.prompts` reads them.
-        words: words that may name a place, besides the shipped vocabulary of buildings.
-        more: further words that the page can search for.
-        provenance: title, credit and license shown on the page.
-        look: training photo whose lighting is shown; default: the overview photo.
-        live: whether a server encodes any other text (`answer`).
-    """
+    scene: Scene
+    texts: Sequence[str | Prompt] = ()
+    """Prompts that the page opens with, as `Scene.prompts` reads them."""
+    words: Sequence[str] = ()
+    """Words that may name a place, besides the shipped vocabulary of buildings."""
+    more: Sequence[str] = ()
+    """Further words that the page can search for."""
+    provenance: Provenance = field(default_factory=Provenance)
+    """Title, credit and license shown on the page."""
+    look: str | None = None
+    """Training photo whose lighting is shown; default: the overview photo."""
+    live: bool = False
+    """Whether a server encodes any other text (`answer`)."""
+    left_out: list[str] = field(default_factory=list)
+    """Sentences about what the files leave out because of its size."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        texts: Sequence[str | Prompt] = (),
-        words: Sequence[str] = (),
-        more: Sequence[str] = (),
-        provenance: Provenance | None = None,
-        look: str | None = None,
-        live: bool = False,
-    ) -> None:
-        self.scene, self.live = scene, live
-        self.prompts = scene.prompts(list(texts)) if texts else []
-        self._foreground = scene.prompts(scene.config.foreground) if scene.config.foreground else []
-        self.left_out: list[str] = []
-        """Sentences about what the files leave out because of its size."""
-        self._about = provenance or Provenance()
-        self._look, self._words, self._more = look, words, more
+    def __post_init__(self) -> None:
+        """Parse prompts, and pack what Gaussians mean. Raises UserError if that is too large for a page."""
+        scene, within = self.scene, self.scene.config.foreground
+        self.prompts = scene.prompts(list(self.texts)) if self.texts else []
+        self._foreground = scene.prompts(within) if within else []
         self._looks = list(scene.looks.names) if scene.looks else []
         self._toward = scene.overview.camera.position.to(scene.device)
         self._meaning: PackedMeaning | None = None
@@ -99,13 +91,12 @@ class Page:
         means = scene.splats.means[scene.splats.sound()]
         center = means.median(0).values if len(means) else self._toward
         files = {path.name: path.read_bytes() for path in _HERE.iterdir() if path.suffix in _KINDS}
-        files["splats.bin"] = pack_splats(scene.baked(self._look), center, self._toward).tobytes()
+        files["splats.bin"] = pack_splats(scene.baked(self.look), center, self._toward).tobytes()
         up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
+        told = self.provenance
         about: dict[str, Any] = {
-            "title": self._about.title or Path(scene.file.data).name,
-            "credit": self._about.credit,
-            "license": self._about.license,
-            "made": self._about.made_how,
+            "title": told.title or Path(scene.file.data).name,
+            **{"credit": told.credit, "license": told.license, "made": told.made_how},
             "count": len(scene.splats),
             "center": center.tolist(),
             "antialiased": scene.splats.antialiased,
@@ -158,8 +149,8 @@ class Page:
         """Encode the words that the page knows: those that may name a place first, then all others."""
         negatives, taught = list(self.scene.text.config.negatives), self.scene.words
         asked = [phrase for phrases in _phrases([*self.prompts, *self._foreground]) for phrase in phrases]
-        naming = _distinct([*shipped_vocabulary(), *self._words, *asked])
-        others = [*(word.name for word in taught.values()), *common_words(), *self._more]
+        naming = _distinct([*shipped_vocabulary(), *self.words, *asked])
+        others = [*(word.name for word in taught.values()), *common_words(), *self.more]
         words = _distinct([*naming, *others])
         numbers = [*self._encoded(meaning, negatives), *self._encoded(meaning, words)]
         count = len(negatives) + len(words)
@@ -199,13 +190,10 @@ class Page:
 
     def answer(self, phrase: str) -> dict[str, Any]:
         """Express a phrase in this scene's numbers: itself, what is searched for, and what it competes with.
-
-        Raises:
-            UserError: the phrase is empty, or the scene has colors only.
-        """
+        Raises UserError if the phrase is empty, or the scene has colors only."""
         if self._meaning is None:
             raise UserError(NO_SEMANTICS)
-        text = plain(phrase[:MOST_TEXT].encode("utf-8", "ignore").decode())
+        text = tidy(phrase[:MOST_TEXT].encode("utf-8", "ignore").decode())
         if not text:
             raise UserError("the prompt is empty: type what to look for, such as rose window")
         near, against = self._meant(self._meaning, text)
@@ -226,12 +214,7 @@ def _phrases(prompts: Sequence[Prompt]) -> list[list[str]]:
 
 def _distinct(phrases: Sequence[str]) -> list[str]:
     """Return the phrases in the form in which the page compares them, each once."""
-    return list(dict.fromkeys(filter(None, map(plain, phrases))))
-
-
-def plain(text: str) -> str:
-    """Return the form in which the page compares a phrase: without quotes and extra spaces."""
-    return " ".join(text.replace('"', " ").replace("\0", " ").split())
+    return list(dict.fromkeys(filter(None, map(tidy, phrases))))
 
 
 def write_page(page: Page, folder: Path) -> int:
