@@ -13,6 +13,7 @@ from lang3dxl_ns.components.compression import (
     CompressionConfig,
     Gathered,
     centered_cosine,
+    fit,
 )
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
@@ -63,6 +64,23 @@ def test_a_class_of_half_a_percent_survives_beside_walls_of_great_mass():
     with torch.no_grad():
         found = F.normalize(trained.decode_clip(codes[owner == 4]), dim=1) @ F.normalize(centers, dim=1).T
     assert (found.argmax(1) == 4).all()
+
+
+def test_codes_fitted_to_blends_decode_a_mixture_of_two_to_the_mixture_of_their_features():
+    """The paper composites codes before it decodes them; codes fitted one by one decode to something else."""
+    features, _ = clusters([300] * 8)
+    generator = torch.Generator().manual_seed(1)
+    a, b = (torch.randint(len(features), (4_000,), generator=generator) for _ in range(2))
+    share = torch.rand(4_000, 1, generator=generator)
+    found = []
+    for blends in (0.0, 0.9):
+        trained, sample = field(), Gathered(features, torch.ones(len(features)), None)
+        codes = fit(sample, trained, QUICK, torch.Generator().manual_seed(0), blends=blends)
+        alone = agreement(features, codes, trained).mean()
+        mixed = agreement(features[a].lerp(features[b], share), codes[a].lerp(codes[b], share), trained)
+        found.append((float(alone), float(mixed.mean())))
+    (alone, scattered), (still_alone, mixed) = found
+    assert mixed > scattered + 0.05 and still_alone > 0.9 * alone
 
 
 def test_what_no_photo_shows_stays_unknown_and_changes_nothing():
