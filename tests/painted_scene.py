@@ -88,14 +88,8 @@ class Painted(Decoder):
     def __init__(self, channels: int = CHANNELS) -> None:
         super().__init__(channels, 0)
 
-    def initial_codes(self, count, generator=None):
-        return None
-
     def forward(self, rendered):
         return rendered, None
-
-    def parameter_groups(self):
-        return {}
 
 
 def painted_codes() -> Tensor:

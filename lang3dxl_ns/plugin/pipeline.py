@@ -149,9 +149,9 @@ class Lang3DXLPipeline(VanillaPipeline):
         photos = self.datamanager.train_photos()
         try:
             with progress_bar() as bar:
-                total = len(self.datamanager.train_dataset)
+                total, steps = len(self.datamanager.train_dataset), decoder.learning_steps(self.model.num_points)
                 gathering = bar.track(photos, total=total, description="gathering features")
-                learning = bar.add_task("learning codes", total=decoder.learning_steps or None)
+                learning = bar.add_task("learning codes", total=steps or None)
                 learn_from_photos(self.model, gathering, lambda: bar.advance(learning))
         finally:
             self.model.train(training)

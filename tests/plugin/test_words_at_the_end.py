@@ -136,9 +136,9 @@ def test_words_are_the_same_from_photos_gathered_smaller(trained, scene, monkeyp
     run, found = trained[0], []
     learn = CompressedField.learn_gaussians
 
-    def noted(self, features, mass, *rest):
-        found.append((features, mass))
-        return learn(self, features, mass, *rest)
+    def noted(self, gathered, *rest):
+        found.append((gathered.features, gathered.mass))
+        return learn(self, gathered, *rest)
 
     monkeypatch.setattr(CompressedField, "learn_gaussians", noted)
     trainer = run()
