@@ -17,10 +17,9 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.timing import part
-from lang3dxl_ns.components.appearance import AppearanceField
+from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.densification import Densification
@@ -116,11 +115,6 @@ class RenderingModel(SplatfactoModel):
             shapes.means, shapes.quats, shapes.scales, shapes.opacities, harmonics, self.antialiased
         )
 
-    @property
-    def looks(self) -> Looks | None:
-        """Looks of the photos; None where the photos share one lighting."""
-        return None if self.appearance is None else Looks(self.appearance)
-
     @torch.no_grad()
     def scene(
         self,
@@ -136,13 +130,13 @@ class RenderingModel(SplatfactoModel):
         file: photos, cameras and CLIP. For the other arguments see `Scene`. While a model has no words yet,
         its scene has colors only.
         """
-        field, codes, looks = self.semantic_field, self.carried, self.looks
+        codes, looks = self.carried, self.appearance
         return Scene(
             self.splats().copied(),
             file,
-            None if codes is None else _frozen(field),
+            None if codes is None else _frozen(self.semantic_field),
             None if codes is None else codes.detach().clone(),
-            looks=None if looks is None else Looks(_frozen(looks.field)),
+            looks=None if looks is None else _frozen(looks),
             background=self._get_background_color().clone(),
             config=config,
             encode_texts=encode_texts,
@@ -183,8 +177,8 @@ class RenderingModel(SplatfactoModel):
         channels: further values to composite.
         """
         view = self._camera(camera)
-        if look is None and self.looks is not None:
-            look = self.looks.of_view(view)
+        if look is None and self.appearance is not None:
+            look = self.appearance.of_view(view)
         splats, keep = self.splats(), None
         if self.crop_box is not None:
             keep = self.crop_box.within(splats.means).squeeze(-1)

@@ -18,8 +18,8 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
@@ -75,7 +75,7 @@ class Scene(ViewedScene):
         decoder: Decoder | None = None,
         codes: Float[Tensor, "n d"] | None = None,
         *,
-        looks: Looks | None = None,
+        looks: AppearanceField | None = None,
         background: Float[Tensor, "3"] | None = None,
         config: QueryConfig | None = None,
         encode_texts: EncodeTexts | None = None,

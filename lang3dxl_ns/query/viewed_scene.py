@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import watched
-from lang3dxl_ns.components.looks import Look, Looks, render_in_look
+from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.query.cache import fingerprint
 from lang3dxl_ns.query.match import View
 from lang3dxl_ns.query.overview import overview
@@ -55,7 +55,7 @@ class ViewedScene:
         self,
         splats: Splats,
         file: SceneFile,
-        looks: Looks | None = None,
+        looks: AppearanceField | None = None,
         background: Float[Tensor, "3"] | None = None,
         config: QueryConfig | None = None,
         cache: Path | None = None,

@@ -46,7 +46,7 @@ def eval_camera(trainer):
 
 def show(model, camera, look=None) -> dict[str, torch.Tensor]:
     model.eval()
-    rendering = model.seen(camera, None if look is None else model.looks.of_photo(look))
+    rendering = model.seen(camera, None if look is None else model.appearance.of_photo(look))
     return {"rgb": rendering.rgb, "accumulation": rendering.alpha[..., None], "depth": rendering.depth}
 
 
