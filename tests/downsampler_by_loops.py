@@ -19,17 +19,6 @@ def axis_window(size, center, side):
     return weights
 
 
-def axis_footprint(size, cells, cell, side, finest):
-    """One cell of a crop grid's axis after the resize of that grid to the finest one."""
-    shift = side / 2
-    count = cells if finest else max(1, math.floor(size / shift + 1e-6))
-    weights = np.zeros(size)
-    for crop in range(count):
-        share = np.interp((cell + 0.5) / cells, (np.arange(count) + 0.5) / count, np.eye(count)[crop])
-        weights += share * axis_window(size, (crop + 0.5) * size / count, side)
-    return weights
-
-
 def dense_kernel(name, size, grid, sides):
     """[hd, wd, h, w]"""
     (h, w), (hd, wd) = size, grid
@@ -38,16 +27,11 @@ def dense_kernel(name, size, grid, sides):
             sides[0] * w * 2 ** (j / 2) for j in range(40) if 2 ** (j / 2) <= sides[-1] / sides[0] + 1e-6
         ]
         boxes = [(side, side, (2 * math.sqrt(2)) ** -j * side**2) for j, side in enumerate(squares)]
-    elif name == "footprint":
-        boxes = [(side * w, side * w, 1.0) for side in sides]
     else:
         boxes = [(h / hd, w / wd, 1.0)]
     kernel = np.zeros((hd, wd, h, w))
-    for i, k, (j, (high, wide, mass)) in itertools.product(range(hd), range(wd), enumerate(boxes)):
-        if name == "footprint":
-            y, x = axis_footprint(h, hd, i, high, j == 0), axis_footprint(w, wd, k, wide, j == 0)
-        else:
-            y, x = axis_window(h, (i + 0.5) * h / hd, high), axis_window(w, (k + 0.5) * w / wd, wide)
+    for i, k, (high, wide, mass) in itertools.product(range(hd), range(wd), boxes):
+        y, x = axis_window(h, (i + 0.5) * h / hd, high), axis_window(w, (k + 0.5) * w / wd, wide)
         kernel[i, k] += mass * np.outer(y, x)
     return torch.from_numpy(kernel / sum(mass for _, _, mass in boxes))
 

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.scene import Scene
@@ -89,14 +88,8 @@ class Painted(Decoder):
     def __init__(self, channels: int = CHANNELS) -> None:
         super().__init__(channels, 0)
 
-    def initial_codes(self, count, generator=None):
-        return None
-
     def forward(self, rendered):
         return rendered, None
-
-    def parameter_groups(self):
-        return {}
 
 
 def painted_codes() -> Tensor:
@@ -134,7 +127,7 @@ def painted_scene(cache: Path | None = None, config: QueryConfig | None = None, 
     return Scene(**{**parts, **changes})
 
 
-def painted_looks(seed: int = 0) -> Looks:
+def painted_looks(seed: int = 0) -> AppearanceField:
     """A look of its own for every training photo."""
     generator = torch.Generator().manual_seed(seed)
     names = [photo.name for photo in painted_file().photos if photo.split == "train"]
@@ -144,4 +137,4 @@ def painted_looks(seed: int = 0) -> Looks:
         for photo in painted_file().photos[:3]:
             pose = photo.camera.view_matrix
             field.remember(photo.name, -pose[:3, :3].T @ pose[:3, 3], pose[2, :3])
-    return Looks(field.eval().requires_grad_(False))
+    return field.eval().requires_grad_(False)

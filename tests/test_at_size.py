@@ -48,6 +48,7 @@ def of_large_photos(folder, clip, dense) -> None:
 
 def of_a_million_gaussians() -> None:
     from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, centered_cosine
+    from lang3dxl_ns.components.feature_decoder import Gathered
     from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
     from lang3dxl_ns.query.doubt import UNRELATED, Doubts
     from lang3dxl_ns.query.engine import make_engine
@@ -58,8 +59,8 @@ def of_a_million_gaussians() -> None:
     owner = torch.arange(count) % 40
     features = kinds[owner] + 0.1 * torch.randn(count, channels, generator=draw)
     field = CompressedField(SemanticFieldConfig("short"), channels, CompressionConfig(300, 512, sample=4_000))
-    codes = field.learn_gaussians(features, torch.ones(count))
-    assert centered_cosine(features, field, codes) > 0.95
+    codes = field.learn_gaussians(Gathered(features, torch.ones(count)))
+    assert centered_cosine(Gathered(features, torch.ones(count)), field, codes) > 0.95
     engine = make_engine(field, codes)
     queries = Queries.of(kinds[:2, None].unbind(), kinds[5:9])
     relevancy = engine.of_gaussians(queries)

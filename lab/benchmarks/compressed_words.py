@@ -25,6 +25,7 @@ from torch import Tensor
 from lab.benchmarks.dense_teacher import gathered_crops, words
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.components.compression import CompressedField
+from lang3dxl_ns.components.feature_decoder import Gathered
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.query.engine import PerGaussian, QueryEngine, make_engine
@@ -93,7 +94,7 @@ def main(config: CompressedWords) -> None:
         plain = score(unit, rows)
         del unit
         start, field = time.process_time(), CompressedField(SemanticFieldConfig("short"), features.shape[1])
-        codes = field.learn_gaussians(noisy, mass[rows])
+        codes = field.learn_gaussians(Gathered(noisy, mass[rows]))
         seconds = time.process_time() - start
         found = score(make_engine(field, codes, temperature), rows)
         if not lines:

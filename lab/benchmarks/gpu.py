@@ -28,6 +28,7 @@ from lang3dxl_ns.common.reports import (
 )
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, centered_cosine
+from lang3dxl_ns.components.feature_decoder import Gathered
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
@@ -204,11 +205,11 @@ def words(count: int, size: tuple[int, int], steps: int) -> dict[str, float]:
     field = CompressedField(SemanticFieldConfig("short"), CLIP, CompressionConfig(steps=steps)).cuda()
     torch.cuda.synchronize()
     start = time.perf_counter()
-    codes = field.learn_gaussians(features, mass, basis=basis)
+    codes = field.learn_gaussians(Gathered(features, mass, basis))
     torch.cuda.synchronize()
     seconds["compress"] = time.perf_counter() - start
     known = mass > 0
-    cosine = centered_cosine(features[known], field, codes[known.to(codes.device)], basis)
+    cosine = centered_cosine(Gathered(features, mass, basis)[known], field, codes[known.to(codes.device)])
     rows = PerGaussian.of(field, codes)
     text = torch.nn.functional.normalize(torch.randn(CLIP, 1, generator=draw), dim=0).cuda()
     ask = lambda: rows.rows.float() @ (text if rows.head is None else rows.head @ text)  # noqa: E731

@@ -251,10 +251,10 @@ def _landmark_features(path: Path) -> tuple[Tensor, Tensor]:
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     class Kept(LiftedFeatures):
-        def learn_gaussians(self, features, mass, *arguments, **others):
-            seen = mass > 0
-            write_atomically(path, save({"features": features[seen], "mass": mass[seen]}))
-            return super().learn_gaussians(features, mass, *arguments, **others)
+        def learn_gaussians(self, gathered, *arguments):
+            seen = gathered[gathered.mass > 0]
+            write_atomically(path, save({"features": seen.features, "mass": seen.mass}))
+            return super().learn_gaussians(gathered, *arguments)
 
     if not path.exists():
         data = path.parent / "landmark"
@@ -284,6 +284,7 @@ def _compression(out: Path, gaussians: int) -> list[Stage]:
     import torch.nn.functional as F
 
     from lang3dxl_ns.components.compression import CompressedField
+    from lang3dxl_ns.components.feature_decoder import Gathered
     from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
     features, mass = _landmark_features(out / "features.safetensors")
@@ -298,7 +299,7 @@ def _compression(out: Path, gaussians: int) -> list[Stage]:
     def said(_: float) -> str:
         return f"{field.learned}; of features and noise: {limit:.3f}"
 
-    work = partial(field.learn_gaussians, noisy, mass[rows])
+    work = partial(field.learn_gaussians, Gathered(noisy, mass[rows]))
     return [_measured("compress", f"{gaussians:,} Gaussians", work, said)]
 
 

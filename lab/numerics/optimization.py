@@ -74,11 +74,11 @@ def optimize(
     model = SemanticField(config, CHANNELS, generator=generator)
     kinds = torch.randn(KINDS, CHANNELS, generator=generator)
     targets = kinds[torch.randint(KINDS, (PIXELS,), generator=generator)]
-    codes = model.initial_codes(PIXELS, generator).requires_grad_()
+    codes = (0.01 * torch.randn(PIXELS, model.code_dim, generator=generator)).requires_grad_()
     groups: list[tuple[list[Tensor], float]] = [
         ([codes], code_rate),
-        ([*model.encoding_parameters()], grid_rate),
-        ([*model.decoder_parameters()], decoder_rate),
+        ([*model.parameter_groups()["field_encoding"]], grid_rate),
+        ([*model.parameter_groups()["field_decoder"]], decoder_rate),
     ]
     adam = torch.optim.Adam([{"params": p, "lr": rate} for p, rate in groups], eps=1e-15, fused=True)
     weight = torch.ones(1, BATCH)

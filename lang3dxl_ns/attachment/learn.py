@@ -66,7 +66,7 @@ def learn(
     dense = partial(targets.dense_features, names) if targets.dense_dim else None
     with progress_bar() as bar:
         photos = bar.track(collection.photos, description="gathering features")
-        learning = bar.add_task("learning codes", total=decoder.learning_steps or None)
+        learning = bar.add_task("learning codes", total=decoder.learning_steps(len(splats)) or None)
         views = _views(splats, photos, cameras, targets)
         clip, advance = partial(targets.clip_features, names), partial(bar.advance, learning)
         codes = learn_codes(decoder, views, splats.means, clip, dense, advance)

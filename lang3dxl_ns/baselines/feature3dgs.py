@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.feature_decoder import Decoder, Features
 
 
 class Feature3DGS(Decoder):
@@ -20,14 +19,10 @@ class Feature3DGS(Decoder):
         self.code_dim = max(clip_dim // 2, 1)
         self.layer = nn.Linear(self.code_dim, clip_dim + dense_dim)
 
-    def initial_codes(
-        self, count: int, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count code"]:
+    def initial_codes(self, count: int) -> Float[Tensor, "count code"]:
         return self.output_mean.new_zeros(count, self.code_dim)
 
-    def forward(
-        self, rendered: Float[Tensor, "*batch d"]
-    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
+    def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
         return self._split(self.output_mean + self.output_std * self.layer(rendered))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.feature_decoder import Decoder, Features
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
 _STRETCH = 2.0
@@ -46,18 +46,13 @@ class PlaceField(Decoder):
         self.register_buffer("center", center.detach().clone())
         self.register_buffer("radius", center.new_tensor(radius))
 
-    def initial_codes(self, count: int, generator: torch.Generator | None = None) -> None:
-        return None
-
     def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"]:
         """Decode the features at the Gaussians' positions; positions get no gradient."""
         places = _STRETCH * (gaussians["means"].detach() - self.center) / self.radius
         clip, dense = self.field(places)
         return clip if dense is None else torch.cat([clip, dense], dim=-1)
 
-    def forward(
-        self, rendered: Float[Tensor, "*batch d"]
-    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
+    def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
         return self._split(rendered)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

@@ -42,20 +42,15 @@ class LangSplat(Decoder):
         self.register_buffer("first_code", torch.tensor([0.0, 0.0, 1.0]))
         self.register_buffer("norm", torch.ones(()))
 
-    def initial_codes(self, count: int, generator: torch.Generator | None = None) -> Float[Tensor, "count 3"]:
+    def initial_codes(self, count: int) -> Float[Tensor, "count 3"]:
         """Return codes that all lie near the code of the mean target."""
-        device = generator.device if generator else None
-        noise = torch.randn(count, 3, generator=generator, device=device)
-        return self.first_code + 0.1 * noise.to(self.first_code)
+        return self.first_code + 0.1 * torch.randn(count, 3).to(self.first_code)
 
     def carried(self, gaussians: dict[str, Tensor]) -> Float[Tensor, "n 3"]:  # type: ignore[override]
         return F.normalize(gaussians["codes"], dim=-1)
 
     def forward(self, rendered: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch clip"], None]:
         return self.norm * F.normalize(self.decoder(rendered), dim=-1), None
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        return {}
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
         """Set the typical length of the CLIP targets; the dense statistics are ignored."""

@@ -1,21 +1,20 @@
-"""Training-free lifting: target features averaged onto the Gaussians by contribution."""
+"""Uncompressed features on the Gaussians: averaged from the photos (lifting), or learned from renderings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.principal_basis import PrincipalBasis
+from lang3dxl_ns.components.feature_decoder import Decoder, Features, Gathered
 
 _LEAST_COVERAGE = 1e-4
 
 
 class LiftedFeatures(Decoder):
-    """Decoder of features that are averaged onto the Gaussians after training, without compression.
+    """Decoder of features that are averaged onto the Gaussians after training, by contribution.
 
     Gaussians carry nothing in training. Afterwards they carry the lifted features and a 1, whose rendering is
     the coverage. So a map is the mean feature of the visible Gaussians, however little of a pixel they cover.
@@ -23,25 +22,24 @@ class LiftedFeatures(Decoder):
 
     needs_lifting = True
 
-    def initial_codes(self, count: int, generator: torch.Generator | None = None) -> None:
-        return None
-
-    def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"] | None:
-        return gaussians.get("codes")
-
-    def forward(
-        self, rendered: Float[Tensor, "*batch d"]
-    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
+    def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
         return self._split(rendered[..., :-1] / rendered[..., -1:].clamp_min(_LEAST_COVERAGE))
 
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        return {}
-
     def learn_gaussians(
-        self,
-        features: Float[Tensor, "n out"],
-        mass: Float[Tensor, " n"],
-        advance: Callable[[], None] = lambda: None,
-        basis: PrincipalBasis | None = None,
+        self, gathered: Gathered, advance: Callable[[], None] = lambda: None
     ) -> Float[Tensor, "n d"]:
-        return torch.cat([features, (mass > 0).to(features)[:, None]], dim=1)
+        features = gathered.features
+        return torch.cat([features, (gathered.mass > 0).to(features)[:, None]], dim=1)
+
+
+class DirectFeatures(Decoder):
+    """Decoder of whitened CLIP and dense features that Gaussians learn with the scene.
+
+    A map is mean + deviation × rendering, so training starts at the mean feature, as for the semantic field.
+    """
+
+    def initial_codes(self, count: int) -> Float[Tensor, "count code"]:
+        return self.output_mean.new_zeros(count, len(self.output_mean))
+
+    def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
+        return self._split(self.output_mean + self.output_std * rendered)

@@ -10,9 +10,8 @@ its feature, so the work beyond the sample is one search per Gaussian.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import count
 
 import torch
 import torch.nn.functional as F
@@ -21,6 +20,7 @@ from torch import Tensor, nn
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.components.code_search import nearest, settle
+from lang3dxl_ns.components.feature_decoder import Gathered
 from lang3dxl_ns.components.hash_grid import MOST_DIMENSIONS
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
@@ -61,47 +61,32 @@ class CompressionConfig:
     field_rate: float = 1e-2
     """Adam's learning rate for the field."""
 
-    def growth(self, count: int) -> int:
-        """Compute the factor of steps and sample for `count` Gaussians: √(count / sample), rounded, in 1…3.
+    def grown(self, count: int) -> CompressionConfig:
+        """Multiply steps and sample for `count` Gaussians by √(count / sample), rounded, in 1…3.
 
         A field that has seen few of many Gaussians matches those few, and the others less."""
-        return min(max(round(math.sqrt(count / self.sample)), 1), _MOST_GROWTH)
-
-    def grown(self, count: int) -> CompressionConfig:
-        """Return the settings for `count` Gaussians."""
-        factor = self.growth(count)
+        factor = min(max(round(math.sqrt(count / self.sample)), 1), _MOST_GROWTH)
         return replace(self, steps=factor * self.steps, sample=factor * self.sample)
 
 
-@dataclass(frozen=True)
-class Gathered:
-    """Features gathered onto Gaussians, all of which have mass."""
-
-    features: Float[Tensor, "n c"]
-    mass: Float[Tensor, " n"]
-    basis: PrincipalBasis | None
-    """Basis in which the features are coordinates; None if they are CLIP features themselves."""
-
-    def rows(self, rows: Int[Tensor, " m"], like: Tensor) -> Float[Tensor, "m c"]:
-        """Return the features of some Gaussians, on the device of `like`."""
-        return to_device(self.features[rows.to(self.features.device)], like.device)
-
-    def sample(self, size: int, generator: torch.Generator | None) -> Gathered:
-        """Draw `size` Gaussians by √mass, so that small things count beside walls; keep all if fewer."""
-        if len(self.mass) <= size:
-            return self
-        # The largest of log(u) / w is drawn with probability ∝ w (Efraimidis & Spirakis 2006).
-        uniform = torch.rand(len(self.mass), generator=generator, dtype=torch.float64).to(self.mass.device)
-        rows = (uniform.log() / self.mass.double().sqrt()).topk(size).indices.sort().values
-        return Gathered(self.features[rows], self.mass[rows], self.basis)
-
-
-def seen_by_photos(
-    features: Float[Tensor, "n c"], mass: Float[Tensor, " n"], basis: PrincipalBasis | None
-) -> Gathered:
+def seen_by_photos(gathered: Gathered) -> Gathered:
     """Select the Gaussians with mass, which are those that some photo shows."""
-    seen = mass > 0
-    return Gathered(features, mass, basis) if seen.all() else Gathered(features[seen], mass[seen], basis)
+    seen = gathered.mass > 0
+    return gathered if seen.all() else gathered[seen]
+
+
+def draw_sample(gathered: Gathered, size: int, generator: torch.Generator | None) -> Gathered:
+    """Draw `size` Gaussians by √mass, so that small things count beside walls; keep all if fewer."""
+    if len(gathered) <= size:
+        return gathered
+    # The largest of log(u) / w is drawn with probability ∝ w (Efraimidis & Spirakis 2006).
+    uniform = torch.rand(len(gathered), generator=generator, dtype=torch.float64).to(gathered.mass.device)
+    return gathered[(uniform.log() / gathered.mass.double().sqrt()).topk(size).indices.sort().values]
+
+
+def _rows(features: Float[Tensor, "n c"], rows: Tensor, like: Tensor) -> Float[Tensor, "m c"]:
+    """Return the features of some Gaussians, on the device of `like`."""
+    return to_device(features[rows.to(features.device)], like.device)
 
 
 def fit(
@@ -126,7 +111,7 @@ def fit(
             same blend of their features. Codes are then not searched anew, which would scatter them.
     """
     place = field.output_mean
-    if not len(sample.mass):
+    if not len(sample):
         return place.new_empty(0, field.code_dim)
     basis, weight = None if sample.basis is None else sample.basis.to(place), sample.mass.sqrt()
     if not field.dense_dim:  # otherwise it already has statistics of its CLIP and dense targets
@@ -149,14 +134,14 @@ def fit(
     with torch.enable_grad():
         for step in range(config.steps):
             if step in searches and step:
-                codes.data.copy_(_search(sample, field, codes.data, basis))
+                codes.data.copy_(_search(sample, field, codes.data))
             rows = draw()
-            wanted, used = sample.rows(rows, codes), codes[rows.to(codes.device)]
+            wanted, used = _rows(sample.features, rows, codes), codes[rows.to(codes.device)]
             if blends:
                 other, (part, mixed) = draw(), torch.rand(2, config.batch, 1, generator=generator)
                 part = (part * (mixed < blends)).to(codes)
                 used = used.lerp(codes[other.to(codes.device)], part)
-                wanted = wanted.lerp(sample.rows(other, codes), part)
+                wanted = wanted.lerp(_rows(sample.features, other, codes), part)
             if basis is not None:
                 wanted = basis.features(wanted)
             loss = (field.decode_clip(used) - wanted).abs().mean()
@@ -171,16 +156,12 @@ def fit(
 
 @torch.no_grad()
 def _search(
-    gathered: Gathered, field: SemanticField, codes: Float[Tensor, "m code"], basis: PrincipalBasis | None
+    gathered: Gathered, field: SemanticField, codes: Float[Tensor, "m code"]
 ) -> Float[Tensor, "n code"]:
     """Find the code that decodes nearest to each Gaussian's feature: the best of `codes`, then refined."""
-    head = _head(field, basis)
-    found = [
-        settle(field, head, nearest(field, head, codes, part), part)
-        for rows in torch.arange(len(gathered.mass)).split(_ROWS)
-        for part in [gathered.rows(rows, codes)]
-    ]
-    return torch.cat(found)
+    head = _head(field, gathered.basis)
+    parts = (to_device(part, codes.device) for part in gathered.features.split(_ROWS))
+    return torch.cat([settle(field, head, nearest(field, head, codes, part), part) for part in parts])
 
 
 def _head(
@@ -188,44 +169,35 @@ def _head(
 ) -> tuple[Float[Tensor, "c hidden"], Float[Tensor, " c"]]:
     """Return the field's last layer, with outputs in the coordinates of the basis."""
     weight, bias = field.clip_head()
-    return (weight, bias) if basis is None else (basis.axes.T @ weight, basis.coordinates(bias))
+    if basis is None:
+        return weight, bias
+    basis = basis.to(weight)
+    return basis.axes.T @ weight, basis.coordinates(bias)
 
 
 def assign(
-    features: Float[Tensor, "n c"],
-    mass: Float[Tensor, " n"],
-    field: SemanticField,
-    known: Float[Tensor, "m code"],
-    basis: PrincipalBasis | None = None,
+    gathered: Gathered, field: SemanticField, known: Float[Tensor, "m code"]
 ) -> Float[Tensor, "n code"]:
     """Find a code for every Gaussian with mass, starting from the codes of a sample; NaN for the others."""
-    codes = known.new_full((len(features), field.code_dim), torch.nan)
-    if not len(known):
-        return codes
-    basis = None if basis is None else basis.to(known)
-    for rows in (mass > 0).nonzero()[:, 0].split(_ROWS):
-        part = _search(Gathered(features[rows], mass[rows], basis), field, known, basis)
-        codes[rows.to(codes.device)] = part
+    codes = known.new_full((len(gathered), field.code_dim), torch.nan)
+    if len(known):
+        for rows in (gathered.mass > 0).nonzero()[:, 0].split(_ROWS):
+            codes[rows.to(codes.device)] = _search(gathered[rows], field, known)
     return codes
 
 
 @torch.no_grad()
-def centered_cosine(
-    features: Float[Tensor, "n c"],
-    field: SemanticField,
-    codes: Float[Tensor, "n code"],
-    basis: PrincipalBasis | None = None,
-) -> float:
+def centered_cosine(gathered: Gathered, field: SemanticField, codes: Float[Tensor, "n code"]) -> float:
     """Compute the mean cosine of decoded and given features, both less the mean feature.
 
     It is 1 if nothing is lost. Without centering, even the mean feature has a cosine above 0.9 with all."""
+    features = gathered.features
     if not len(features):
         return 1.0
-    basis = None if basis is None else basis.to(codes)
-    (weight, bias), mean, total = _head(field, basis), features.mean(0).to(codes), 0.0
+    (weight, bias), mean, total = _head(field, gathered.basis), features.mean(0).to(codes), 0.0
     for rows in torch.arange(len(features)).split(_ROWS):
         decoded = F.linear(field.hidden(codes[rows.to(codes.device)]), weight, bias)
-        wanted = features[rows.to(features.device)].to(codes)
+        wanted = _rows(features, rows, codes)
         total += float(F.cosine_similarity(decoded - mean, wanted - mean, dim=1).sum())
     return total / len(features)
 
@@ -275,18 +247,12 @@ class _LearningField(SemanticField):
         super().__init__(config, clip_dim, dense_dim)
         self.config, self.compression = config, compression or CompressionConfig()
 
-    @property
-    def learning_steps(self) -> int:  # type: ignore[override]
-        return self.compression.steps
+    def learning_steps(self, count: int) -> int:
+        return self.compression.grown(count).steps
 
     def learning_seconds(self, count: int) -> float:
-        draws = self.compression.grown(count).steps * self.compression.batch
+        draws = self.learning_steps(count) * self.compression.batch
         return draws * _SECONDS_PER_DRAW + count * _SECONDS_PER_GAUSSIAN
-
-    def _step(self, gaussians: int, advance: Callable[[], None]) -> Callable[[], None]:
-        """Return a callback for every step that advances a bar whose length doesn't depend on `gaussians`."""
-        steps, growth = count(1), self.compression.growth(gaussians)
-        return lambda: advance() if next(steps) % growth == 0 else None
 
 
 class CompressedField(_LearningField):
@@ -297,27 +263,19 @@ class CompressedField(_LearningField):
     per_gaussian = True
     needs_lifting = True
 
-    def initial_codes(self, count: int, generator: torch.Generator | None = None) -> None:  # type: ignore[override]
+    def initial_codes(self, count: int) -> None:  # type: ignore[override]
         return None
-
-    def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n code"] | None:
-        return gaussians.get("codes")
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         return {}
 
     def learn_gaussians(
-        self,
-        features: Float[Tensor, "n clip"],
-        mass: Float[Tensor, " n"],
-        advance: Callable[[], None] = lambda: None,
-        basis: PrincipalBasis | None = None,
+        self, gathered: Gathered, advance: Callable[[], None] = lambda: None
     ) -> Float[Tensor, "n code"]:
         """Learn codes of three numbers, or of more if three lose too much and the settings allow it."""
         generator = torch.Generator().manual_seed(0)
-        config = self.compression.grown(len(features))
-        sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
-        step = self._step(len(features), advance)
+        config = self.compression.grown(len(gathered))
+        sample = draw_sample(seen_by_photos(gathered), config.sample, generator)
         state = generator.get_state()
         dims = CODE_DIMS if self.config.code_dim is None else (self.config.code_dim,)
         lost = ""
@@ -325,16 +283,16 @@ class CompressedField(_LearningField):
             generator.set_state(state)
             fresh = SemanticField(replace(self.config, code_dim=dim), self.clip_dim, generator=generator)
             fresh = fresh.to(self.output_mean.device)
-            codes = fit(sample, fresh, config, generator, step if dim == dims[0] else _nothing)
-            found = assign(sample.features, sample.mass, fresh, codes, basis)
-            cosine = centered_cosine(sample.features, fresh, found, basis)
+            codes = fit(sample, fresh, config, generator, advance if dim == dims[0] else lambda: None)
+            found = assign(sample, fresh, codes)
+            cosine = centered_cosine(sample, fresh, found)
             if cosine >= GOOD or dim == dims[-1]:
                 break
             lost += f"; {dim} numbers: {cosine:.3f}"
         self.take(fresh)
-        codes = assign(features, mass, self, found, basis)
-        known = (mass > 0).to(codes.device)
-        cosine = centered_cosine(seen_by_photos(features, mass, basis).features, self, codes[known], basis)
+        codes = assign(gathered, self, found)
+        known = (gathered.mass > 0).to(codes.device)
+        cosine = centered_cosine(seen_by_photos(gathered), self, codes[known])
         self.learned = (
             f"features compressed to {self.code_dim} numbers per Gaussian: centered cosine {cosine:.3f}{lost}"
         )
@@ -358,19 +316,10 @@ class JointField(_LearningField):
     """Semantic field whose codes are trained with the scene, and may start from gathered features."""
 
     def learn_gaussians(
-        self,
-        features: Float[Tensor, "n clip"],
-        mass: Float[Tensor, " n"],
-        advance: Callable[[], None] = lambda: None,
-        basis: PrincipalBasis | None = None,
+        self, gathered: Gathered, advance: Callable[[], None] = lambda: None
     ) -> Float[Tensor, "n code"]:
         """Learn codes from which training continues, and train the field to decode them."""
         generator = torch.Generator().manual_seed(0)
-        config = self.compression.grown(len(features))
-        step = self._step(len(features), advance)
-        sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
-        codes = fit(sample, self, config, generator, step, _BLENDS)
-        return assign(features, mass, self, codes, basis)
-
-
-def _nothing() -> None: ...
+        config = self.compression.grown(len(gathered))
+        sample = draw_sample(seen_by_photos(gathered), config.sample, generator)
+        return assign(gathered, self, fit(sample, self, config, generator, advance, _BLENDS))

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from lang3dxl_ns.common.precision import in_full_precision
 
-KernelName = Literal["pyramid", "footprint", "box"]
+KernelName = Literal["pyramid", "box"]
 
 # exp(-2 * 30) is far above the smallest float32, so one maximum over the whole map serves every window.
 _LARGEST_BOUND_FOR_ONE_MAXIMUM = 30.0
@@ -38,10 +38,9 @@ class DownsamplerConfig:
 
     kernel: KernelName | Literal["auto"] = "auto"
     """Fixed part of the weights. pyramid: nested squares from the smallest crop to the largest, growing by
-    √2, favoring small ones (the published system's kernel). footprint: the exact crops of every scale and
-    the resize of their grids, equally weighted. box: the cell alone, as in the paper's formula; much too
-    narrow for targets that are a mean over scales. auto: box with the semantic field's preset `paper`,
-    otherwise pyramid."""
+    √2, favoring small ones (the published system's kernel). box: the cell alone, as in the paper's formula;
+    much too narrow for targets that are a mean over scales. auto: box with the semantic field's preset
+    `paper`, otherwise pyramid."""
     hidden: int | None = None
     """Width of the network that predicts the weights; 0 keeps the fixed kernel and builds no network. None:
     512, as published, with the semantic field's presets `paper` and `official`, otherwise 16, which is about
@@ -232,10 +231,7 @@ def separable_kernel(
     Raises ValueError for crop sides that are not positive and ascending."""
     if not sides or sides[0] <= 0 or list(sides) != sorted(sides):
         raise ValueError(f"crop_sides must be positive and ascending, smallest first; got {sides}")
-    if name == "footprint":
-        rows, columns = _footprint_rows(size, grid, sides, axis=0), _footprint_rows(size, grid, sides, axis=1)
-        masses = torch.full((len(sides),), 1 / len(sides), dtype=torch.float64)
-    elif name == "pyramid":
+    if name == "pyramid":
         # The published weights are (2√2)^-j per unit of area; times the area of square j, they are √2^-j.
         count = 1 + math.floor(2 * math.log2(sides[-1] / sides[0]) + 1e-6)
         squares = [sides[0] * size[1] * math.sqrt(2) ** j for j in range(count)]
@@ -257,32 +253,6 @@ def _nested_rows(size: int, cells: int, sides: Sequence[float]) -> Float[Tensor,
     """Build windows of the given sides (pixels) around the center of every cell of an axis."""
     centers = (torch.arange(cells, dtype=torch.float64) + 0.5) * (size / cells)
     return torch.stack([_window_means(size, centers, side) for side in sides])
-
-
-def _footprint_rows(
-    size: tuple[int, int], grid: tuple[int, int], sides: Sequence[float], axis: int
-) -> Float[Tensor, "j n a"]:
-    """Combine the crops of every scale along an axis with the bilinear resize of their grid to the target's.
-
-    Crops of one scale overlap by about half; their centers are the middles of equal cells.
-    """
-    length, cells = size[axis], grid[axis]
-    # A map's height is the photo's, scaled and rounded down, so the photo may be up to a pixel higher.
-    photo_length = length if axis == 1 else length + 0.5
-    rows = []
-    for index, side in enumerate(side * size[1] for side in sides):
-        shift = side / 2
-        count = cells if index == 0 else max(1, math.floor(photo_length / shift + 1e-6))
-        centers = (torch.arange(count, dtype=torch.float64) + 0.5) * (length / count)
-        rows.append(_bilinear_rows(count, cells) @ _window_means(length, centers, side))
-    return torch.stack(rows)
-
-
-def _bilinear_rows(source: int, target: int) -> Float[Tensor, "target source"]:
-    """Build the bilinear resize of an axis, with cell centers at (i + 0.5) / n (align_corners=False)."""
-    position = (torch.arange(target, dtype=torch.float64) + 0.5) * (source / target) - 0.5
-    distance = position.clamp(0, source - 1)[:, None] - torch.arange(source, dtype=torch.float64)
-    return (1 - distance.abs()).clamp(min=0)
 
 
 def _window_means(size: int, centers: Float[Tensor, " n"], side: float) -> Float[Tensor, "n a"]:

@@ -4,12 +4,33 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
+
+Features = tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]
+"""CLIP features, and dense features if there is a dense head."""
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Features gathered onto Gaussians."""
+
+    features: Float[Tensor, "n c"]
+    """CLIP features, or their coordinates in `basis`."""
+    mass: Float[Tensor, " n"]
+    """Pixels that each Gaussian fills; 0 for those that no photo shows."""
+    basis: PrincipalBasis | None = None
+
+    def __len__(self) -> int:
+        return len(self.mass)
+
+    def __getitem__(self, rows: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> Gathered:
+        return Gathered(self.features[rows], self.mass[rows], self.basis)
 
 
 class Decoder(nn.Module, ABC):
@@ -42,21 +63,17 @@ class Decoder(nn.Module, ABC):
     gathered_channels: int | None = None
     """Number of principal components to gather if CLIP features are wider; None gathers the features."""
 
-    @abstractmethod
-    def initial_codes(
-        self, count: int, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count code"] | None:
+    def initial_codes(self, count: int) -> Float[Tensor, "count code"] | None:
         """Return initial codes, one per Gaussian; None if Gaussians learn none."""
+        return None
 
     def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"] | None:
         """Return the values to render, from the Gaussians' raw parameters; None if there are none (yet)."""
-        return gaussians["codes"]
+        return gaussians.get("codes")
 
     @abstractmethod
-    def forward(
-        self, rendered: Float[Tensor, "*batch d"]
-    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
-        """Decode the CLIP and dense features of every pixel; dense is None without a dense head."""
+    def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
+        """Decode the CLIP and dense features of every pixel."""
 
     def decode_clip(self, rendered: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch clip"]:
         """Decode the CLIP features of every pixel."""
@@ -71,24 +88,14 @@ class Decoder(nn.Module, ABC):
         return None
 
     def learn_gaussians(
-        self,
-        features: Float[Tensor, "n clip"],
-        mass: Float[Tensor, " n"],
-        advance: Callable[[], None] = lambda: None,
-        basis: PrincipalBasis | None = None,
+        self, gathered: Gathered, advance: Callable[[], None] = lambda: None
     ) -> Float[Tensor, "n code"]:
-        """Learn codes for features gathered onto the Gaussians.
-
-        Args:
-            features: CLIP features, or their coordinates in `basis`.
-            mass: pixels that each Gaussian fills; 0 for those that no photo shows.
-            advance: called `learning_steps` times during the work.
-            basis: basis of the coordinates, if CLIP features are wider than `gathered_channels`.
-        """
+        """Learn codes for features gathered onto the Gaussians, and call `advance` `learning_steps` times."""
         raise NotImplementedError
 
-    learning_steps = 0
-    """Number of steps of `learn_gaussians`."""
+    def learning_steps(self, count: int) -> int:
+        """Return the number of steps of `learn_gaussians` for `count` Gaussians."""
+        return 0
 
     learned: str | None = None
     """Result of `learn_gaussians` in a sentence, for the log; None if there is nothing to report."""
@@ -103,9 +110,9 @@ class Decoder(nn.Module, ABC):
         missing = 3 - colors.shape[-1]
         return torch.cat([colors, *[colors[..., :1]] * missing], dim=-1)
 
-    @abstractmethod
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Return the parameters by optimizer group."""
+        """Return the parameters by optimizer group; none by default."""
+        return {}
 
     def own_losses(
         self, clip: Float[Tensor, "h w clip"], dense: Float[Tensor, "h w dense"] | None
@@ -135,7 +142,5 @@ class Decoder(nn.Module, ABC):
     def set_progress(self, fraction: float) -> None:
         """Set the fraction of the run done (0 to 1)."""
 
-    def _split(
-        self, features: Float[Tensor, "*batch out"]
-    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
+    def _split(self, features: Float[Tensor, "*batch out"]) -> Features:
         return features[..., : self.clip_dim], features[..., self.clip_dim :] if self.dense_dim else None

@@ -23,18 +23,13 @@ _POINTS = 1024
 
 
 class Lattices(NamedTuple):
-    """Levels of a grid, in the form that the kernels take."""
+    """Levels of a grid, in the form that the kernels take: `HashGrid`'s attributes of the same names."""
 
     cells: Int[Array, " levels"]
-    """Cells per unit, which are two fewer than vertices per axis."""
     offsets: Int[Array, " levels"]
-    """First table row of each level."""
     dense_levels: int
-    """Number of levels whose vertices have a row each; finer levels are hashed."""
-    mask: int
-    """Largest row of a hashed level."""
+    hash_mask: int
     primes: Int[Array, " d"]
-    """Factors of the hash."""
 
 
 def interpolate(
@@ -96,8 +91,8 @@ def _look_up(point, level, lattices, entries, sides):
                 entries[corner + bit] = entries[corner] + high
                 entries[corner] += low
         else:
-            low = vertex * lattices.primes[axis] & lattices.mask
-            high = (vertex + 1) * lattices.primes[axis] & lattices.mask
+            low = vertex * lattices.primes[axis] & lattices.hash_mask
+            high = (vertex + 1) * lattices.primes[axis] & lattices.hash_mask
             for corner in range(bit):
                 entries[corner + bit] = entries[corner] ^ high
                 entries[corner] ^= low

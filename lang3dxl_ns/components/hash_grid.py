@@ -35,9 +35,6 @@ class HashGrid(nn.Module):
     gives finite features, and has a gradient up to ± 1024, where it is clamped. A NaN coordinate makes only
     its own output row NaN.
 
-    Keep `max_resolution` as low as the task allows: Adam with a vanishing epsilon moves every touched entry
-    equally far, so fine levels, which few samples constrain, grow as large as coarse ones.
-
     Args:
         input_dim: number of dimensions d, 2 to 6.
         levels: number of resolutions, in geometric progression from `min_resolution` to `max_resolution`;
@@ -73,17 +70,19 @@ class HashGrid(nn.Module):
         self.input_dim, self.levels, self.features_per_level = input_dim, levels, features_per_level
         self.output_dim = levels * features_per_level
 
-        resolutions = _resolutions(levels, min_resolution, max_resolution)
+        growth = (max_resolution / min_resolution) ** (1 / max(levels - 1, 1))
+        # Without rounding first, rounding error could make the finest level one vertex wider.
+        resolutions = [math.ceil(round(min_resolution * growth**level, 6)) for level in range(levels)]
         capacity = 2**log2_table_size
-        sizes = [min(_round_up(r**input_dim, 8), capacity) for r in resolutions]
+        sizes = [min(-(-(r**input_dim) // 8) * 8, capacity) for r in resolutions]  # multiples of 8
         self.entries = sum(sizes)
         self.dense_levels = sum(r**input_dim <= capacity for r in resolutions)
         self.hash_mask = capacity - 1
 
         table = torch.empty(self.entries, features_per_level)
         self.table = nn.Parameter(table.uniform_(-INITIAL_RANGE, INITIAL_RANGE, generator=generator))
-        self.cells: Tensor
-        self.offsets: Tensor
+        self.cells: Tensor  # per unit, two fewer than vertices per axis
+        self.offsets: Tensor  # the first table row of each level
         self.dense_resolutions: Tensor
         offsets = [sum(sizes[:level]) for level in range(levels)]
         # They are integers, so that `.half()` and the like don't round them.
@@ -149,16 +148,6 @@ class HashGrid(nn.Module):
             hashed_entry = (hashed_entry[:, None] ^ keys[axis]).flatten(0, 1)
         # 32 bits suffice for a row number, and halve the time of sorting in the backward pass.
         return (torch.cat((dense_entry, hashed_entry), 1) + self.offsets[:, None]).int()
-
-
-def _resolutions(levels: int, lowest: int, highest: int) -> list[int]:
-    growth = (highest / lowest) ** (1 / max(levels - 1, 1))
-    # Without rounding first, rounding error could make the finest level highest + 1.
-    return [math.ceil(round(lowest * growth**level, 6)) for level in range(levels)]
-
-
-def _round_up(value: int, multiple: int) -> int:
-    return -(-value // multiple) * multiple
 
 
 class _Interpolate(torch.autograd.Function):

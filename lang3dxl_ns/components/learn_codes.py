@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.feature_decoder import Decoder, Gathered
 from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
@@ -74,7 +74,7 @@ def learn_codes(
     if fine_basis is not None:
         features = sharpen(features[:, :width], features[:, width:], mass)
     # Many features are kept on the CPU, so codes that are features themselves come from there.
-    return decoder.learn_gaussians(features, mass, advance, basis).to(means.device)
+    return decoder.learn_gaussians(Gathered(features, mass, basis), advance).to(means.device)
 
 
 def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:

@@ -24,11 +24,7 @@ def linear(
     """
     # torch's `skip_init` would take a third of a second to import at its first use.
     with torch.random.fork_rng(devices=[]):
-        layer = nn.Linear(1, 1, bias=bias)
-    layer.in_features, layer.out_features = inputs, outputs
-    layer.weight = nn.Parameter(torch.empty(outputs, inputs))
-    if bias:
-        layer.bias = nn.Parameter(torch.empty(outputs))
+        layer = nn.Linear(inputs, outputs, bias=bias)
     reach = (fan_in or inputs) ** -0.5
     for parameter in layer.parameters():
         nn.init.uniform_(parameter, -reach, reach, generator=generator)

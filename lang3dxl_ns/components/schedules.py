@@ -1,4 +1,4 @@
-"""Learning-rate and loss-weight schedules: pure functions of the step or of x, the run's fraction in [0, 1].
+"""Learning-rate and loss-weight schedules: pure functions of x, the run's fraction in [0, 1].
 
 Outside its range a schedule keeps its nearest end value. All return Python floats, because a NumPy scalar
 would end up in optimizer state and checkpoints, where a safe loader rejects it.
@@ -15,14 +15,9 @@ def log_linear(x: float, start: float, end: float) -> float:
     return math.exp((1 - x) * math.log(start) + x * math.log(end))
 
 
-def exponential_ramp(step: float, start: float, end: float, steps: float) -> float:
-    """Go from start to end (both positive) over the first `steps` steps, by a constant factor per step."""
-    return log_linear(step / steps if steps > 0 else 1.0, start, end)
-
-
 def semantic_ramp(x: float, share: float) -> float:
     """Raise the weight of the semantic losses from 0.1 to 1 over the run's first `share`: geometry leads."""
-    return exponential_ramp(x, 0.1, 1.0, share)
+    return log_linear(x / share if share > 0 else 1.0, 0.1, 1.0)
 
 
 def cosine_decay(x: float, peak: float, end: float, power: float = 1.0) -> float:

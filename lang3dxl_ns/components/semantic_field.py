@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.feature_decoder import Decoder, Features
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, MOST_DIMENSIONS, HashGrid
 from lang3dxl_ns.components.linear import linear
 
@@ -184,13 +184,9 @@ class SemanticField(Decoder):
     def bounded(self) -> bool:  # type: ignore[override]
         return self.settings.bounding == "sigmoid"
 
-    def initial_codes(
-        self, count: int, generator: torch.Generator | None = None
-    ) -> Float[Tensor, "count code"]:
-        """Sample initial codes, one per Gaussian, on the generator's device."""
-        device = generator.device if generator else None
-        noise = torch.randn(count, self.code_dim, generator=generator, device=device)
-        return (self.settings.code_std * noise).to(self.output_mean)
+    def initial_codes(self, count: int) -> Float[Tensor, "count code"]:
+        """Sample initial codes, one per Gaussian."""
+        return (self.settings.code_std * torch.randn(count, self.code_dim)).to(self.output_mean)
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
         """Set the targets' statistics (see `Decoder.set_output_statistics`), which need `whiten`."""
@@ -202,10 +198,8 @@ class SemanticField(Decoder):
         if self.level_weights is not None:
             self.level_weights.copy_(self.grid.coarse_to_fine(fraction / self.settings.coarse_to_fine))
 
-    def forward(
-        self, codes: Float[Tensor, "*batch code"]
-    ) -> tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]:
-        """Decode the CLIP and dense features of every code; dense is None without a dense head."""
+    def forward(self, codes: Float[Tensor, "*batch code"]) -> Features:
+        """Decode the CLIP and dense features of every code."""
         hidden = self.hidden(codes)
         clip = F.linear(hidden, *self._head(slice(0, self.clip_dim)))
         dense = F.linear(hidden, *self._head(slice(self.clip_dim, None))) if self.dense_dim else None
@@ -220,15 +214,10 @@ class SemanticField(Decoder):
         return self._head(slice(0, self.clip_dim))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        return {"field_encoding": self.encoding_parameters(), "field_decoder": self.decoder_parameters()}
-
-    def encoding_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters of the hash grid, an optimizer group without weight decay."""
-        return list(self.grid.parameters())
-
-    def decoder_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters of the MLP, a group with weight decay so that CLIP and dense share edges."""
-        return [*self.layers.parameters(), *self.output.parameters()]
+        """Return the parameters of the hash grid, and those of the MLP, whose weights decay so that CLIP and
+        dense features share edges."""
+        network = [*self.layers.parameters(), *self.output.parameters()]
+        return {"field_encoding": list(self.grid.parameters()), "field_decoder": network}
 
     def hidden(self, codes: Float[Tensor, "*batch code"]) -> Float[Tensor, "*batch hidden"]:
         """Compute the activations of the last hidden layer."""

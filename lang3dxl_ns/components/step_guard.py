@@ -49,11 +49,7 @@ class StepGuard:
         if bool(sound.all()):
             self._in_a_row = 0
             return True
-        broken = [name for name, good in zip(named, sound.tolist(), strict=True) if not good]
-        self._skip(step, photo, ", ".join(broken))
-        return False
-
-    def _skip(self, step: int, photo: str, what: str) -> None:
+        what = ", ".join(name for name, good in zip(named, sound.tolist(), strict=True) if not good)
         self.skipped += 1
         self._in_a_row += 1
         self._seen[photo, what] += 1
@@ -66,6 +62,7 @@ class StepGuard:
                 f"named above, their masks and targets, lower the learning rate of the parameters named "
                 f"here, or allow more with --max-skipped-steps"
             )
+        return False
 
     def summary(self) -> str | None:
         """Summarize the skipped steps in one sentence; None if there were none."""

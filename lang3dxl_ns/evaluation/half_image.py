@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lang3dxl_ns.common.reports import synchronize
-from lang3dxl_ns.components.appearance import AppearanceField
-from lang3dxl_ns.components.looks import Look, Looks, render_in_look
+from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.rendering.rasterize import Backend, rasterize
 from lang3dxl_ns.rendering.splats import Splats
@@ -87,7 +86,7 @@ class HalfImageProtocol:
         The loss is the color loss of training, on the mask's foreground. 0 steps return the initial
         vector."""
         camera = camera.to(self.splats.means.device)
-        vector = Looks(self.field).of_view(camera).vector.clone().requires_grad_()
+        vector = self.field.of_view(camera).vector.clone().requires_grad_()
         view = Camera(camera.view_matrix, camera.intrinsics, left.shape[1], left.shape[0])
         splats = self.splats.select(in_view(view, self.splats.means, self.splats.scales))
         gaussians, colors = splats.gaussians, splats.colors(view.position)

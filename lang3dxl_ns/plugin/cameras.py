@@ -15,33 +15,20 @@ from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4"]) -> Cameras:
     """Build pinhole cameras (photos are undistorted on reading) at nerfstudio's poses."""
 
-    def column(name: str) -> Tensor:
-        return torch.tensor([getattr(lens, name) for lens in lenses])
+    def column(name: str, kind: type) -> Tensor:
+        return torch.tensor([kind(getattr(lens, name)) for lens in lenses])
 
-    return Cameras(
-        camera_to_worlds=camera_to_worlds,
-        fx=column("fx").float(),
-        fy=column("fy").float(),
-        cx=column("cx").float(),
-        cy=column("cy").float(),
-        width=column("width"),
-        height=column("height"),
-    )
+    fx, fy, cx, cy = (column(name, float) for name in ("fx", "fy", "cx", "cy"))
+    return Cameras(camera_to_worlds, fx, fy, cx, cy, column("width", int), column("height", int))
 
 
 def lens_of(cameras: Cameras, index: int) -> Lens:
     """Return the lens of a nerfstudio perspective camera."""
     parameters = cameras.distortion_params
     k1, k2, k3, _, p1, p2 = [0.0] * 6 if parameters is None else parameters[index].tolist()
-    return Lens(
-        width=int(cameras.width[index]),
-        height=int(cameras.height[index]),
-        fx=float(cameras.fx[index]),
-        fy=float(cameras.fy[index]),
-        cx=float(cameras.cx[index]),
-        cy=float(cameras.cy[index]),
-        distortion=(k1, k2, p1, p2, k3) if any((k1, k2, k3, p1, p2)) else (),
-    )
+    fx, fy, cx, cy = (float(values[index]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
+    distortion = (k1, k2, p1, p2, k3) if any((k1, k2, k3, p1, p2)) else ()
+    return Lens(int(cameras.width[index]), int(cameras.height[index]), fx, fy, cx, cy, distortion)
 
 
 def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:

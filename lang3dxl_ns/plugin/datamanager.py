@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -35,8 +34,7 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for, recorded_scene
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
-from lang3dxl_ns.plugin.novel_views import novel_outputs, novel_pixel_sizes
-from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
+from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset, novel_outputs, novel_pixel_sizes
 from lang3dxl_ns.preparation.collection import CropPlan, plan_crops, prepare_collection
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
@@ -51,7 +49,6 @@ from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.scene.camera import scaled_size
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.novel_views import NovelViews, read_novel_views
 from lang3dxl_ns.scene.photo import Photo
@@ -108,8 +105,6 @@ class PhotosGoneError(UserError):
     """Raised when too many photos have vanished during training to continue."""
 
 
-_WORTH_TELLING = 1e8
-"""Bytes of photos and targets above which their memory is logged."""
 MOST_GONE = 0.1
 """Share of the training photos that may vanish before training ends."""
 
@@ -196,8 +191,6 @@ class Lang3DXLDataManager(FullImageDatamanager):
             facts.clip_targets = partial(self.targets.clip_features, names)
             if self.targets.dense_dim:
                 facts.dense_targets = partial(self.targets.dense_features, names)
-        if budget := self._memory_budget():
-            _log(budget)
 
     @cached_property
     def targets(self) -> TargetReader | None:
@@ -209,31 +202,20 @@ class Lang3DXLDataManager(FullImageDatamanager):
         # Held-out photos have the whole pyramid, which serves as the 2-D teacher.
         fine = [p.name for p in self.train_dataset.photos] if self.config.crops == "fine" else []
         return prepare_collection(
-            photos,
-            self._reconstruction(),
-            self.config,
-            self.cache_dir,
-            self.device,
-            log=_log,
-            regions=self._region_source,
-            fine=fine,
-        ).reader
+            photos, self._reconstruction(), self.config, self.cache_dir, self.device,
+            log=_log, regions=self._region_source, fine=fine,
+        ).reader  # fmt: skip
 
     def clean_store(self) -> tuple[int, int]:
         """Delete targets that this configuration and the scene's photos don't use; count files and bytes."""
-        c = self.config
-        used = {
-            CLIP: c.clip != "none",
-            FINE: c.clip != "none",
-            DENSE: c.dense != "none",
-            FOREGROUND: c.foreground == "text",
-            PHOTOS: True,
-            PHOTO_MASKS: True,
-        }
-        used[REGIONS] = self._region_source is not None
+        c, used = self.config, [PHOTOS, PHOTO_MASKS]
+        used += [CLIP, FINE] if c.clip != "none" else []
+        used += [DENSE] if c.dense != "none" else []
+        used += [FOREGROUND] if c.foreground == "text" else []
+        used += [REGIONS] if self._region_source is not None else []
         names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
         names += [] if self.test_views is None else [view.name for view in self.test_views.cameras]
-        return FeatureStore(self.cache_dir).clean([kind for kind, wanted in used.items() if wanted], names)
+        return FeatureStore(self.cache_dir).clean(used, names)
 
     @cached_property
     def test_views(self) -> NovelViews | None:
@@ -354,28 +336,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def _train_cache(self) -> PhotoCache:
         _ = self.targets  # prepare the targets now, not in the cache's thread
         read = partial(self._read, self.train_dataset, with_targets=self.config.targets_in_steps)
-        return PhotoCache(read, self.cache_bytes)
-
-    @property
-    def cache_bytes(self) -> float:
-        """Memory for photos and targets in bytes."""
         gigabytes = self.config.cache_gb
-        return machine_memory() / 4 if gigabytes is None else gigabytes * 1e9
-
-    def _memory_budget(self) -> str:
-        """Describe the memory for photos in training, estimated from the first one's targets; "" if low."""
-        photos, scale = self.train_dataset.photos, self.config.camera_res_scale_factor
-        total = 3.0 * sum(math.prod(scaled_size(p.width, p.height, scale)) for p in photos)
-        if self.targets is not None and self.config.targets_in_steps:
-            total += len(photos) * self.targets.bytes_of(self.targets.names[0])
-        held = min(total, self.cache_bytes)
-        if total < _WORTH_TELLING:
-            return ""
-        return (
-            f"memory: at most {held / 1e9:.2f} GB of photos and targets at a time (of "
-            f"{total / 1e9:.2f} GB in {len(photos)} photos), {self.config.read_ahead} photos read ahead "
-            "(--pipeline.datamanager.cache-gb sets the limit)"
-        )
+        return PhotoCache(read, machine_memory() / 4 if gigabytes is None else gigabytes * 1e9)
 
     def sample_train_cameras(self) -> list[int]:
         """Start a new round of all usable training photos."""
@@ -455,7 +417,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @property
     def fixed_indices_eval_dataloader(self) -> EvalPhotos:  # type: ignore[override]
-        """All held-out photos, which are read one at a time."""
+        """All held-out photos, which are read one at a time. nerfstudio gets this when its viewer starts,
+        which must not prepare anything yet."""
         return self.evaluated()
 
     def evaluated(

@@ -112,7 +112,8 @@ class PhotoCollectionDataParser(ColmapDataParser):
 
     def _get_image_indices(self, image_filenames, split):
         if self.config.held_out is not None:
-            held_out = self._held_out([self._name(path) for path in image_filenames])
+            folder = self._images_folder
+            held_out = self._held_out([Path(p).relative_to(folder).as_posix() for p in image_filenames])
             everything = np.arange(len(image_filenames))
             wanted = np.isin(everything, held_out, invert=split == "train")
             indices = everything[wanted]
@@ -184,27 +185,15 @@ class PhotoCollectionDataParser(ColmapDataParser):
         world_from_camera[:3, 1:3] *= -1  # OpenCV axes to OpenGL's
         world_from_camera = world_from_camera[[0, 2, 1, 3]]  # COLMAP assumes gravity along -y; here z is up
         world_from_camera[2] *= -1
-        return {
-            "file_path": self._image_path(tracked.name).as_posix(),
-            "transform_matrix": world_from_camera,
-            "camera_model": "PINHOLE",
-            "fl_x": tracked.lens.fx,
-            "fl_y": tracked.lens.fy,
-            "cx": tracked.lens.cx,
-            "cy": tracked.lens.cy,
-            "w": tracked.width,
-            "h": tracked.height,
-        }
-
-    def _image_path(self, name: str) -> Path:
-        return self._images_folder / name
+        path, lens = (self._images_folder / tracked.name).as_posix(), tracked.lens
+        intrinsics = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+        size = {"w": tracked.width, "h": tracked.height}
+        place = {"file_path": path, "transform_matrix": world_from_camera, "camera_model": "PINHOLE"}
+        return place | intrinsics | size
 
     @property
     def _images_folder(self) -> Path:
         return self.config.data / self.config.images_path
-
-    def _name(self, path: Path) -> str:
-        return Path(path).relative_to(self.config.data / self.config.images_path).as_posix()
 
     def _read_collection(self) -> None:
         """Read the model's usable photos, and log which are left out, and why."""

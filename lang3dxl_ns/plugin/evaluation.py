@@ -88,7 +88,6 @@ class Evaluation:
 
     @cached_property
     def _test_scorer(self) -> LanguageScorer | None:
-        """Scorer of words in the test views; None without test views or semantics."""
         views = self._data.test_views
         if views is None or self._model.semantic_field is None:
             return None
@@ -132,13 +131,12 @@ class Evaluation:
             score = partial(self._score_words, scorer, self._label_limit(scorer, photos))
         views = self._data.test_views if split == "test" else None
         hidden = () if views is None or views.same_light else _COLORS_OF_LIGHT
-        warm = False
         with progress_bar() as bar:
-            for camera, batch in bar.track(photos, total=len(photos), description="evaluating"):
+            shown = bar.track(photos, total=len(photos), description="evaluating")
+            for number, (camera, batch) in enumerate(shown):
                 photo = photos.dataset.photos[batch["image_idx"]]
-                if not warm:  # warm-up, excluded from timing
+                if number == 0:  # warm-up, excluded from timing
                     self._evaluate_photo(camera, batch, photo, score)
-                    warm = True
                 evaluated = self._evaluate_photo(camera, batch, photo, score)
                 for name in hidden:
                     evaluated.metrics.pop(name, None)
@@ -253,7 +251,8 @@ class Evaluation:
         same for the scene's `test_views`.
         """
         results = self._averages(self._settings.evaluated_photos, output_path, get_std)
-        results["peak_memory_mb"] = _peak_memory(self._model.device) / 2**20
+        on_gpu = torch.device(self._model.device).type == "cuda"
+        results["peak_memory_mb"] = (torch.cuda.max_memory_allocated() if on_gpu else host_peak()) / 2**20
         beside = self._settings.evaluated_photos == "held-out" and self._data.test_views is not None
         if get_std and beside:
             results["test_views"] = self._averages("test", output_path, get_std)
@@ -273,9 +272,9 @@ class Evaluation:
         return results
 
     def _protocol(self, split: Split, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
-        scorer = self._scorer_of(split)
+        scorer, masked = self._scorer_of(split), sum(photo.masked for photo in evaluated)
         trained = {photo.name for photo in self._data.train_dataset.photos}
-        seen, masked = (sum(p.name in trained for p in evaluated), sum(p.masked for p in evaluated))
+        seen = sum(photo.name in trained for photo in evaluated)
         photos: dict[str, Any] = {
             "split": split,
             "evaluated_photos": len(evaluated),
@@ -283,9 +282,9 @@ class Evaluation:
         }
         if self._fits_looks(split):
             photos["colors"] = PROTOCOL
-        mask = f"predictions are 0 outside the foreground masks of {masked} of {len(evaluated)} photos"
         if scorer is None:
             return photos
+        mask = f"predictions are 0 outside the foreground masks of {masked} of {len(evaluated)} photos"
         words = scorer.protocol(mask if masked else "none")
         if words["prompts_without_photos"]:
             CONSOLE.log(
@@ -293,7 +292,3 @@ class Evaluation:
                 f"evaluate run --split seen` scores the labeled training photos"
             )
         return photos | words
-
-
-def _peak_memory(device: torch.device | str) -> int:
-    return torch.cuda.max_memory_allocated() if torch.device(device).type == "cuda" else host_peak()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import MISSING, fields
 from typing import Any
 
 from lang3dxl_ns.common.errors import UserError
@@ -13,7 +11,7 @@ OF_SPLATFACTO = (
     *("warmup_length", "refine_every", "reset_alpha_every", "stop_split_at", "n_split_samples"),
     *("cull_scale_thresh", "cull_screen_size", "split_screen_size", "stop_screen_size_at"),
     *("use_scale_regularization", "max_gauss_ratio", "use_bilateral_grid", "grid_shape"),
-    *("color_corrected_metrics", "resolution_schedule"),
+    *("color_corrected_metrics", "resolution_schedule", "num_downscales", "output_depth_during_training"),
 )
 """Settings of splatfacto's own schedule and parts, which this model does not have."""
 OF_IMAGE_CACHES = (
@@ -39,32 +37,25 @@ def check_inert(model: Any, data: Any) -> None:
     model, data: settings of the model and of the data manager.
     """
     changed = [
-        *(f"--pipeline.model.{name}" for name in _changed(model, OF_SPLATFACTO)),
-        *(f"--pipeline.datamanager.{name}" for name in _changed(data, OF_IMAGE_CACHES)),
+        *_changed(model, OF_SPLATFACTO, "--pipeline.model."),
+        *_changed(data, OF_IMAGE_CACHES, "--pipeline.datamanager."),
     ]
     if changed:
-        raise UserError(
-            f"{_option(changed[0])} has no effect here: no method of this package reads it; leave it off"
-        )
+        raise UserError(f"{changed[0]} has no effect here: no method of this package reads it; leave it off")
     if model.decoder.learns_from_renderings:
         return
-    changed = [f"--pipeline.model.{name}" for name in _changed(model, _OF_RENDERINGS)]
+    changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")
     if data.regions not in ("auto", "none"):
         changed.append("--pipeline.datamanager.regions")
     if changed:
         raise UserError(
-            f"{_option(changed[0])} has no effect where semantics are learned after training, as with "
+            f"{changed[0]} has no effect where semantics are learned after training, as with "
             f"--pipeline.model.decoder.name {model.decoder.name}: leave it off, or train with "
             "ns-train lang3dxl-paper"
         )
 
 
-def _changed(settings: Any, names: tuple[str, ...]) -> Iterator[str]:
-    for field in fields(settings):
-        default = field.default if field.default_factory is MISSING else field.default_factory()
-        if field.name in names and getattr(settings, field.name) != default:
-            yield field.name
-
-
-def _option(name: str) -> str:
-    return name.replace("_", "-")
+def _changed(settings: Any, names: tuple[str, ...], prefix: str) -> list[str]:
+    default = type(settings)()
+    changed = [name for name in names if getattr(settings, name) != getattr(default, name)]
+    return [prefix + name.replace("_", "-") for name in changed]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,6 @@ def _load_model(config: Any, checkpoints: Path, file: SceneFile, device: torch.d
     return model.to(device).eval()
 
 
-def model_state(state: dict[str, Any]) -> dict[str, Any]:
+def model_state(state: Mapping[str, Any]) -> dict[str, Any]:
     """Select the model's part of a pipeline's parameters."""
     return {k.removeprefix("_model."): v for k, v in state.items() if k.startswith("_model.")}

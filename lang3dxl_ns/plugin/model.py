@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from math import isqrt
 from typing import Any
 
@@ -24,9 +26,10 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.components.bounds import EVERY, FREE, keep_in_bounds
 from lang3dxl_ns.components.initialization import color_parameters, initial_gaussians, seed_positions
+from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
-from lang3dxl_ns.plugin.optional_components import COMPONENTS
+from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.handover import Batch
@@ -34,6 +37,9 @@ from lang3dxl_ns.scene.geometry import center_and_radius
 
 DECODE_SIZES = 5
 """Number of sizes at which code maps are decoded in training."""
+LONGER_SIDE = 1_600
+"""Longer side in pixels to which larger photos are reduced for gathering: a CLIP crop covers hundreds of
+pixels, and time and memory grow with their number."""
 
 
 @dataclass
@@ -60,11 +66,7 @@ class Lang3DXLModel(RenderingModel):
         self.strategy = make_strategy(self.config)
         self.strategy.cameras, self.strategy.free = self.facts.positions, FREE * self.extent[1]
         self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
-        for component in COMPONENTS:
-            if component.wanted(self.config, self.facts):
-                component.build(self)
-            else:
-                component.leave_out(self)
+        build_components(self)
         self.step = 0
         self.step_is_sound = True
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
@@ -99,20 +101,46 @@ class Lang3DXLModel(RenderingModel):
                 colors = color_parameters(self.sky.colors, self.config.sh_degree)
                 self.gauss_params["features_dc"][: len(self.sky)] = colors
 
+    def learn_from_photos(
+        self, photos: Iterable[tuple[Cameras, Batch]], advance: Callable[[], None] = lambda: None
+    ) -> None:
+        """Give the Gaussians codes that represent the photos' targets; see `learn_codes`.
+
+        Args:
+            photos: cameras and batches, with targets.
+            advance: called `learning_steps` times as the decoder learns.
+        """
+        decoder, facts = self.semantic_field, self.facts
+        assert decoder is not None and facts.clip_targets is not None
+        views, means = (self._target_view(*photo) for photo in photos), self.means.detach()
+        codes = learn_codes(decoder, views, means, facts.clip_targets, facts.dense_targets, advance)
+        if self.learns_from_renderings:
+            self.gauss_params["codes"].data.copy_(codes.nan_to_num(0.0))
+        else:
+            self.gauss_params["codes"] = Parameter(codes.to(self.device), requires_grad=False)
+
+    def _target_view(self, camera: Cameras, batch: Batch) -> TargetView:
+        longer = int(torch.maximum(camera.width, camera.height).max())
+        if longer > LONGER_SIDE:
+            camera = deepcopy(camera)
+            camera.rescale_output_resolution(LONGER_SIDE / longer)
+        return TargetView(
+            partial(self.composite, camera),
+            (int(camera.height.item()), int(camera.width.item())),
+            batch["clip_target"],
+            batch.get("dense_target"),
+            batch["mask"][..., 0] if "mask" in batch else None,
+        )
+
     def forget_gathered_codes(self) -> None:
         """Remove codes that were gathered for a question in training, since the Gaussians still change."""
         if not self.learns_from_renderings and "codes" in self.gauss_params:
             del self.gauss_params["codes"]
 
-    def get_gaussian_param_groups(self) -> dict[str, list[Parameter]]:
-        names = [n for n in self.gauss_params if n != "codes" or self.learns_from_renderings]
-        return {name: [self.gauss_params[name]] for name in names}
-
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Return the optimizer groups: one per Gaussian property, and those of the components present."""
-        groups = self.get_gaussian_param_groups()
-        for component in COMPONENTS:
-            groups |= component.parameters(self)
+        names = [n for n in self.gauss_params if n != "codes" or self.learns_from_renderings]
+        groups = {name: [self.gauss_params[name]] for name in names} | component_parameters(self)
         return {name: parameters for name, parameters in groups.items() if parameters}
 
     # ── losses and metrics ──────────────────────────────────────────────────────────────────────────
@@ -121,7 +149,7 @@ class Lang3DXLModel(RenderingModel):
         self, outputs: dict, batch: Batch, metrics_dict: dict | None = None
     ) -> dict[str, Tensor]:
         """Compute the color loss and, if there are semantics, the semantic losses, all already weighted."""
-        mask = self._downscale_if_required(batch["mask"])[..., 0] if "mask" in batch else None
+        mask = batch["mask"][..., 0] if "mask" in batch else None
         with part("losses"):
             target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
             loss = {"rgb": losses.rgb_loss(outputs["rgb"], target, mask, self.config.ssim_lambda)}
@@ -139,12 +167,15 @@ class Lang3DXLModel(RenderingModel):
         ramp = schedules.semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
         size = fitted_size(codes, self._random_size())
         clip, dense, small_mask = self._decode_small(codes, mask, size)
+        assert self.semantic_field is not None and self.downsampler is not None
         with part("downsample"):
-            predicted, target, weight = self._match(clip, batch, small_mask)
+            predicted, target, weight = self.downsampler.match(
+                clip, batch["clip_target"], batch["crop_sides"], small_mask
+            )
         with part("losses"):
             # Cells with little foreground have a low weight.
-            weight = None if small_mask is None else weight
-            loss = {"clip": ramp * c.clip_weight * losses.clip_loss(predicted, target, weight)}
+            difference = losses.clip_loss(predicted, target, None if small_mask is None else weight)
+            loss = {"clip": ramp * c.clip_weight * difference}
             if dense is not None and "dense_target" in batch:
                 shown = small_mask if c.mask_dense else None
                 difference = losses.dense_loss(dense, batch["dense_target"], shown, c.dense_compare)
@@ -152,7 +183,6 @@ class Lang3DXLModel(RenderingModel):
             if "regions" in batch:
                 labels = resize_nearest(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()
                 loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
-            assert self.semantic_field is not None
             own = self.semantic_field.own_losses(clip, dense)
         return loss | {name: ramp * value for name, value in own.items()}
 
@@ -163,10 +193,6 @@ class Lang3DXLModel(RenderingModel):
         with part("decode"):
             clip, dense = self.semantic_field(resize_nearest(codes, size))
         return clip, dense, small_mask
-
-    def _match(self, clip: Float[Tensor, "h w c"], batch: Batch, mask: Tensor | None):
-        assert self.downsampler is not None
-        return self.downsampler.match(clip, batch["clip_target"], batch["crop_sides"], mask)
 
     def _random_size(self) -> int:
         """Draw the longer side at which this iteration decodes. It is one of a few, since a GPU's libraries
@@ -264,8 +290,7 @@ class Lang3DXLModel(RenderingModel):
 
         Parameters are resized in place: the optimizers hold them, and new ones would never be trained.
         """
-        for component in COMPONENTS:
-            component.load(self, state)
+        match_components(self, state)
         self.config.sh_degree = isqrt(state["gauss_params.features_rest"].shape[1] + 1) - 1
         self.step = self.config.total_steps
         for name, parameter in self.gauss_params.items():

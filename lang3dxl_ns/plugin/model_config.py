@@ -93,7 +93,7 @@ class ModelSettings(SplatfactoModelConfig):
     background_color: Literal["random", "black", "white"] = "black"
     """Color behind the scene. Black, as in the paper: where nothing is rendered, the code is zero too."""
     num_downscales: int = 0
-    """Number of coarse-to-fine steps in resolution. None are needed, since photos already vary in size."""
+    """Always 0, since photos already vary in size."""
     ssim_lambda: float = 0.5
     """Weight of 1 − SSIM relative to L1 in the color loss."""
     cull_alpha_thresh: float = 0.005

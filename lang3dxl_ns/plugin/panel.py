@@ -195,7 +195,7 @@ class AskPanel(ViewerControl):
 
     def _outputs_shown(self) -> set[str]:
         panel = self.viewer.control_panel
-        return {panel.output_render, panel.split_output_render if panel.split else panel.output_render}
+        return {panel.output_render} | ({panel.split_output_render} if panel.split else set())
 
     def _show_output(self, name: str) -> None:
         """Select an output as the user would; nerfstudio has no public way to do so."""

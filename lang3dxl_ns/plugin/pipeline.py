@@ -19,7 +19,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.evaluation import Evaluation, EvaluationSettings
-from lang3dxl_ns.plugin.lift_features import learn_from_photos
+from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
@@ -116,7 +116,11 @@ class Lang3DXLPipeline(VanillaPipeline):
         """Load a checkpoint; for rendering, also prepare to answer the configured prompts."""
         super().load_pipeline(loaded_state, step)
         if self.test_mode != "val" and self.query:
-            self.model.answers = self._answers()
+            run = self.datamanager.config.run
+            cache = None if run is None else run / "lang3dxl_visible.safetensors"
+            CONSOLE.log(f"Looking for {escape(self.query)}")
+            scene = self.model.scene(self.scene_file, cache=cache)
+            self.model.answers = RenderedAnswers(scene.ask(self.query))
 
     def scored_matches(self, photos: Sequence[str]) -> dict[str, dict[str, Match]]:
         """Find every scored prompt in the views of some photos as a user would, by photo and prompt. Without
@@ -127,12 +131,6 @@ class Lang3DXLPipeline(VanillaPipeline):
         scene, prompts = self.model.scene(self.scene_file), scorer.truth.categories
         question = scene.ask([Prompt(text) for text in prompts])
         return {photo: dict(zip(prompts, scene.matches(question, photo), strict=True)) for photo in photos}
-
-    def _answers(self) -> RenderedAnswers:
-        cache = self.datamanager.config.run
-        cache = None if cache is None else cache / "lang3dxl_visible.safetensors"
-        CONSOLE.log(f"Looking for {escape(self.query)}")
-        return RenderedAnswers(self.model.scene(self.scene_file, cache=cache).ask(self.query))
 
     @property
     def has_words_to_learn(self) -> bool:
@@ -150,8 +148,10 @@ class Lang3DXLPipeline(VanillaPipeline):
             with progress_bar() as bar:
                 total = len(self.datamanager.train_dataset)
                 gathering = bar.track(photos, total=total, description="gathering features")
-                learning = bar.add_task("learning codes", total=decoder.learning_steps or None)
-                learn_from_photos(self.model, gathering, lambda: bar.advance(learning))
+                learning = bar.add_task(
+                    "learning codes", total=decoder.learning_steps(self.model.num_points) or None
+                )
+                self.model.learn_from_photos(gathering, lambda: bar.advance(learning))
         finally:
             self.model.train(training)
         if decoder.learned is not None:
@@ -159,9 +159,8 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""
-        state = {key.removeprefix("_model."): v for key, v in state_dict.items() if key.startswith("_model.")}
         try:
-            self.model.load_state_dict(state, strict=True)
+            self.model.load_state_dict(model_state(state_dict), strict=True)
         except (RuntimeError, KeyError) as error:
             raise UserError(
                 f"the checkpoint does not fit this configuration: {error}. "

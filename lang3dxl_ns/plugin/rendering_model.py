@@ -17,10 +17,9 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.timing import part
-from lang3dxl_ns.components.appearance import AppearanceField
+from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.looks import Look, Looks, render_in_look
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.densification import Densification
@@ -36,7 +35,7 @@ from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 from lang3dxl_ns.rendering.splats import harmonics_of
-from lang3dxl_ns.scene.camera import Camera, in_view
+from lang3dxl_ns.scene.camera import in_view
 
 
 class Answers(Protocol):
@@ -87,11 +86,6 @@ class RenderingModel(SplatfactoModel):
         return self.config.rasterizer if self.means.is_cuda else "auto"
 
     @property
-    def antialiased(self) -> bool:
-        """Whether small Gaussians are dimmed to prevent aliasing."""
-        return self.config.rasterize_mode == "antialiased"
-
-    @property
     def carried(self) -> Float[Tensor, "n d"] | None:
         """Semantic values that Gaussians carry; None if there are none (yet)."""
         return None if self.semantic_field is None else self.semantic_field.carried(self.gauss_params)
@@ -112,14 +106,8 @@ class RenderingModel(SplatfactoModel):
         if self.config.sh_degree > 0:
             coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
             harmonics = coefficients[:, : (self.degree + 1) ** 2]
-        return Splats(
-            shapes.means, shapes.quats, shapes.scales, shapes.opacities, harmonics, self.antialiased
-        )
-
-    @property
-    def looks(self) -> Looks | None:
-        """Looks of the photos; None where the photos share one lighting."""
-        return None if self.appearance is None else Looks(self.appearance)
+        antialiased = self.config.rasterize_mode == "antialiased"
+        return Splats(shapes.means, shapes.quats, shapes.scales, shapes.opacities, harmonics, antialiased)
 
     @torch.no_grad()
     def scene(
@@ -136,13 +124,13 @@ class RenderingModel(SplatfactoModel):
         file: photos, cameras and CLIP. For the other arguments see `Scene`. While a model has no words yet,
         its scene has colors only.
         """
-        field, codes, looks = self.semantic_field, self.carried, self.looks
+        codes, looks = self.carried, self.appearance
         return Scene(
             self.splats().copied(),
             file,
-            None if codes is None else _frozen(field),
+            None if codes is None else _frozen(self.semantic_field),
             None if codes is None else codes.detach().clone(),
-            looks=None if looks is None else Looks(_frozen(looks.field)),
+            looks=None if looks is None else _frozen(looks),
             background=self._get_background_color().clone(),
             config=config or QueryConfig(),
             encode_texts=encode_texts,
@@ -182,9 +170,9 @@ class RenderingModel(SplatfactoModel):
 
         channels: further values to composite.
         """
-        view = self._camera(camera)
-        if look is None and self.looks is not None:
-            look = self.looks.of_view(view)
+        view = to_rasterizer(camera)
+        if look is None and self.appearance is not None:
+            look = self.appearance.of_view(view)
         splats, keep = self.splats(), None
         if self.crop_box is not None:
             keep = self.crop_box.within(splats.means).squeeze(-1)
@@ -219,7 +207,7 @@ class RenderingModel(SplatfactoModel):
 
     def composite(self, camera: Cameras, features: Float[Tensor, "n d"]) -> Float[Tensor, "H W d"]:
         """Composite values of Gaussians over black in a camera; differentiable only in the values."""
-        return composite(self.splats(), self._camera(camera).detach(), features, self.backend)
+        return composite(self.splats(), to_rasterizer(camera).detach(), features, self.backend)
 
     def _code_colors(self) -> Float[Tensor, "n 3"] | None:
         if self.carried is None:
@@ -242,8 +230,6 @@ class RenderingModel(SplatfactoModel):
             "accumulation": raster.alpha,
             "background": background,
         }
-        if raster.depth is not None:
-            outputs["depth"] = torch.where(raster.alpha > 0, raster.depth, raster.depth.detach().max())
         return outputs if raster.features is None else outputs | {"codes": raster.features}
 
     @property
@@ -266,16 +252,6 @@ class RenderingModel(SplatfactoModel):
             pose = torch.cat([change[:, :3] @ pose[:, :3], pose[:, 3:] + change[:, 3:]], dim=1)
         return pose
 
-    def _camera(self, camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
-        """Convert the camera for the rasterizer, at a pose (default: its own)."""
-        downscale = self._get_downscale_factor()
-        if downscale != 1:
-            camera.rescale_output_resolution(1 / downscale)
-        view = to_rasterizer(camera, pose)
-        if downscale != 1:
-            camera.rescale_output_resolution(downscale)
-        return view
-
     def activated(self, g: Mapping[str, Tensor]) -> Gaussians:
         """Activate the parameters `g`, which store log scales and logits of opacity, to Gaussians."""
         scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
@@ -284,7 +260,7 @@ class RenderingModel(SplatfactoModel):
     def _raster(self, camera: Cameras, features: Tensor | None) -> tuple[Raster, Float[Tensor, "3"]]:
         """Render a training step, with gradients."""
         g, pose = self.gauss_params, self._pose(camera)
-        view, pose = self._camera(camera, pose), to_device(pose, self.device)
+        view, pose = to_rasterizer(camera, pose), to_device(pose, self.device)
         background = self._get_background_color()
         gaussians = self.activated(g)
         colors = self.colors_from(g, pose[:, 3])
@@ -297,28 +273,25 @@ class RenderingModel(SplatfactoModel):
             visible = in_view(near, gaussians.means, gaussians.scales).nonzero().squeeze(1)
             with part("appearance"):
                 colors, in_photo = self.appearance(gaussians, colors, vector, visible, self.step)
-        settings: dict[str, Any] = {"backend": self.backend, "antialiased": self.antialiased}
-        absgrad, depth = self.strategy.absgrad, self.config.output_depth_during_training
+        antialiased, absgrad = self.config.rasterize_mode == "antialiased", self.strategy.absgrad
+        settings: dict[str, Any] = {"backend": self.backend, "antialiased": antialiased}
         moves = self.config.feature_gradient_to_geometry and features is not None
         if in_photo is gaussians and not moves:
             raster = rasterize(
                 gaussians.seen_from(view), view, colors, background,
-                features=features, render_depth=depth, absgrad=absgrad, **settings,
+                features=features, absgrad=absgrad, **settings,
             )  # fmt: skip
             return raster, background
         photo = rasterize(in_photo.seen_from(view), view, colors, background, absgrad=absgrad, **settings)
-        if features is None and not depth:
+        if features is None:
             return photo, background
-        # Semantics, coverage and depth belong to the scene, not to a photo, so they keep the scene's
-        # opacities.
-        carried = colors.detach()[:, :1] if features is None else features
+        # Semantics and coverage belong to the scene, not to a photo, so they keep the scene's opacities.
         if moves:
             gaussians = replace(gaussians, opacities=gaussians.opacities.detach())
         else:
             gaussians, view = gaussians.detach(), view.detach()
-        scene = rasterize(gaussians.seen_from(view), view, carried, render_depth=depth, **settings)
-        image = None if features is None else scene.image
-        return replace(photo, features=image, alpha=scene.alpha, depth=scene.depth), background
+        scene = rasterize(gaussians.seen_from(view), view, features, **settings)
+        return replace(photo, features=scene.image, alpha=scene.alpha), background
 
     def _vector(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
         """Return the training photo's appearance vector, or for other views the one that the rule chooses."""

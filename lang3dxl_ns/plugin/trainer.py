@@ -22,6 +22,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
+from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns import __version__
@@ -32,7 +33,6 @@ from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
 from lang3dxl_ns.components.step_guard import StepGuard
-from lang3dxl_ns.plugin.checkpoint import restore_run_state, run_state
 from lang3dxl_ns.plugin.datamanager import PhotosGoneError
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
@@ -131,10 +131,13 @@ class Lang3DXLTrainer(Trainer):
             self.pipeline.datamanager.scene_file().write(self.base_dir / SCENE_FILE)
             if test_mode == "val":
                 write_needs(self.pipeline.datamanager.needs, self.base_dir)
-        self._limit_gaussians()
+        model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
+        pixels, wanted = int((cameras.width * cameras.height).max()), self.config.pipeline.model.max_gaussians
+        model.strategy.most, message = plan(model, pixels, torch.device(self.device), wanted)
+        CONSOLE.log(escape(message))
         torch.manual_seed(self.config.machine.seed)
         if self._run_state is not None:
-            restore_run_state(self.pipeline, self._run_state)
+            _restore(self.pipeline, self._run_state)
 
     def _forget_folder(self) -> None:
         """Remove the folder of a run that could not start, if it holds nothing but its settings, and the
@@ -144,13 +147,6 @@ class Lang3DXLTrainer(Trainer):
                 (self.base_dir / "config.yml").unlink(missing_ok=True)
                 for folder in (self.base_dir, *self.base_dir.parents[:3]):
                     folder.rmdir()  # the first folder that is not empty raises, and ends the loop
-
-    def _limit_gaussians(self) -> None:
-        """Set the cap of densification from the device's memory, and log how much training will take."""
-        model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
-        pixels, wanted = int((cameras.width * cameras.height).max()), self.config.pipeline.model.max_gaussians
-        model.strategy.most, message = plan(model, pixels, torch.device(self.device), wanted)
-        CONSOLE.log(escape(message))
 
     def _load_checkpoint(self) -> None:
         """Load a checkpoint as nerfstudio does, but keep the run state until everything is set up. Raises
@@ -168,13 +164,12 @@ class Lang3DXLTrainer(Trainer):
                 self.optimizers.load_schedulers(state["schedulers"])
             if state["scalers"]:  # a run without a loss scale has none
                 self.grad_scaler.load_state_dict(state["scalers"])
+            self._run_state, self.words_are_learned = state["run"], state["words"]
         except NOT_A_CHECKPOINT as error:
             raise UserError(
                 f"{path} is not a checkpoint of lang3dxl ({error}): give --load-dir the "
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
             ) from error
-        self._run_state = state.get("run")  # earlier versions' checkpoints lack it
-        self.words_are_learned = state.get("words", "codes" in self.pipeline.model.gauss_params)
         CONSOLE.log(f"Loaded {path}")
 
     def _checkpoint_to_load(self) -> Path | None:
@@ -369,7 +364,13 @@ class Lang3DXLTrainer(Trainer):
             scene = with_words_of(scene, folder / path.name)
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
         size = write_scene(path, scene, told)
-        say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)", *self._next_steps())
+        run = shlex.quote(os.path.relpath(self.base_dir))
+        say(
+            f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)",
+            f"Walk through it: lang3dxl view {run}",
+        )
+        if self.pipeline.model.semantic_field is not None:
+            say(f"Ask it:          lang3dxl query {run} --text windows --out found")
 
     def _learn_words(self) -> None:
         # Hold the lock, since the viewer may be learning words for a recent question.
@@ -381,12 +382,6 @@ class Lang3DXLTrainer(Trainer):
                     self.words_are_learned = True
             finally:
                 self._is_learning_words = False
-
-    def _next_steps(self) -> Iterator[str]:
-        run = shlex.quote(os.path.relpath(self.base_dir))
-        yield f"Walk through it: lang3dxl view {run}"
-        if self.pipeline.model.semantic_field is not None:
-            yield f"Ask it:          lang3dxl query {run} --text windows --out found"
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
@@ -428,8 +423,38 @@ class Lang3DXLTrainer(Trainer):
                 "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
                 "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
                 "scalers": self.grad_scaler.state_dict(),
-                "run": run_state(self.pipeline),
+                "run": _run_state(self.pipeline),
                 "words": self.words_are_learned,
             },
             path,
         )
+
+
+def _run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
+    """Collect densification statistics, whether codes have begun, the current round through the photos, and
+    the random generators' states.
+
+    The state has only tensors and plain values, which torch's weights-only loader accepts.
+    """
+    model = pipeline.model
+    return {
+        "strategy": dict(model.strategy_state),
+        "codes_have_begun": model.codes_have_begun,
+        "photos": pipeline.datamanager.round_state(),
+        "random": torch.get_rng_state(),
+        "random_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+    }
+
+
+def _restore(pipeline: Lang3DXLPipeline, state: dict[str, Any]) -> None:
+    """Restore `_run_state` on the pipeline's device, whichever device it was saved from."""
+    model = pipeline.model
+    model.strategy_state = {
+        name: value.to(model.device) if isinstance(value, Tensor) else value
+        for name, value in state["strategy"].items()
+    }
+    model.codes_have_begun = state["codes_have_begun"]
+    pipeline.datamanager.restore_round(state["photos"])
+    torch.set_rng_state(state["random"])
+    if torch.cuda.is_available() and len(state["random_cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(state["random_cuda"])

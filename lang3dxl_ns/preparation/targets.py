@@ -92,15 +92,6 @@ class TargetReader:
         """Read the photo's region labels, −1 for none; None (no file is read) for one without regions."""
         return self._store.read(REGIONS, name)["labels"] if name in self._with_regions else None
 
-    def bytes_of(self, name: str) -> int:
-        """Compute the bytes of a photo's targets on disk."""
-        kinds = (
-            [self._clip_kind(name)]
-            + [DENSE] * (name in self._with_dense)
-            + [REGIONS] * (name in self._with_regions)
-        )
-        return sum(self._store.path(kind, name).stat().st_size for kind in kinds)
-
     def check(self, encoder: ImageTextEncoder) -> None:
         """Raise UserError if a photo's target is missing or was made by another CLIP than `encoder`."""
         for name in self.names:

@@ -32,7 +32,6 @@ from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.looks import Looks
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
@@ -115,7 +114,7 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
             content["codes"] = _array(torch.where(known, places, 0), np.uint16)
         content["words"] = _array(scene.text.vectors(described["words"]), np.float16)
     if scene.looks is not None:
-        field = scene.looks.field
+        field = scene.looks
         described["looks"] = {"config": asdict(field.config), "names": field.names}
         content |= _stored_state("looks", field)
     for i, photo in enumerate(scene.photos):
@@ -203,7 +202,7 @@ def read_scene(
             decoder = _decoder(file, settings).to(device)
             codes = _codes(file, decoder.bounded, len(splats)).to(device)
         if (described := file.about.get("looks")) is not None:
-            looks = Looks(_looks(file, described).to(device))
+            looks = _looks(file, described).to(device)
         if (words := file.about.get("words")) is not None:
             expect(all(isinstance(word, str) for word in words), "its words are no texts")
             rows = file.tensor("words", len(words), file.shapes["words"][1]).float()

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import watched
-from lang3dxl_ns.components.looks import Look, Looks, render_in_look
+from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.query.match import View
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, overview
@@ -51,7 +51,7 @@ class ViewedScene:
     file: SceneFile
     """Photos, cameras, and the CLIP that the features come from."""
     _: KW_ONLY
-    looks: Looks | None = None
+    looks: AppearanceField | None = None
     """Lighting of the photos; None if all share one."""
     background: Float[Tensor, "3"] | None = None
     """Color behind the scene, 0…1; None for black."""

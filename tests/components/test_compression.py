@@ -11,10 +11,11 @@ from lang3dxl_ns.components import compression
 from lang3dxl_ns.components.compression import (
     CompressedField,
     CompressionConfig,
-    Gathered,
     centered_cosine,
+    draw_sample,
     fit,
 )
+from lang3dxl_ns.components.feature_decoder import Gathered
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
@@ -33,6 +34,11 @@ def clusters(sizes, spread=0.05, seed=0):
     owner = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
     noise = spread * torch.randn(len(owner), CHANNELS, generator=generator)
     return centers[owner] + noise, owner
+
+
+def everything(features, basis=None):
+    """Features of Gaussians that all fill a pixel."""
+    return Gathered(features, torch.ones(len(features)), basis)
 
 
 def compressed(features, mass, config=QUICK):
@@ -119,9 +125,9 @@ def test_learning_again_begins_anew():
     """As the viewer does while a run goes on, with Gaussians that have come meanwhile."""
     features, _ = clusters([200] * 4)
     decoder = CompressedField(SemanticFieldConfig("short"), CHANNELS, QUICK)
-    first = decoder.learn_gaussians(features, torch.ones(len(features)))
-    decoder.learn_gaussians(features.flip(0)[:300], torch.ones(300))
-    again = decoder.learn_gaussians(features, torch.ones(len(features)))
+    first = decoder.learn_gaussians(everything(features))
+    decoder.learn_gaussians(everything(features.flip(0)[:300]))
+    again = decoder.learn_gaussians(everything(features))
     assert torch.equal(first, again)
 
 
@@ -148,7 +154,7 @@ def test_a_hundred_times_as_many_gaussians_are_compressed_as_well():
         codes, trained = compressed(
             features, torch.ones(len(features)), CompressionConfig(300, 512, sample=320)
         )
-        found.append(centered_cosine(features, trained, codes))
+        found.append(centered_cosine(everything(features), trained, codes))
     assert found[0] > 0.95 and found[1] > found[0] - 0.02
 
 
@@ -159,15 +165,15 @@ def test_work_grows_with_the_gaussians_within_limits(count, factor):
     assert (grown.steps, grown.sample, grown.batch) == (factor * 10, factor * 64, 8)
 
 
-def test_many_gaussians_are_fitted_in_more_steps_which_advance_the_bar_as_few_do():
+def test_every_step_of_many_gaussians_or_few_advances_the_bar():
     advanced = []
     for count in (64, 9 * 64):
         features, _ = clusters([count // 4] * 4)
         decoder = CompressedField(
             SemanticFieldConfig("short", code_dim=3), CHANNELS, CompressionConfig(100, 64, sample=64)
         )
-        decoder.learn_gaussians(features, torch.ones(len(features)), partial(advanced.append, count))
-        assert advanced.count(count) == decoder.learning_steps == 100
+        decoder.learn_gaussians(everything(features), partial(advanced.append, count))
+        assert advanced.count(count) == decoder.learning_steps(count)
     assert CompressedField(SemanticFieldConfig("short"), CHANNELS).learning_seconds(10**6) > 180
 
 
@@ -177,19 +183,19 @@ def test_the_centered_cosine_sees_what_the_cosine_does_not():
     trained, codes = field(), torch.zeros(200, 3)
     trained.set_output_statistics(features.mean(0), torch.full((CHANNELS,), 1e-6))
     assert agreement(features, codes, trained).mean() > 0.999
-    assert abs(centered_cosine(features, trained, codes)) < 0.1
+    assert abs(centered_cosine(everything(features), trained, codes)) < 0.1
     mean, std = features.mean(0), features.std(0)
     basis = PrincipalBasis.of([features], CHANNELS)
     trained.set_output_statistics(mean, std)
-    whole = centered_cosine(features, trained, codes)
-    assert centered_cosine(basis.coordinates(features), trained, codes, basis) == pytest.approx(
+    whole = centered_cosine(everything(features), trained, codes)
+    assert centered_cosine(everything(basis.coordinates(features), basis), trained, codes) == pytest.approx(
         whole, abs=1e-3
     )
 
 
 def test_a_sample_has_what_has_little_mass_more_often_than_its_mass():
     mass = torch.cat([torch.full((900,), 100.0), torch.full((100,), 1.0)])
-    drawn = Gathered(torch.arange(1000.0)[:, None], mass, None).sample(200, torch.Generator().manual_seed(0))
+    drawn = draw_sample(Gathered(torch.arange(1000.0)[:, None], mass), 200, torch.Generator().manual_seed(0))
     rows = drawn.features[:, 0].long()
     assert len(rows.unique()) == 200 and torch.equal(drawn.mass, mass[rows])
     assert 0 < (rows >= 900).sum() < 10  # by √mass two of 200 are expected, by mass none, by number 20
@@ -200,7 +206,7 @@ def test_codes_have_more_numbers_where_three_lose_too_much(monkeypatch):
     losses = iter([0.9, 0.97, 0.97])
     monkeypatch.setattr(compression, "centered_cosine", lambda *_: next(losses))
     decoder = CompressedField(SemanticFieldConfig("short"), CHANNELS, CompressionConfig(20, 128))
-    codes = decoder.learn_gaussians(features, torch.ones(len(features)))
+    codes = decoder.learn_gaussians(everything(features))
     assert codes.shape[1] == decoder.code_dim == 4
     assert (
         decoder.learned is not None
@@ -219,4 +225,4 @@ def test_a_number_of_numbers_that_was_asked_for_is_kept(monkeypatch):
     monkeypatch.setattr(compression, "centered_cosine", lambda *_: 0.0)
     config = SemanticFieldConfig("short", code_dim=2)
     decoder = CompressedField(config, CHANNELS, CompressionConfig(20, 128))
-    assert decoder.learn_gaussians(features, torch.ones(len(features))).shape[1] == 2
+    assert decoder.learn_gaussians(everything(features)).shape[1] == 2

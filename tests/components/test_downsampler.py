@@ -1,12 +1,10 @@
 """Laws of the attenuated downsampler."""
 
-import itertools
 import math
 
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
 from downsampler_by_loops import dense_kernel, reference_mean
 
 from lang3dxl_ns.components.downsampler import (
@@ -17,7 +15,7 @@ from lang3dxl_ns.components.downsampler import (
     separable_kernel,
 )
 
-KERNELS = ["pyramid", "footprint", "box"]
+KERNELS = ["pyramid", "box"]
 CPU = torch.device("cpu")
 # (map, grid, crop sides): plain; map below the grid; one cell; crops wider than the map; same size.
 CASES = [
@@ -98,44 +96,6 @@ def test_a_ramp_keeps_its_position_where_the_window_is_inside(name, rho):
     error, inside = ramp_and_error(name, (80, 100), (48, 61), [2 / 61, 2 / 61 * rho])
     assert inside.sum() > 500
     assert float(error[inside].max()) < 1e-12
-
-
-@pytest.mark.parametrize("rho", [1, 5, 15])
-def test_footprints_keep_a_ramp_where_crops_tile_the_image(rho):
-    error, inside = ramp_and_error("footprint", (80, 100), (60, 75), [2 / 75, 2 / 75 * rho])
-    assert inside.sum() > 400
-    assert float(error[inside].max()) < 1e-12
-
-
-def test_footprints_of_crops_that_do_not_tile_the_image_lie_at_the_middles_of_its_cells():
-    """6 crops of 28 pixels in 99: the second is centered at 24.75, or a quarter."""
-    result = downsampler("footprint", channels=2)(seeded(99, 96, 2), (5, 6), [28 / 96])[0]
-    photo = seeded(99, 96, 2)
-    torch.testing.assert_close(result[2, 1], photo[36:63, 10:38].mean((0, 1)), atol=0.05, rtol=0)
-
-
-def test_the_footprint_kernel_is_the_mean_over_scales_of_resized_grids_of_crop_means():
-    height, width = 96, 120
-    crops = [12, 16, 24]  # all tile the photo, so that none is rounded to a pixel
-    photo = seeded(height, width, 3)
-    sums = torch.zeros(3, 16, 20, dtype=torch.float64)
-    valid = torch.zeros(1, 16, 20, dtype=torch.float64)
-    for crop in crops:
-        shift = crop // 2
-        counts = [a // shift for a in (height, width)]
-        starts = [
-            [round((i + 0.5) * a / n - shift) for i in range(n)]
-            for a, n in zip((height, width), counts, strict=True)
-        ]
-        grid = torch.zeros(4, len(starts[0]), len(starts[1]), dtype=torch.float64)
-        for (i, y), (k, x) in itertools.product(enumerate(starts[0]), enumerate(starts[1])):
-            part = photo[max(y, 0) : y + crop, max(x, 0) : x + crop].reshape(-1, 3)
-            grid[:3, i, k], grid[3, i, k] = part.sum(0) / crop**2, len(part) / crop**2
-        grid = F.interpolate(grid[None], (16, 20), mode="bilinear", align_corners=False)[0]
-        sums, valid = sums + grid[:3] / len(crops), valid + grid[3:] / len(crops)
-    result, share = downsampler("footprint", channels=3)(photo, (16, 20), [c / width for c in crops])
-    torch.testing.assert_close(share, valid[0])
-    torch.testing.assert_close(result, (sums / valid).permute(1, 2, 0))
 
 
 def test_the_pyramid_weighs_its_nested_squares_by_the_published_factor():
@@ -273,7 +233,7 @@ def test_a_soft_mask_weighs_pixels_once():
 def test_published_presets_have_the_published_downsampler(preset, kernel, hidden):
     found = DownsamplerConfig().resolved(preset)
     assert (found.kernel, found.hidden) == (kernel, hidden)
-    asked = DownsamplerConfig("footprint", 8)
+    asked = DownsamplerConfig("box", 8)
     assert asked.resolved(preset) == asked
 
 

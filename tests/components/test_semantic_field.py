@@ -31,9 +31,7 @@ def parameters_on_paper(name):
     """Encoding and decoder parameter counts of a full preset, without allocating it."""
     with torch.device("meta"):
         field = SemanticField(SemanticFieldConfig(name), 512, 384)
-    counts = [
-        sum(p.numel() for p in group) for group in (field.encoding_parameters(), field.decoder_parameters())
-    ]
+    counts = [sum(p.numel() for p in group) for group in field.parameter_groups().values()]
     return field, counts
 
 
@@ -104,7 +102,8 @@ def test_without_a_dense_head_there_is_no_dense_output():
 def test_codes_have_a_gradient_at_the_start_and_at_exactly_zero(name, start):
     field = make_field(name)
     field.set_progress(0.0)
-    codes = torch.zeros(6, 3) if start == "zero" else field.initial_codes(6, torch.Generator().manual_seed(0))
+    torch.manual_seed(0)
+    codes = torch.zeros(6, 3) if start == "zero" else field.initial_codes(6)
     codes.requires_grad_()
     field.decode_clip(codes).abs().sum().backward()
     assert (codes.grad != 0).all()
@@ -231,7 +230,7 @@ def test_float64_fields_compute_in_float64():
 
 def test_parameter_groups_hold_every_parameter_once():
     field = make_field("short")
-    grouped = [*field.encoding_parameters(), *field.decoder_parameters()]
+    grouped = [*field.parameter_groups()["field_encoding"], *field.parameter_groups()["field_decoder"]]
     assert len({id(p) for p in grouped}) == len(grouped)
     assert {id(p) for p in grouped} == {id(p) for p in field.parameters()}
 
@@ -246,12 +245,12 @@ def test_one_seed_gives_one_field_and_leaves_the_global_generator_alone():
 
 
 def test_initial_codes_are_small_noise_and_exact_zeros_for_the_official_preset():
-    generator = torch.Generator().manual_seed(0)
-    codes = make_field("default").initial_codes(4000, generator)
+    torch.manual_seed(0)
+    codes = make_field("default").initial_codes(4000)
     assert codes.shape == (4000, 3)
     assert abs(codes.std().item() - 0.01) < 5e-4
     assert abs(codes.mean().item()) < 5e-4
-    assert not make_field("official").initial_codes(10, generator).any()
+    assert not make_field("official").initial_codes(10).any()
 
 
 def test_a_setting_wins_over_its_preset():
@@ -292,11 +291,11 @@ def test_short_preset_learns_a_labeled_scene_in_300_steps():
     targets = prototypes[torch.randint(12, (400,), generator=generator)]
     field = make_field("short", clip_dim=16, log2_table_size=9)
     field.set_output_statistics(targets.mean(0), targets.std(0))
-    codes = field.initial_codes(400, generator).requires_grad_()
+    codes = (0.01 * torch.randn(400, 3, generator=generator)).requires_grad_()
     groups = [
         {"params": [codes], "lr": 3e-2},
-        {"params": field.encoding_parameters(), "lr": 1e-2},
-        {"params": field.decoder_parameters(), "lr": 1e-2, "weight_decay": 1e-5},
+        {"params": field.parameter_groups()["field_encoding"], "lr": 1e-2},
+        {"params": field.parameter_groups()["field_decoder"], "lr": 1e-2, "weight_decay": 1e-5},
     ]
     optimizer = torch.optim.Adam(groups, eps=1e-15)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 300)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from lab.numerics.measure import Bounds, Case, Maps, Problem
-from lang3dxl_ns.components.compression import CompressionConfig, assign, fit, seen_by_photos
+from lang3dxl_ns.components.compression import CompressionConfig, assign, draw_sample, fit, seen_by_photos
+from lang3dxl_ns.components.feature_decoder import Gathered
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
@@ -48,8 +49,9 @@ def compress(
 ) -> Tensor:
     """Codes of a field that is given, as `CompressedField` learns them for its own."""
     config = config.grown(len(features))
-    sample = seen_by_photos(features, mass, basis).sample(config.sample, generator)
-    return assign(features, mass, field, fit(sample, field, config, generator), basis)
+    gathered = Gathered(features, mass, basis)
+    sample = draw_sample(seen_by_photos(gathered), config.sample, generator)
+    return assign(gathered, field, fit(sample, field, config, generator))
 
 
 def _problem(kinds: int = KINDS, size: float = 1.0, masses: float = 0.0, unseen: float = 0.0) -> Problem:

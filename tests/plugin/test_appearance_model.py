@@ -9,7 +9,6 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.plugin.optional_components import Lighting
 from lang3dxl_ns.preparation.handover import SceneFacts
 
 USE = "pipeline__model__appearance__use"
@@ -46,7 +45,7 @@ def eval_camera(trainer):
 
 def show(model, camera, look=None) -> dict[str, torch.Tensor]:
     model.eval()
-    rendering = model.seen(camera, None if look is None else model.looks.of_photo(look))
+    rendering = model.seen(camera, None if look is None else model.appearance.of_photo(look))
     return {"rgb": rendering.rgb, "accumulation": rendering.alpha[..., None], "depth": rendering.depth}
 
 
@@ -72,7 +71,7 @@ def test_scene_needs_decide_what_is_auto(train, scene, monkeypatch):
         ("off", {"appearance": True}, False),
     ):
         config.appearance.use = use
-        assert Lighting().wanted(config, SceneFacts(needs=needs)) is expected
+        assert SceneFacts(needs=needs).wants("appearance", config.appearance.use) is expected
 
 
 def test_first_iteration_moves_gaussians_as_without_appearance(train, scene):

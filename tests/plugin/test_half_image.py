@@ -4,7 +4,7 @@ import pytest
 import torch
 from conftest import make_trainer
 
-from lang3dxl_ns.components.looks import Look
+from lang3dxl_ns.components.appearance import Look
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.evaluation.half_image import HalfImageProtocol
 from lang3dxl_ns.evaluation.photo_metrics import psnr

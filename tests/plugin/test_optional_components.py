@@ -3,20 +3,21 @@
 import pytest
 
 from lang3dxl_ns.plugin.optional_components import (
-    COMPONENTS,
-    CameraRefinement,
-    Lighting,
-    Semantics,
-    SmoothSky,
+    build_camera_refinement,
+    build_lighting,
+    build_semantics,
+    build_sky,
+    component_parameters,
+    leave_out_components,
 )
 
 PARTS = {
-    SmoothSky: {"sky"},
-    CameraRefinement: {"camera_optimizer"},
-    Semantics: {"semantic_field", "downsampler", "clip_mean", "dense_mean"},
-    Lighting: {"appearance"},
+    build_sky: {"sky"},
+    build_camera_refinement: {"camera_optimizer"},
+    build_semantics: {"semantic_field", "downsampler", "clip_mean", "dense_mean"},
+    build_lighting: {"appearance"},
 }
-"""Names in a checkpoint by component: earlier checkpoints have them too."""
+"""Names in a checkpoint by component."""
 
 
 def parts(model) -> set[str]:
@@ -37,15 +38,13 @@ def model(train, scene):
 
 
 def test_every_component_can_be_left_out_and_built_again_under_the_names_of_checkpoints(model):
-    assert {type(component) for component in COMPONENTS} == set(PARTS)
-    assert parts(model) == set().union(*PARTS.values()) - PARTS[Lighting]
-    for component in COMPONENTS:
+    assert parts(model) == set().union(*PARTS.values()) - PARTS[build_lighting]
+    for build, names in PARTS.items():
         model.register_buffer("clip_mean", None), model.register_buffer("dense_mean", None)
-        for one in COMPONENTS:
-            one.leave_out(model)
+        leave_out_components(model)
         model.config.camera_optimizer.mode = "off"
         assert parts(model) == set() and set(model.get_param_groups()) <= set(model.gauss_params)
-        component.build(model)
-        assert parts(model) == PARTS[type(component)]
-        assert component.parameters(model)
-        assert not any(one.parameters(model) for one in COMPONENTS if one is not component)
+        assert not component_parameters(model)
+        build(model)
+        assert parts(model) == names
+        assert component_parameters(model)

@@ -68,7 +68,7 @@ def test_words_of_a_run_that_is_prolonged_are_learned_anew(trained, train, scene
 def test_a_signal_while_words_are_learned_ends_the_run_at_once(trained, monkeypatch, number, code):
     run, folders = trained
     monkeypatch.setattr(
-        "lang3dxl_ns.plugin.pipeline.learn_from_photos", lambda *_: signal.raise_signal(number)
+        "lang3dxl_ns.plugin.model.Lang3DXLModel.learn_from_photos", lambda *_: signal.raise_signal(number)
     )
     with pytest.raises(SystemExit) as end:
         run()
@@ -136,13 +136,13 @@ def test_words_are_the_same_from_photos_gathered_smaller(trained, scene, monkeyp
     run, found = trained[0], []
     learn = CompressedField.learn_gaussians
 
-    def noted(self, features, mass, *rest):
-        found.append((features, mass))
-        return learn(self, features, mass, *rest)
+    def noted(self, gathered, *rest):
+        found.append((gathered.features, gathered.mass))
+        return learn(self, gathered, *rest)
 
     monkeypatch.setattr(CompressedField, "learn_gaussians", noted)
     trainer = run()
-    monkeypatch.setattr("lang3dxl_ns.plugin.lift_features.LONGER_SIDE", 48)
+    monkeypatch.setattr("lang3dxl_ns.plugin.model.LONGER_SIDE", 48)
     trainer.pipeline.learn_words()
     (whole, mass), (half, smaller) = found
     seen = (mass > 20) & (smaller > 5)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.baselines.lifting import LiftedFeatures
+from lang3dxl_ns.components.feature_decoder import Gathered
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, filled_pixels, gather
 from lang3dxl_ns.scene.camera import Camera
@@ -107,7 +108,7 @@ def test_where_all_pixels_agree_the_rendered_feature_is_theirs_at_any_coverage()
     camera = cameras()[0]
     decoder = LiftedFeatures(2, 1)
     lifted = gather(5, [(lambda carried: composite(camera, carried), whole(pixels))], 3, feature)
-    rendered = composite(camera, decoder.learn_gaussians(*lifted))
+    rendered = composite(camera, decoder.learn_gaussians(Gathered(*lifted)))
     clip, dense = decoder(rendered)
     seen = rendered[..., -1] > 1e-3
     assert rendered[..., -1][seen].min() < 0.1
