@@ -38,6 +38,8 @@ from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _NORMALIZE_THEMSELVES = ("radio",)
 """Vision transformers that take pictures in 0…1."""
+_HEAD_ROWS = 16
+"""Number of rows of a map that a head for patches reads at once, to bound memory."""
 _VOCABULARIES = (
     ("tokenizer.json",),
     ("vocab.json", "merges.txt"),
@@ -108,7 +110,10 @@ class ImageTextEncoder:
     def join_sizes(self, features: Float[Tensor, "sizes rows columns d"]) -> Float[Tensor, "rows columns c"]:
         """Make one map of those of windows of several sizes, coarse to fine: their mean, or what the head
         reads in them."""
-        return mean_of_sizes(features) if self._head is None else self._head(features)
+        if self._head is None:
+            return mean_of_sizes(features)
+        # A few rows at a time, because the head's input is several times as wide as its output.
+        return torch.cat([self._head(rows) for rows in features.split(_HEAD_ROWS, dim=1)])
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Float[Tensor, "n c"]:
