@@ -46,6 +46,17 @@ def pytest_collection_finish(session: pytest.Session) -> None:
         sys.modules["processes"].start_server()
 
 
+def pytest_runtest_teardown() -> None:
+    """Runs end with their test: nerfstudio adds the writers of a run to those of all before it in the
+    process, and each of them writes every number of every later run."""
+    if writer := sys.modules.get("nerfstudio.utils.writer"):
+        for one in writer.EVENT_WRITERS:
+            if isinstance(one, writer.TensorboardWriter):
+                one.tb_writer.close()
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
+
+
 @pytest.fixture(scope="session")
 def tiny_clip(tmp_path_factory) -> Path:
     """Directory of a CLIP of random weights."""

@@ -54,8 +54,13 @@ def trapped(folder, text):
     return folder / "config.yml", folder / "trap"
 
 
-@pytest.mark.parametrize("text", TRAPS)
-@pytest.mark.parametrize("command", ["query --text a", "export --text a", "evaluate run", "view"])
+@pytest.mark.parametrize(
+    ("text", "command"),
+    [
+        *((text, "query --text a") for text in TRAPS),
+        *((TRAPS[0], command) for command in ("export --text a", "evaluate run", "view")),
+    ],
+)
 def test_our_commands_run_nothing_in_a_config(tmp_path, text, command):
     path, trap = trapped(tmp_path, text)
     out = [] if command == "view" else ["--out", str(tmp_path / "out.ply")]
@@ -64,8 +69,13 @@ def test_our_commands_run_nothing_in_a_config(tmp_path, text, command):
     assert not trap.exists()
 
 
-@pytest.mark.parametrize("text", TRAPS)
-@pytest.mark.parametrize("option", ["--load-config {}", "--load-config={}", "--load_config {}"])
+@pytest.mark.parametrize(
+    ("text", "option"),
+    [
+        *((text, "--load-config {}") for text in TRAPS),
+        *((TRAPS[0], option) for option in ("--load-config={}", "--load_config {}")),
+    ],
+)
 def test_nerfstudios_commands_end_before_they_read_such_a_config(tmp_path, text, option):
     path, trap = trapped(tmp_path, text)
     with pytest.raises(SystemExit, match=r"config\.yml holds more than settings"):

@@ -149,10 +149,10 @@ def test_coordinates_in_a_basis_compress_like_the_features():
 def test_a_hundred_times_as_many_gaussians_are_compressed_as_well():
     """The work grows with them; the field is trained on a sample."""
     found = []
-    for sizes in ([40] * 8, [4000] * 8):
+    for sizes in ([20] * 8, [2000] * 8):
         features, _ = clusters(sizes)
         codes, trained = compressed(
-            features, torch.ones(len(features)), CompressionConfig(300, 512, sample=320)
+            features, torch.ones(len(features)), CompressionConfig(150, 512, sample=160)
         )
         found.append(centered_cosine(everything(features), trained, codes))
     assert found[0] > 0.95 and found[1] > found[0] - 0.02
