@@ -271,7 +271,12 @@ def make_ready() -> None:
         raise UserError("gsplat's kernels run on NVIDIA's GPUs, and this one is AMD's")
     arch = device_arch()
     folder = build_folder(arch)
-    kernels = load(built(folder) or build(gsplat_extension(), folder, arch))
+    library = built(folder) or build(gsplat_extension(), folder, arch)
+    try:
+        kernels = load(library)
+    except ImportError:  # the library is damaged
+        library.unlink()
+        kernels = load(build(gsplat_extension(), folder, arch))
     gsplat.csrc = sys.modules["gsplat.csrc"] = kernels
 
 
