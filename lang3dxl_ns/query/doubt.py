@@ -30,8 +30,11 @@ UNRELATED = (
 )  # fmt: skip
 """Things that rarely appear in photos of buildings. The built-in CLIP was trained on none of them, since it
 would reject absent things from its training more easily than the words that users enter."""
-DOUBTFUL = 0.1
-"""Prompts above this are reported as doubtful. Nine in ten absent things are."""
+DOUBTFUL = 0.04
+"""Prompts above this are reported as doubtful, as all but one absent thing in thirty are: at most one unrelated
+word may fit as well (docs/lab/words.md)."""
+DOUBTFUL_TAUGHT = 0.1
+"""The same for words taught by example, whose doubt is measured in what was not marked."""
 LEAST_PEAK = 0.012
 """Prompts whose peak is below this are doubtful even if all unrelated words match less. Present things reach
 0.3 and more."""
@@ -79,7 +82,7 @@ def peaks(relevancy: Float[Tensor, "q n"]) -> Float[Tensor, " q"]:
 
 def doubtful(text: str, doubt: float, taught: bool = False) -> str | None:
     """Describe a doubtful prompt; return None for the others. taught: whether it was taught by example."""
-    if doubt <= DOUBTFUL:
+    if doubt <= (DOUBTFUL_TAUGHT if taught else DOUBTFUL):
         return None
     unknown = "or the run's CLIP may not know the word"
     if taught:

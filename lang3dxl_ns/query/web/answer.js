@@ -34,16 +34,17 @@ export class Answers {
   }
 
   /** Return peak, doubt, threshold, and the number of Gaussians of the foreground that match.
-   * strict: whether the prompt has negatives of its own, or was taught; doubt: if it is already known. */
+   * strict: whether the prompt has negatives of its own, or was taught; doubt: of a word that was taught. */
   verdict(relevancy, { strict = false, doubt = null, threshold = null }) {
     const { unrelated, rules } = this.words, sorted = relevancy.slice().sort(), count = sorted.length;
     let fit = 0;
     const top = Math.max(Math.ceil(rules.best * count), 1);
     for (let i = count - top; i < count; i++) fit += sorted[i] / top;
     const asWell = unrelated.filter((other) => other >= fit * TIE).length;
+    const mostDoubt = doubt === null ? rules.doubtful : rules.doubtful_taught;
     doubt ??= fit < rules.least_peak ? 1 : (1 + asWell) / (1 + unrelated.length);
     const low = sorted[(count - 1) >> 1]; // the lower median, as in torch
-    const isDoubtful = doubt > rules.doubtful;
+    const isDoubtful = doubt > mostDoubt;
     const own = isDoubtful || strict ? rules.even : Math.min(low + rules.share * (fit - low), rules.even);
     const level = threshold ?? own, { foreground } = this;
     const confined = foreground ? relevancy.map((value, i) => value * foreground[i]) : relevancy;

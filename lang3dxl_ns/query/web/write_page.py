@@ -17,7 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, write_atomically
 from lang3dxl_ns.common.reports import watched
-from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, LEAST_PEAK
+from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.question import EVEN, SHARE
@@ -44,7 +44,7 @@ _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _RULES = {
-    **{"best": BEST, "doubtful": DOUBTFUL, "least_peak": LEAST_PEAK},
+    **{"best": BEST, "doubtful": DOUBTFUL, "doubtful_taught": DOUBTFUL_TAUGHT, "least_peak": LEAST_PEAK},
     **{"even": EVEN, "share": SHARE, "clear": CLEAR},
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
