@@ -58,7 +58,7 @@ def of_a_million_gaussians() -> None:
     kinds = torch.randn(40, channels, generator=draw)
     owner = torch.arange(count) % 40
     features = kinds[owner] + 0.1 * torch.randn(count, channels, generator=draw)
-    field = CompressedField(SemanticFieldConfig("short"), channels, CompressionConfig(300, 512, sample=4_000))
+    field = CompressedField(SemanticFieldConfig("short"), channels, CompressionConfig(300, 512, sample=1_000))
     codes = field.learn_gaussians(Gathered(features, torch.ones(count)))
     assert centered_cosine(Gathered(features, torch.ones(count)), field, codes) > 0.95
     engine = make_engine(field, codes)

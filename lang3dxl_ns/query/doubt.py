@@ -31,8 +31,8 @@ UNRELATED = (
 """Things that rarely appear in photos of buildings. The built-in CLIP was trained on none of them, since it
 would reject absent things from its training more easily than the words that users enter."""
 DOUBTFUL = 0.04
-"""Prompts above this are reported as doubtful, as all but one absent thing in thirty are: at most one unrelated
-word may fit as well (docs/lab/words.md)."""
+"""Prompts above this are reported as doubtful, as all but one absent thing in thirty are: at most one
+unrelated word may fit as well (docs/lab/words.md)."""
 DOUBTFUL_TAUGHT = 0.1
 """The same for words taught by example, whose doubt is measured in what was not marked."""
 LEAST_PEAK = 0.012

@@ -103,6 +103,7 @@ _WHERE = re.compile(
     re.IGNORECASE,
 )
 _COLOR = re.compile(rf"\b(?:{_COLORS})\b(?=\s+\S)", re.IGNORECASE)
+_NO_NAME = re.compile(r"an?|the|and|or|of|in|on|at|to|it|is|are|this|that|these|those|what|where|\d+")
 
 
 def searched(text: str) -> str:
@@ -112,7 +113,10 @@ def searched(text: str) -> str:
 
 
 def caution(text: str) -> str | None:
-    """Return a warning about words in a prompt that CLIP can't tell (places, sizes, colors), if any."""
+    """Return a warning about a prompt that names nothing, such as *the* or *42*, or that has words which CLIP
+    can't tell (places, sizes, colors); None for others."""
+    if all(_NO_NAME.fullmatch(word) for word in re.findall(r"\w+", text.casefold())):
+        return f"{text} names nothing that can be seen: what follows is chance"
     if (found := searched(text)) != text:
         return f"places and sizes are not told apart: {found} is searched for everywhere"
     if color := _COLOR.search(text):

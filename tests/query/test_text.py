@@ -153,6 +153,16 @@ def test_where_a_thing_is_is_not_searched_for_and_that_is_said(typed, expected, 
     torch.testing.assert_close(queries.vectors[queries.positive[0][-1]], encoder.vectors([expected])[0])
 
 
+@pytest.mark.parametrize("typed", ["the", "42", "of the", "What is this?", "…", "3 & 4", "1,000"])
+def test_prompts_that_name_nothing_are_said_to(typed):
+    assert "names nothing" in caution(typed)
+
+
+@pytest.mark.parametrize("typed", ["The Thinker", "thing", "42nd street", "Ö", "窓", "a b", "its arch"])
+def test_names_are_not_called_nothing(typed):
+    assert caution(typed) is None
+
+
 @pytest.mark.parametrize(("typed", "said"), [("red roof", True), ("red", False), ("colored glass", False)])
 def test_colors_are_said_to_be_ignored(typed, said):
     assert bool(caution(typed)) is said and searched(typed) == typed
