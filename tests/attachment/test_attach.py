@@ -13,6 +13,7 @@ from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.known_frames import known_frames
 from lang3dxl_ns.commands.attach import _show
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.query.read_splats import read_splats
 from lang3dxl_ns.query.scene_file import read_scene
@@ -21,6 +22,15 @@ from lang3dxl_ns.query.splat_file import write_splats
 from lang3dxl_ns.query.teach import Example
 
 SETTINGS = AttachConfig(views=6, up="z", clip="builtin", dense="builtin", dense_tokens=16)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_codes():
+    """Learning codes takes 15 seconds otherwise."""
+    with pytest.MonkeyPatch.context() as patch:
+        steps, *others = CompressionConfig.__init__.__defaults__
+        patch.setattr(CompressionConfig.__init__, "__defaults__", (steps // 10, *others))
+        yield
 
 
 @pytest.fixture(scope="module")
