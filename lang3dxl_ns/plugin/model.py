@@ -113,7 +113,9 @@ class Lang3DXLModel(RenderingModel):
         decoder, facts = self.semantic_field, self.facts
         assert decoder is not None and facts.clip_targets is not None
         views, means = (self._target_view(*photo) for photo in photos), self.means.detach()
-        codes = learn_codes(decoder, views, means, facts.clip_targets, facts.dense_targets, advance)
+        # Codes that training goes on from start at what it compares with, which is not sharpened.
+        dense = None if self.learns_from_renderings else facts.dense_targets
+        codes = learn_codes(decoder, views, means, facts.clip_targets, dense, advance)
         if self.learns_from_renderings:
             self.gauss_params["codes"].data.copy_(codes.nan_to_num(0.0))
         else:
