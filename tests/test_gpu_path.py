@@ -359,11 +359,11 @@ def test_a_conversation_in_the_viewer(default, gpu):
         model.answers = None
 
 
-@pytest.mark.parametrize(("name", "width"), [("gathered", 3), ("lifting", 65)])
-def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, width):
+@pytest.mark.parametrize(("name", "width", "memory"), [("gathered", 3, 2.0), ("lifting", 65, 2.5e4)])
+def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, width, memory):
     """Wide features as principal components, a few channels at a time, sums on the CPU."""
     monkeypatch.setattr(CompressedField, "gathered_channels", 5)
-    monkeypatch.setattr("lang3dxl_ns.rendering.gathering.MEMORY", 2.0)
+    monkeypatch.setattr("lang3dxl_ns.rendering.gathering.MEMORY", memory)
     model = trained(iterations=3, pipeline__model__decoder__name=name).pipeline.model
     codes = model.gauss_params["codes"]
     assert codes.device == CUDA and codes.shape == (model.num_points, width)

@@ -9,6 +9,7 @@ from conftest import make_trainer
 from nerfstudio.utils.eval_utils import eval_setup
 
 from lang3dxl_ns.baselines.decoders import DecoderConfig, DecoderName
+from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
 
@@ -19,7 +20,8 @@ def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
     @cache
     def made(name: str, dense: bool = True):
         semantics = name != "none"
-        decoder = DecoderConfig(name, autoencoder_steps=20) if semantics else DecoderConfig()
+        few = CompressionConfig(steps=40, batch=512)
+        decoder = DecoderConfig(name, few, autoencoder_steps=20) if semantics else DecoderConfig()
         changes = {"pipeline__model__decoder": decoder}
         if not dense:
             changes["pipeline__datamanager__dense"] = "none"

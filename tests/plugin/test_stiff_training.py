@@ -73,7 +73,7 @@ def spoil(monkeypatch):
 def test_extreme_photos_among_usual_ones_break_nothing(train, scene, spoil):
     spoil({f"photo_{i:03d}.jpg": change for i, change in enumerate(EXTREMES, start=1)})
     changes = {"pipeline__model__densify_grad_thresh": 1e-7, "pipeline__model__appearance__use": "on"}
-    assert is_sound(train(scene, iterations=20, **changes, **QUIET))
+    assert is_sound(train(scene, iterations=14, **changes, **QUIET))
 
 
 @pytest.mark.parametrize("change", EXTREMES, ids=lambda change: change.__name__)
