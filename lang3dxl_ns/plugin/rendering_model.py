@@ -273,17 +273,12 @@ class RenderingModel(SplatfactoModel):
             visible = in_view(near, gaussians.means, gaussians.scales).nonzero().squeeze(1)
             with part("appearance"):
                 colors, in_photo = self.appearance(gaussians, colors, vector, visible, self.step)
-        antialiased, absgrad = self.config.rasterize_mode == "antialiased", self.strategy.absgrad
+        antialiased = self.config.rasterize_mode == "antialiased"
         settings: dict[str, Any] = {"backend": self.backend, "antialiased": antialiased}
-        moves = self.config.feature_gradient_to_geometry and features is not None
-        if in_photo is gaussians and not moves:
-            raster = rasterize(
-                gaussians.seen_from(view), view, colors, background,
-                features=features, absgrad=absgrad, **settings,
-            )  # fmt: skip
-            return raster, background
-        photo = rasterize(in_photo.seen_from(view), view, colors, background, absgrad=absgrad, **settings)
-        if features is None:
+        moves = self.config.feature_gradient_to_geometry
+        together = None if moves or in_photo is not gaussians else features
+        photo = rasterize(in_photo.seen_from(view), view, colors, background, features=together, **settings)
+        if together is features:
             return photo, background
         # Semantics and coverage belong to the scene, not to a photo, so they keep the scene's opacities.
         if moves:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
-from lang3dxl_ns.rendering.fused_plan import LOG2_E, make_plan
+from lang3dxl_ns.rendering.fused_plan import make_plan
 from lang3dxl_ns.rendering.fused_tiles import (
     CHANNELS_FROM,
     PIXELS,
@@ -63,7 +63,6 @@ class FusedCompositing(torch.autograd.Function):
         depths: Tensor,
         width: int,
         height: int,
-        absgrad: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
         plan = make_plan(
             means2d.view(-1, 2), conics, variances, depths, opacities, channels, detached_channels, width,
@@ -80,7 +79,7 @@ class FusedCompositing(torch.autograd.Function):
         in_threads(composite_tiles, [(tiles, *shared) for tiles in _parts(rows)])
         ctx.save_for_backward(means2d, conics, opacities)
         ctx.set_materialize_grads(False)
-        ctx.plan, ctx.trace, ctx.absgrad = plan, trace, absgrad
+        ctx.plan, ctx.trace = plan, trace
         return maps[0], maps[1], maps[2]
 
     @staticmethod
@@ -99,16 +98,12 @@ class FusedCompositing(torch.autograd.Function):
         dealt = [np.concatenate(parts[k::threads]) for k in range(min(threads, len(parts)))]
         columns = CHANNELS_FROM + plan.table.shape[1]
         sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
-        shared = plan, maps, ctx.trace, ctx.absgrad
-        in_threads(backward_tiles, [(tiles, *shared, sums[k]) for k, tiles in enumerate(dealt)])
-        found = [torch.zeros_like(part) for part in (positions, conics, opacities, positions)]
+        in_threads(backward_tiles, [(tiles, plan, maps, ctx.trace, sums[k]) for k, tiles in enumerate(dealt)])
+        found = [torch.zeros_like(part) for part in (positions, conics, opacities)]
         found += [opacities.new_zeros(len(opacities), size) for size in ctx.sizes[:2]]
         arrays = plan, conics.numpy(), opacities.numpy(), sums, _Gradients(*(g.numpy() for g in found))
         in_threads(_collect, [(*part, *arrays) for part in ranges(len(plan.order), least=4096)])
-        position, conic, opacity, absolutes, channels, detached = found
-        if ctx.absgrad:
-            means2d.absgrad = absolutes.view_as(means2d)
-        return position.view_as(means2d), conic, opacity, channels, detached, *[None] * 5
+        return found[0].view_as(means2d), *found[1:], *[None] * 4
 
 
 class _Gradients(NamedTuple):
@@ -117,7 +112,6 @@ class _Gradients(NamedTuple):
     position: Float[np.ndarray, "n 2"]
     conic: Float[np.ndarray, "n 3"]
     opacity: Float[np.ndarray, " n"]
-    absolutes: Float[np.ndarray, "n 2"]
     channels: Float[np.ndarray, "n c"]
     detached: Float[np.ndarray, "n d"]
 
@@ -146,7 +140,6 @@ def _collect(first, last, plan, conics, opacities, sums, found) -> None:
         # dx and dy point from the center to the pixel.
         found.position[g, 0], found.position[g, 1] = a * row[3] + b * row[4], b * row[3] + c * row[4]
         found.opacity[g] = row[5] / opacities[g]
-        found.absolutes[g, 0], found.absolutes[g, 1] = row[6] * (2 / LOG2_E), row[7] * (2 / LOG2_E)
         for k in range(found.channels.shape[1]):
             found.channels[g, k] = row[CHANNELS_FROM + k]
         for k in range(found.detached.shape[1]):

@@ -19,7 +19,6 @@ from lang3dxl_ns.rendering.fused_plan import SPLAT_COLUMNS, TILE, UNROLL
 from lang3dxl_ns.rendering.gaussians import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from lang3dxl_ns.rendering.simd import (
     LANES,
-    absolute,
     bits,
     entry,
     exp2,
@@ -34,9 +33,9 @@ from lang3dxl_ns.rendering.simd import (
 
 WAVE = 32
 PIXELS = TILE * TILE
-CHANNELS_FROM = 8
-"""First channel column of a row's gradients. The eight columns before it are the conic (xx, xy, yy), first
-moments (x, y), ln opacity, and sums of the absolute pixel gradients of the screen position (x, y)."""
+CHANNELS_FROM = 6
+"""First channel column of a row's gradients. The six columns before it are the conic (xx, xy, yy), first
+moments (x, y), and ln opacity."""
 _BLOCKS = PIXELS // LANES
 _BLOCK_WIDTH, _BLOCK_HEIGHT = 8, 2
 _REACH = math.log2(ALPHA_MIN) - 0.01  # with a margin for rounding
@@ -224,7 +223,7 @@ def composite_tiles(tiles, plan, maps, trace, keep):
 
 
 @kernel
-def backward_tiles(tiles, plan, maps, trace, absolutes, sums):
+def backward_tiles(tiles, plan, maps, trace, sums):
     """Sum the gradients of some tiles per visible Gaussian. `maps` has the gradients of the output maps.
 
     Waves are processed from the back. In each, alpha and weight are recomputed front to back, then used in
@@ -280,7 +279,7 @@ def backward_tiles(tiles, plan, maps, trace, absolutes, sums):
                     rank = plan.ranks[begin + k]
                     splat = _splat(plan.splats, rank, corner_x, corner_y)
                     _add_values(plan, upstream, rank, first, last, found)
-                    _add_shape(across, down, splat, first, last, found, behind, absolutes, zero, sums[rank])
+                    _add_shape(across, down, splat, first, last, found, behind, zero, sums[rank])
                     _add_channels(upstream, first, last, found, channels, zero, sums[rank])
 
 
@@ -318,9 +317,9 @@ def _add_values(plan, upstream, rank, first, last, found):
 
 
 @numba.njit(forceinline=True)
-def _add_shape(across, down, splat, first, last, found, behind, absolutes, zero, sums):
+def _add_shape(across, down, splat, first, last, found, behind, zero, sums):
     """Add the gradients of a row's conic, moments and opacity, and move `behind` in front of it."""
-    m, mx, my, mxx, mxy, myy, abs_x, abs_y = zero, zero, zero, zero, zero, zero, zero, zero
+    m, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
     for slot in range(first, last):
         at = entry(found.places, slot)
         dx, dy = load(across, at) - splat.x, load(down, at) - splat.y
@@ -335,19 +334,12 @@ def _add_shape(across, down, splat, first, last, found, behind, absolutes, zero,
         mxx += slope_x * dx
         mxy += slope_x * dy
         myy += slope_y * dy
-        if absolutes:
-            tilt = (dx + dy * splat.shear) * splat.steepness
-            abs_x += absolute(slope * tilt)
-            abs_y += absolute(slope * (tilt * splat.shear + dy * splat.rise))
     sums[0] += total(mxx)
     sums[1] += total(mxy)
     sums[2] += total(myy)
     sums[3] += total(mx)
     sums[4] += total(my)
     sums[5] += total(m)
-    if absolutes:
-        sums[6] += total(abs_x)
-        sums[7] += total(abs_y)
 
 
 @numba.njit(forceinline=True)
