@@ -1,6 +1,8 @@
-"""Initial Gaussians of training: one per COLMAP point, and a sky."""
+"""Initial Gaussians of training: one per COLMAP point, and a sky; the extent of a scene."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 import torch.nn.functional as F
@@ -11,7 +13,6 @@ from torch.nn import Parameter
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.rendering.splats import harmonics_of
-from lang3dxl_ns.scene.geometry import sphere_around
 
 FIRST_OPACITY = 0.1
 FEWEST = 4
@@ -75,3 +76,18 @@ def _spacing(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
     spacing = torch.from_numpy(distances).float().mean(dim=-1, keepdim=True)
     # Coincident points would make Gaussians of zero size.
     return spacing.clamp_min(1e-3 * float(spacing.median().clamp_min(1e-6)))
+
+
+def center_and_radius(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], float]:
+    """Compute the median point of a scene, and the radius around it that contains 90 % of the points."""
+    center = points.median(dim=0).values
+    return center, float((points - center).norm(dim=1).quantile(0.9))
+
+
+def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "count 3"]:
+    """Spread points evenly (as a Fibonacci lattice) on a sphere of ten times the scene's radius."""
+    center, radius = center_and_radius(points)
+    i = torch.arange(count) + 0.5
+    z, longitude = 1 - 2 * i / count, i * math.pi * (3 - math.sqrt(5))
+    around = (1 - z * z).sqrt()
+    return center + 10 * radius * torch.stack([around * longitude.cos(), around * longitude.sin(), z], dim=1)

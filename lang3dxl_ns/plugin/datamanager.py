@@ -11,7 +11,6 @@ from typing import Any, Literal, cast
 
 import torch
 import tyro
-from jaxtyping import Bool
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
@@ -40,7 +39,7 @@ from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.handover import Batch, SceneFacts
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
-from lang3dxl_ns.preparation.needs import Need, Sources, needs_table, scene_needs
+from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
@@ -259,12 +258,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @cached_property
     def needs(self) -> list[Need]:
         """Needs of the scene for optional components, measured on first use."""
-        learns = self.config.clip != "none"
-        sources = Sources(
-            dense=learns and self.config.makes_dense,
-            regions=learns and self._region_source is not None,
+        learns, photos = self.config.clip != "none", list(self.photos.values())
+        dense, regions = self.config.makes_dense, self._region_source is not None
+        return scene_needs(
+            photos, self._reconstruction(), self.crop_plan, learns and dense, learns and regions
         )
-        return scene_needs(list(self.photos.values()), self._reconstruction(), self.crop_plan, sources)
 
     @cached_property
     def photos(self) -> dict[str, Photo]:
@@ -279,10 +277,6 @@ class Lang3DXLDataManager(FullImageDatamanager):
         for dataset in datasets:
             dataset.photos[:] = [photos[photo.name] for photo in dataset.photos]
         return photos
-
-    def foreground(self, name: str) -> Bool[Tensor, "h w"] | None:
-        """Return a photo's foreground at training resolution; None if it is the whole photo."""
-        return self._working.mask(self.photos[name], self.config.camera_res_scale_factor)
 
     def scene_file(self) -> SceneFile:
         """Describe the scene for the run's folder: photos, cameras and CLIP."""

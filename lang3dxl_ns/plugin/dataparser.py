@@ -27,6 +27,7 @@ from lang3dxl_ns.preparation.photo_collection import (
     MODEL_FOLDERS,
     OWN_MODEL,
     TRANSFORMS,
+    find_colmap_model,
     images_path,
     usable_photos,
 )
@@ -326,19 +327,17 @@ def parser_for(
     data = expanded(parser.data).absolute()
     if is_video(data) or (not data.exists() and frames_folder(data).is_dir()):
         data = parser.data = extract_frames(data) if may_reconstruct else frames_folder(data)
-    named = parser.colmap_path
-    folders: tuple[Path, ...] = (named, *MODEL_FOLDERS, OWN_MODEL)
+    named, usual = parser.colmap_path, type(parser)().colmap_path
+    folders = [named, *MODEL_FOLDERS, OWN_MODEL]
     if cache_dir is not None:
-        folders = (*folders, expanded(cache_dir).absolute() / "reconstruction/sparse/0")
-    known = next((f for f in folders if any((data / f).glob("images.*"))), None)
+        folders.append(expanded(cache_dir).absolute() / "reconstruction/sparse/0")
+    known = find_colmap_model(data, folders)
     if known is not None:
         parser.colmap_path = known
     elif (data / TRANSFORMS).is_file():
         CONSOLE.log(f"{data} has a {TRANSFORMS} and no COLMAP model: read as nerfstudio-data")
         return NerfstudioDataParserConfig(data=data)
-    elif (
-        may_reconstruct and named == type(parser)().colmap_path and data.is_dir() and find_photos(data).names
-    ):
+    elif may_reconstruct and named == usual and data.is_dir() and find_photos(data).names:
         data, model = reconstruct_scene(data, cache_dir)
         parser.colmap_path = model.relative_to(data) if model.is_relative_to(data) else model
     elif may_reconstruct and data.is_dir() and not any(data.iterdir()):

@@ -25,7 +25,12 @@ from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
 from lang3dxl_ns.components.bounds import EVERY, FREE, keep_in_bounds
-from lang3dxl_ns.components.initialization import color_parameters, initial_gaussians, seed_positions
+from lang3dxl_ns.components.initialization import (
+    center_and_radius,
+    color_parameters,
+    initial_gaussians,
+    seed_positions,
+)
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
@@ -33,7 +38,6 @@ from lang3dxl_ns.plugin.optional_components import build_components, component_p
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.handover import Batch
-from lang3dxl_ns.scene.geometry import center_and_radius
 
 DECODE_SIZES = 5
 """Number of sizes at which code maps are decoded in training."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -18,7 +20,6 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.dense_map import mean_of_sizes
 from lang3dxl_ns.preparation.families import FAMILIES, Family, input_side, patch_tokens, vision_inputs
-from lang3dxl_ns.preparation.light import in_known_light
 from lang3dxl_ns.preparation.model_files import (
     BUILTIN,
     CLIP_OPTION,
@@ -40,6 +41,10 @@ _NORMALIZE_THEMSELVES = ("radio",)
 """Vision transformers that take pictures in 0…1."""
 _HEAD_ROWS = 16
 """Number of rows of a map that a head for patches reads at once, to bound memory."""
+_DIM = 0.75
+"""Share of the known brightness below which a photo is dark; nearly all photos of landmarks are above it."""
+_DARKEST = 0.02
+"""Lower bound on a photo's mean brightness, so that black photos stay black and exponents stay moderate."""
 _VOCABULARIES = (
     ("tokenizer.json",),
     ("vocab.json", "merges.txt"),
@@ -162,25 +167,17 @@ def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> Pat
 
 
 def usual_dense(config: PreparationConfig, learned: bool) -> str:
-    """Resolve the dense encoder "auto" of a configuration.
-
-    Args:
-        config: settings; another name than "auto" is returned as it is.
-        learned: whether the semantics learn dense features, as in the paper, instead of sharpening by them.
-    """
+    """Resolve the dense encoder "auto" of a configuration; another name is returned as it is. `learned` says
+    whether the semantics learn dense features, as in the paper, instead of sharpening by them."""
     if config.dense != "auto":
         return config.dense
-    if not learned and _has_head(config):
-        return "none"
+    with suppress(
+        UserError
+    ):  # `check_encoders` reports a missing CLIP, together with a missing dense encoder
+        reading = None if learned else patch_reading(config.clip, config.clip_features)
+        if reading is not None and reading.sizes is not None:
+            return "none"
     return BUILTIN if config.clip == BUILTIN else DENSE_MODEL
-
-
-def _has_head(config: PreparationConfig) -> bool:
-    try:
-        reading = patch_reading(config.clip, config.clip_features)
-    except UserError:  # `check_encoders` reports a missing CLIP, together with a missing dense encoder
-        return False
-    return reading is not None and reading.sizes is not None
 
 
 def _family(files: ModelFiles) -> Family:
@@ -307,6 +304,20 @@ def _say_what_builtin_knows() -> None:
         "The built-in CLIP knows landmarks and street façades and nothing else; a real one knows more: "
         f"{spoken(CLIP_OPTION)} openai/clip-vit-base-patch32"
     )
+
+
+def in_known_light(photo: Float[Tensor, "h w 3"], brightness: float) -> Float[Tensor, "h w 3"]:
+    """Bring a dark photo (RGB in 0…1) to about this mean, the same in all channels; others stay unchanged.
+
+    A gamma curve sets the brightness, which keeps black and white. Then each channel is multiplied (gray
+    world), which removes a tint. Encoders trained on millions of photos need neither.
+    """
+    mean = max(float(photo.mean()), _DARKEST)
+    if mean >= _DIM * brightness:
+        return photo
+    lit = photo ** (math.log(brightness) / math.log(mean))
+    channels = lit.mean((0, 1))
+    return (lit * (channels.mean() / channels.clamp_min(_DARKEST))).clamp(0, 1)
 
 
 def _channels(values: Sequence[float], device: torch.device) -> Float[Tensor, "3 1 1"]:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.scene.photo import Photo
 
 logger = logging.getLogger(__name__)
@@ -122,7 +122,7 @@ class FeatureStore:
                 metadata = file.metadata()
                 if _canonical(json.loads(metadata["settings"])) != _canonical(settings):
                     return False
-                if _is_sealed(path):
+                if path.stat().st_mtime_ns % _SECOND == 0:  # sealed
                     return True
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
                 if metadata.get("checksum") != _checksum(tensors):
@@ -138,8 +138,9 @@ class FeatureStore:
 
         A file is read once, and again if its size, modification time or inode has changed.
         """
-        path = self.root / _HASHES
-        known = _read_json(path)
+        path, known = self.root / _HASHES, dict[str, Any]()
+        with contextlib.suppress(OSError, ValueError, TypeError):  # missing or damaged
+            known = dict(read_json(path))
 
         def look(photo: Photo) -> tuple[str | UserError, list[Any] | None]:
             try:
@@ -233,18 +234,6 @@ def _seal(path: Path) -> None:
     with contextlib.suppress(OSError):
         seconds = path.stat().st_mtime_ns // _SECOND
         os.utime(path, ns=(seconds * _SECOND, seconds * _SECOND))
-
-
-def _is_sealed(path: Path) -> bool:
-    return path.stat().st_mtime_ns % _SECOND == 0
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; empty for a file that is missing or damaged."""
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        content = json.loads(path.read_text())
-        return content if isinstance(content, dict) else {}
-    return {}
 
 
 def _canonical(settings: dict[str, Any]) -> str:
