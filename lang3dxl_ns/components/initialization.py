@@ -1,4 +1,7 @@
-"""Initial Gaussians of training: one per COLMAP point, and a sky; the extent of a scene."""
+"""Gaussians of training: the initial ones, one per COLMAP point and a sky; bounds on all of them.
+
+Gaussians that few photos see may grow into sheets across the scene, or float where only new views see them.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,31 @@ import math
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import Parameter
 
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.rendering.splats import harmonics_of
 
 FIRST_OPACITY = 0.1
 FEWEST = 4
 """Smallest number of positions, so that each has three neighbors."""
+
+LONGEST = 1.0
+"""Longest standard deviation, relative to the scene's radius or, outside, to the distance from its center."""
+NEEDLE = 0.25
+"""Like `LONGEST`, for Gaussians more than twice as long as wide; ground and distant hills are wide."""
+EVERY = 10
+"""Training steps between two corrections; with harmonics, one takes a fifth of the time of a short step."""
+FREE = 0.02
+"""Radius of the space around every training camera that stays empty, relative to the scene's radius."""
+_STEEPEST = 0.5
+"""Largest norm of a color's harmonics above degree 0, per channel."""
+_ROWS = 16_384
+"""Number of Gaussians processed at a time, to bound memory."""
 
 
 def seed_positions(
@@ -91,3 +108,35 @@ def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "co
     z, longitude = 1 - 2 * i / count, i * math.pi * (3 - math.sqrt(5))
     around = (1 - z * z).sqrt()
     return center + 10 * radius * torch.stack([around * longitude.cos(), around * longitude.sin(), z], dim=1)
+
+
+@torch.no_grad()
+def keep_in_bounds(
+    gaussians: torch.nn.ParameterDict, center: Float[Tensor, "3"], radius: float, first: int, degree: int
+) -> None:
+    """Shorten Gaussians that are too long and bring their colors to 0…1, in place.
+
+    Args:
+        gaussians: parameters like those of `initial_gaussians`.
+        center, radius: center and radius of the scene, world units.
+        first: row of the first Gaussian to change; those before it are the sky's.
+        degree: degree of the colors' spherical harmonics.
+    """
+    g = {name: parameter[first:] for name, parameter in gaussians.items()}
+    away = (g["means"] - to_device(center, g["means"].device)).norm(dim=1, keepdim=True).clamp_min(radius)
+    wide = 2 * g["scales"].median(dim=1, keepdim=True).values.exp()
+    longest = wide.maximum(NEEDLE * away).minimum(LONGEST * away)
+    g["scales"].copy_(g["scales"].minimum(longest.log()))
+    if degree > 0:  # otherwise colors are logits
+        g["features_dc"].clamp_(*color_parameters(torch.tensor([[0.0], [1.0]]), degree).flatten().tolist())
+        norms = g["features_rest"].norm(dim=1, keepdim=True)
+        g["features_rest"].mul_(_STEEPEST / norms.clamp_min(_STEEPEST))
+
+
+@torch.no_grad()
+def near_cameras(
+    means: Float[Tensor, "n 3"], cameras: Float[Tensor, "p 3"], distance: float
+) -> Bool[Tensor, " n"]:
+    """Return which positions lie within a distance of any of the cameras, all in world units."""
+    cameras = cameras.to(means)
+    return torch.cat([torch.cdist(some, cameras).amin(1) < distance for some in means.split(_ROWS)])

@@ -24,11 +24,13 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
-from lang3dxl_ns.components.bounds import EVERY, FREE, keep_in_bounds
 from lang3dxl_ns.components.initialization import (
+    EVERY,
+    FREE,
     center_and_radius,
     color_parameters,
     initial_gaussians,
+    keep_in_bounds,
     seed_positions,
 )
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes

@@ -22,7 +22,6 @@ from torch import Tensor
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.stages import roughly
-from lang3dxl_ns.preparation.crop_budget import USUAL_INPUT, Crops, choose_crops
 from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids, nested_grids
 from lang3dxl_ns.preparation.encoders import (
     DenseEncoder,
@@ -39,7 +38,7 @@ from lang3dxl_ns.preparation.model_files import (
     read_config,
     spoken,
 )
-from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
+from lang3dxl_ns.preparation.pyramid import THIRD, USUAL_INPUT, Crops, build_clip_target, choose_crops
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
-from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+from lang3dxl_ns.scene.colmap import load_pycolmap
 
 if TYPE_CHECKING:
     import pycolmap

@@ -27,7 +27,7 @@ from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
-from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
 from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs, rotations_of

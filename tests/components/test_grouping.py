@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.components import grouping
-from lang3dxl_ns.components.grouping import sharpen
+from lang3dxl_ns.components.learn_codes import sharpen
 
 
 def scene(count=3000, seed=0, kinds=4):
