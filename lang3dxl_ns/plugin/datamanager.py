@@ -9,6 +9,7 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import numpy as np
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
@@ -33,7 +34,7 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for, recorded_scene
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
-from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset, novel_outputs, novel_pixel_sizes
+from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset, novel_outputs
 from lang3dxl_ns.preparation.collection import CropPlan, plan_crops, prepare_collection
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
@@ -41,6 +42,7 @@ from lang3dxl_ns.preparation.handover import Batch, SceneFacts
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
+from lang3dxl_ns.preparation.physical_scale import pixel_size
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -244,12 +246,17 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return plan_crops(list(self.photos.values()), self._reconstruction(), self.config)
 
     def test_pixel_sizes(self, photos: list[Photo]) -> dict[str, float] | None:
-        """Return the world units per pixel of the test views' photos; None if crops are relative."""
+        """Return the world units per pixel of the test views' photos, by the same rules as for all others;
+        None if crops are relative."""
         if self.crop_plan.pixel_sizes is None or self.test_views is None:
             return None
-        sizes = novel_pixel_sizes(self.test_views, self.config)  # per pixel of the views' files
-        widths = {view.name: view.width for view in self.test_views.cameras}
-        return {photo.name: sizes[photo.name] * widths[photo.name] / photo.width for photo in photos}
+        views, rules = self.test_views.cameras, (self.config.pixel_distance, self.config.pixel_angle)
+        sizes = {
+            view.name: (pixel_size(view, *rules), view.width) for view in views
+        }  # per pixel of the files
+        usual = float(np.median([size for size, _ in sizes.values() if size is not None]))
+        named = ((photo, *sizes[photo.name]) for photo in photos)
+        return {p.name: (usual if size is None else size) * width / p.width for p, size, width in named}
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
@@ -378,11 +385,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def round_state(self) -> dict[str, Any]:
         """Return the photos left in this round, and the state that determines the next, for a checkpoint."""
-        names = [photo.name for photo in self.train_dataset.photos]
-        generator = getattr(self, "random_generator", None)  # "fps" sampling has none
+        photos, generator = self.train_dataset.photos, getattr(self, "random_generator", None)
         return {
-            "upcoming": [names[i] for i in self.train_unseen_cameras],
-            "generator": generator and generator.getstate(),
+            "upcoming": [photos[i].name for i in self.train_unseen_cameras],
+            "generator": generator and generator.getstate(),  # "fps" sampling has none
         }
 
     def restore_round(self, state: dict[str, Any]) -> None:

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 import torch
 from conftest import make_trainer
-from lang3dxl_ns.scene.stand import stand_of
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
 from scenes import view_of, write_scene
 
-from lang3dxl_ns.plugin.panel import INVITATION, least_size
+from lang3dxl_ns.plugin.panel import INVITATION, least_size, stand_of
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 from lang3dxl_ns.query import conversation as session
 from lang3dxl_ns.query.query_config import QueryConfig
