@@ -60,10 +60,8 @@ def make_decoder(
     center: Float[Tensor, "3"],
     radius: float,
 ) -> Decoder:
-    """Build the feature decoder that `config` names.
-
-    `settings` applies to decoders with a hash grid; `center` and `radius` are the scene's, in world units.
-    """
+    """Build the feature decoder that `config` names. `settings` applies to decoders with a hash grid;
+    `center` and `radius` are the scene's, in world units."""
     if config.name == "feature3dgs":
         decoder: Decoder = Feature3DGS(clip_dim, dense_dim)
     elif config.name == "fmgs":

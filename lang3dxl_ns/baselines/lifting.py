@@ -16,9 +16,8 @@ _LEAST_COVERAGE = 1e-4
 class LiftedFeatures(Decoder):
     """Decoder of features that are averaged onto the Gaussians after training, by contribution.
 
-    Gaussians carry nothing in training. Afterwards they carry the lifted features and a 1, whose rendering is
-    the coverage. So a map is the mean feature of the visible Gaussians, however little of a pixel they cover.
-    """
+    Gaussians then also carry a 1, whose rendering is the coverage. So a map is the mean feature of the
+    visible Gaussians, however little of a pixel they cover."""
 
     needs_lifting = True
 

@@ -39,11 +39,9 @@ _ROWS = 16_384
 def seed_positions(
     points: tuple[Tensor, Tensor] | None, count: int, side: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Choose the initial positions of Gaussians and their colors (0…1).
-
-    They are those of the points (whose colors are bytes) or, without points, `count` random ones in a box
-    with this side in world units. Raises UserError if there are too few points.
-    """
+    """Choose the initial positions of Gaussians and their colors (0…1): those of the points (whose colors are
+    bytes) or, without points, `count` random ones in a box with this side in world units. Raises UserError if
+    there are too few points."""
     if points is None:
         return (torch.rand(count, 3) - 0.5) * side, torch.rand(count, 3)
     if len(points[0]) < FEWEST:
@@ -57,16 +55,9 @@ def seed_positions(
 def initial_gaussians(
     means: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], sky: int, degree: int
 ) -> dict[str, Parameter]:
-    """Create the parameters of the sky's Gaussians, then of one Gaussian per position.
-
-    Gaussians are as wide as the mean distance to their three nearest neighbors.
-
-    Args:
-        means: at least `FEWEST` positions, world units.
-        colors: colors at these positions, 0…1.
-        sky: number of Gaussians on a sphere around the positions.
-        degree: degree of the colors' spherical harmonics.
-    """
+    """Create the parameters of the sky's Gaussians (`sky` of them, on a sphere around the positions), then of
+    one Gaussian per position, as wide as the mean distance to its three nearest neighbors. There are at least
+    `FEWEST` positions (world units), with colors in 0…1, stored as spherical harmonics of a degree."""
     sphere = sphere_around(means, sky)
     means = torch.cat([sphere, means])
     colors = torch.cat([torch.full_like(sphere, 0.5), colors])
@@ -114,14 +105,9 @@ def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "co
 def keep_in_bounds(
     gaussians: torch.nn.ParameterDict, center: Float[Tensor, "3"], radius: float, first: int, degree: int
 ) -> None:
-    """Shorten Gaussians that are too long and bring their colors to 0…1, in place.
-
-    Args:
-        gaussians: parameters like those of `initial_gaussians`.
-        center, radius: center and radius of the scene, world units.
-        first: row of the first Gaussian to change; those before it are the sky's.
-        degree: degree of the colors' spherical harmonics.
-    """
+    """Shorten Gaussians that are too long and bring their colors to 0…1, in place. Those before row `first`
+    are the sky's, and stay. `center` and `radius` are the scene's, in world units; `degree` is that of the
+    colors' spherical harmonics."""
     g = {name: parameter[first:] for name, parameter in gaussians.items()}
     away = (g["means"] - to_device(center, g["means"].device)).norm(dim=1, keepdim=True).clamp_min(radius)
     wide = 2 * g["scales"].median(dim=1, keepdim=True).values.exp()

@@ -98,13 +98,9 @@ def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:
 def sharpen(
     features: Float[Tensor, "n c"], dense: Float[Tensor, "n r"], mass: Float[Tensor, " n"]
 ) -> Float[Tensor, "n c"]:
-    """Move features half the way to the mean of their group, which keeps the sum of mass · feature.
-
-    Args:
-        features: gathered CLIP features of each Gaussian.
-        dense: gathered dense features, or their coordinates in an orthonormal basis.
-        mass: pixels that each Gaussian fills, weighted; one without mass keeps its features, affecting none.
-    """
+    """Move features half the way to the mean of their group, which keeps the sum of mass · feature. `dense`
+    are gathered dense features, or their coordinates in an orthonormal basis; `mass` the pixels that each
+    Gaussian fills, weighted. One without mass keeps its features, affecting none."""
     seen = mass > 0
     if not seen.any():
         return features

@@ -349,10 +349,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return usable
 
     def next_train(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
-        """Return camera and batch of the next training photo; every photo appears once per round.
-
-        A photo found to be damaged is left out from then on, and logged.
-        """
+        """Return camera and batch of the next training photo; every photo appears once per round. A photo
+        found to be damaged is left out from then on, and logged."""
         while True:
             index = self.train_unseen_cameras.pop(0)
             if not self.train_unseen_cameras:
@@ -443,12 +441,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
 
     def _read(self, dataset: PhotoDataset, index: int, with_targets: bool = True) -> dict[str, Any]:
-        """Read a photo's data for a step as they are kept in memory: bytes and half precision.
-
-        The data are `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target`
-        [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions`
-        [h, w] (labels, −1 for none).
-        """
+        """Read a photo's data for a step as they are kept in memory: bytes and half precision. The data are
+        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target` [Hd, Wd, C],
+        `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
+        (labels, −1 for none)."""
         data: dict[str, Any] = dict(dataset.read(index))
         if self.targets is not None and with_targets:
             name = dataset.photos[index].name

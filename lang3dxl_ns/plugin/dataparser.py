@@ -148,9 +148,8 @@ class PhotoCollectionDataParser(ColmapDataParser):
     @cached_property
     def _origin(self) -> np.ndarray:
         """Center of the cameras, which is subtracted from positions as the origin while they are in float64.
-
-        The parent casts to float32, which resolves map coordinates (millions of meters) only to half a meter.
-        """
+        The parent casts to float32, which resolves map coordinates (millions of meters) only to half a
+        meter."""
         return np.zeros(3) if self.config.center_method == "none" else self._centers.mean(axis=0)
 
     @property
@@ -302,10 +301,8 @@ def parser_for(
     parser: PhotoCollectionDataParserConfig, cache_dir: Path | None, may_reconstruct: bool
 ) -> DataParserConfig:
     """Choose the dataparser for `parser.data`. Photos without a model are reconstructed, if allowed; a video
-    becomes a folder of frames. A folder with only a transforms.json gets nerfstudio's own parser.
-
-    Raises UserError if the photos don't make a scene.
-    """
+    becomes a folder of frames. A folder with only a transforms.json gets nerfstudio's own parser. Raises
+    UserError if the photos don't make a scene."""
     data = expanded(parser.data).absolute()
     if is_video(data) or (not data.exists() and frames_folder(data).is_dir()):
         data = parser.data = extract_frames(data) if may_reconstruct else frames_folder(data)

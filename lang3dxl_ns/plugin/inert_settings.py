@@ -33,10 +33,8 @@ _OF_RENDERINGS = (
 
 
 def check_inert(model: Any, data: Any) -> None:
-    """Raise UserError if a setting that has no effect in this run differs from its default.
-
-    model, data: settings of the model and of the data manager.
-    """
+    """Raise UserError if a setting that has no effect in this run differs from its default. model, data:
+    settings of the model and of the data manager."""
     changed = [
         *_changed(model, OF_SPLATFACTO, "--pipeline.model."),
         *_changed(data, OF_IMAGE_CACHES, "--pipeline.datamanager."),

@@ -27,11 +27,7 @@ from lang3dxl_ns.scene.photo import Photo
 
 class PhotoDataset(InputDataset):
     """nerfstudio's dataset over `Photo`s: upright, undistorted and resized on demand, with pinhole cameras.
-
-    Args:
-        scale: scale of the pictures that are read, relative to the photos.
-        working: source of the photos at their size.
-    """
+    `scale` is that of the pictures relative to the photos, which `working` reads at their size."""
 
     def __init__(self, outputs: DataparserOutputs, scale: float, working: WorkingPhotos):
         super().__init__(outputs)

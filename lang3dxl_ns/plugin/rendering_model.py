@@ -101,13 +101,12 @@ class RenderingModel(SplatfactoModel):
     def splats(self) -> Splats:
         """Return the present Gaussians, which share memory with the model; `scene` takes copies."""
         g = {name: parameter.detach() for name, parameter in self.gauss_params.items()}
-        shapes = self.activated(g)
-        harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
         if self.config.sh_degree > 0:
-            coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
-            harmonics = coefficients[:, : (self.degree + 1) ** 2]
+            harmonics = _coefficients(g)[:, : (self.degree + 1) ** 2]
+        else:
+            harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
         antialiased = self.config.rasterize_mode == "antialiased"
-        return Splats(shapes.means, shapes.quats, shapes.scales, shapes.opacities, harmonics, antialiased)
+        return Splats(*vars(self.activated(g)).values(), harmonics, antialiased)
 
     @torch.no_grad()
     def scene(
@@ -119,11 +118,9 @@ class RenderingModel(SplatfactoModel):
         cache: Path | None = None,
         watch: Callable[[str], None] | None = None,
     ) -> Scene:
-        """Copy the present state to a separate scene, which later training doesn't change.
-
-        file: photos, cameras and CLIP. For the other arguments see `Scene`. While a model has no words yet,
-        its scene has colors only.
-        """
+        """Copy the present state to a separate scene, which later training doesn't change, with the photos,
+        cameras and CLIP of a file; for the other arguments see `Scene`. While a model has no words yet, its
+        scene has colors only."""
         codes, looks = self.carried, self.appearance
         return Scene(
             self.splats().copied(),
@@ -150,9 +147,8 @@ class RenderingModel(SplatfactoModel):
         start, answers = time.perf_counter(), self.answers
         if answers is None:
             return self.get_outputs(camera)  # type: ignore[return-value]
-        asked = answers.channels()
         colors = self._code_colors() if answers.shows_bottleneck else None
-        rendering, outputs = self._shown(camera, asked, colors)
+        rendering, outputs = self._shown(camera, answers.channels(), colors)
         found = answers.outputs(rendering, time.perf_counter() - start)
         return {"rgb": outputs["rgb"], **found, **outputs}
 
@@ -166,31 +162,23 @@ class RenderingModel(SplatfactoModel):
     def seen(
         self, camera: Cameras, look: Look | None = None, channels: Float[Tensor, "n d"] | None = None
     ) -> Rendering:
-        """Render the present Gaussians from a camera, under a look (default: by the appearance's rule).
-
-        channels: further values to composite.
-        """
-        view = to_rasterizer(camera)
+        """Render the present Gaussians, and composite further `channels`, from a camera, under a look
+        (default: by the appearance's rule)."""
+        view, splats, background = to_rasterizer(camera), self.splats(), self._get_background_color()
         if look is None and self.appearance is not None:
             look = self.appearance.of_view(view)
-        splats, keep = self.splats(), None
         if self.crop_box is not None:
             keep = self.crop_box.within(splats.means).squeeze(-1)
             splats, channels = splats.select(keep), None if channels is None else channels[keep]
-        background = self._get_background_color()
         return render_in_look(splats, view, look, channels, background=background, backend=self.backend)
 
     def _shown(
-        self,
-        camera: Cameras,
-        asked: Float[Tensor, "n d"] | None,
-        colors: Float[Tensor, "n 3"] | None,
+        self, camera: Cameras, asked: Float[Tensor, "n d"] | None, colors: Float[Tensor, "n 3"] | None
     ) -> tuple[Rendering, dict[str, Tensor]]:
         """Return a rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
         parts = [part for part in (asked, colors) if part is not None]
         rendering = self.seen(camera, channels=torch.cat(parts, dim=1) if parts else None)
-        background = self._get_background_color().expand_as(rendering.rgb)
-        depth = rendering.depth
+        background, depth = self._get_background_color().expand_as(rendering.rgb), rendering.depth
         outputs = {
             "rgb": rendering.rgb,
             "accumulation": rendering.alpha[..., None],
@@ -310,8 +298,11 @@ class RenderingModel(SplatfactoModel):
         if self.config.sh_degree == 0:
             return torch.sigmoid(g["features_dc"])
         directions = g["means"].detach() - camera_center
-        coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
-        return (spherical_harmonics(self.degree, directions, coefficients) + 0.5).clamp_min(0.0)
+        return (spherical_harmonics(self.degree, directions, _coefficients(g)) + 0.5).clamp_min(0.0)
+
+
+def _coefficients(g: Mapping[str, Tensor]) -> Float[Tensor, "n k 3"]:
+    return torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
 
 
 def _frozen(module: Any) -> Any:

@@ -56,9 +56,7 @@ class _Stopped(BaseException):
 @contextmanager
 def _disk_kept_out_of_training() -> Iterator[None]:
     """Let training continue if its log (tensorboard's events) can't be written, as on a full disk.
-
-    tensorboard's own thread keeps such an error, and raises it in the step that adds to the log.
-    """
+    tensorboard's own thread keeps such an error, and raises it in the step that adds to the log."""
     write = writer.write_out_storage
 
     def guarded() -> None:
@@ -205,10 +203,8 @@ class Lang3DXLTrainer(Trainer):
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run), then
-        learn words. A run that was stopped between the two learns words only.
-
-        Raises SystemExit after a signal stopped the run: 130 for Ctrl-C, 143 for SIGTERM.
-        """
+        learn words. A run that was stopped between the two learns words only. Raises SystemExit after a
+        signal stopped the run: 130 for Ctrl-C, 143 for SIGTERM."""
         total = self.config.max_num_iterations
         if self.is_finished:
             raise UserError(
@@ -377,9 +373,7 @@ class Lang3DXLTrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write the checkpoint beside its folder and move it in, so that a killed run leaves no partial one.
-
-        If it can't be written, training continues; at the end of training, UserError is raised.
-        """
+        If it can't be written, training continues; at the end of training, UserError is raised."""
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         partial = self.base_dir / f"{path.name}.partial"
         state = {

@@ -152,10 +152,8 @@ class PatchReading:
 
 
 def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
-    """Return how an encoder (a name or folder) makes maps; None if it reads crops alone.
-
-    Raises UserError like `load_image_text_encoder`.
-    """
+    """Return how an encoder (a name or folder) makes maps; None if it reads crops alone. Raises UserError
+    like `load_image_text_encoder`."""
     files = find_model(clip, CLIP_OPTION)
     family, head = _family(files), head_recipe(files.folder)
     by_crops = (family.features if features == "auto" else features) == "crops"
@@ -210,9 +208,7 @@ class DenseEncoder:
     @torch.no_grad()
     def encode(self, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "t t d"]:
         """Normalized patch tokens of the last layer, float32, for a photo (RGB in 0…1) squashed to a square.
-
-        Token (i, j) covers rows i/t…(i+1)/t and columns j/t…(j+1)/t of the photo.
-        """
+        Token (i, j) covers rows i/t…(i+1)/t and columns j/t…(j+1)/t of the photo."""
         image = _resize(photo.to(self._device, torch.float32).permute(2, 0, 1)[None], self._side)
         with _half_precision_on_cuda(self._device):
             output = self._model(pixel_values=(image - self._mean) / self._std, **self._arguments)
@@ -222,10 +218,8 @@ class DenseEncoder:
 
 
 def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str) -> ImageTextEncoder:
-    """An image-text encoder in Hugging Face format, from a folder, by name, or "builtin".
-
-    Raises UserError if it can't be found or downloaded, is of no known family, or is incomplete.
-    """
+    """An image-text encoder in Hugging Face format, from a folder, by name, or "builtin". Raises UserError if
+    it can't be found or downloaded, is of no known family, or is incomplete."""
     from transformers import AutoModel
 
     files = find_model(name_or_dir, CLIP_OPTION)
@@ -282,10 +276,8 @@ def _image_processor(files: ModelFiles) -> Any:
 
 
 def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, tokens: int = 64) -> DenseEncoder:
-    """DINOv2 or another vision transformer with patch tokens, read at `tokens`×`tokens`.
-
-    Raises UserError if it can't be found or downloaded, has no patch tokens, or is incomplete.
-    """
+    """DINOv2 or another vision transformer with patch tokens, read at `tokens`×`tokens`. Raises UserError if
+    it can't be found or downloaded, has no patch tokens, or is incomplete."""
     from transformers import AutoModel
 
     files = find_model(name_or_dir, DENSE_OPTION)
@@ -307,11 +299,9 @@ def _say_what_builtin_knows() -> None:
 
 
 def in_known_light(photo: Float[Tensor, "h w 3"], brightness: float) -> Float[Tensor, "h w 3"]:
-    """Bring a dark photo (RGB in 0…1) to about this mean, the same in all channels; others stay unchanged.
-
-    A gamma curve sets the brightness, which keeps black and white. Then each channel is multiplied (gray
-    world), which removes a tint. Encoders trained on millions of photos need neither.
-    """
+    """Bring a dark photo (RGB in 0…1) to about this mean, the same in all channels; others stay unchanged. A
+    gamma curve sets the brightness, which keeps black and white. Then each channel is multiplied (gray
+    world), which removes a tint. Encoders trained on millions of photos need neither."""
     mean = max(float(photo.mean()), _DARKEST)
     if mean >= _DIM * brightness:
         return photo

@@ -24,17 +24,11 @@ _DROPPED = 0.2
 
 
 class PatchHead(nn.Module):
-    """Patch tokens of a place, in windows of several sizes → a feature to compare with texts.
+    """Patch tokens (of `width` channels) of a place, in windows of several `sizes` → a feature to compare
+    with texts' vectors (of `channels`).
 
     The feature is a linear function of the token in the smallest windows, corrected by a network with one
-    hidden layer that sees the tokens of all sizes.
-
-    Args:
-        width: channels of a token.
-        channels: channels of a text's vector.
-        sizes: number of window sizes.
-        hidden: width of the hidden layer.
-    """
+    hidden layer that sees the tokens of all sizes."""
 
     def __init__(self, width: int, channels: int, sizes: int, hidden: int) -> None:
         super().__init__()

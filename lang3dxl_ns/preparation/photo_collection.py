@@ -46,14 +46,9 @@ class PhotoCollection:
 
 
 def read_collection(data: str | Path) -> PhotoCollection:
-    """Read the photos of a folder or video. Photos without poses are reconstructed, which takes minutes.
-
-    Args:
-        data: a folder with a COLMAP model or a transforms.json, a folder of photos alone, or a video.
-
-    Raises:
-        UserError: there are no photos, or they can't be used, or the poses are damaged.
-    """
+    """Read the photos of a folder with a COLMAP model or a transforms.json, a folder of photos alone, or a
+    video. Photos without poses are reconstructed, which takes minutes. Raises UserError if there are no
+    photos, or they can't be used, or the poses are damaged."""
     folder = expanded(data).absolute()
     if is_video(folder) or (not folder.exists() and frames_folder(folder).is_dir()):
         folder = extract_frames(folder)

@@ -48,12 +48,10 @@ def crop_count(length: int, side: int, steps: int = HALF) -> int:
 
 
 def crop_centers(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]:
-    """Compute the pixel positions of the crop centers along an axis of `length` pixels.
-
-    They are the middles of equal cells, like a target's, about `side` / `steps` apart. A crop covers
-    `side // 2` pixels to either side of its center and may extend beyond the photo. Method: Lang3D-XL, crop
-    grid; there the centers are exactly half a crop apart, and up to half a cell off their cells' middles.
-    """
+    """Compute the pixel positions of the crop centers along an axis of `length` pixels. They are the middles
+    of equal cells, like a target's, about `side` / `steps` apart. A crop covers `side // 2` pixels to either
+    side of its center and may extend beyond the photo. Method: Lang3D-XL, crop grid; there the centers are
+    exactly half a crop apart, and up to half a cell off their cells' middles."""
     count = crop_count(length, side, steps)
     return ((2 * torch.arange(count) + 1) * length + count - 1) // (2 * count)  # rounded
 
@@ -66,10 +64,8 @@ def valid_fractions(height: int, width: int, side: int, steps: int = HALF) -> Fl
 def iterate_crops(
     photo: Float[Tensor, "h w 3"], side: int, size: int, batch_size: int, steps: int = HALF
 ) -> Iterator[Float[Tensor, "n 3 s s"]]:
-    """Yield the photo's crops, row by row from the top left, at `size` pixels, `batch_size` at a time.
-
-    They are black outside the photo. CLIP's own antialiased bicubic resize is used, then clamped to 0..1.
-    """
+    """Yield the photo's crops, row by row from the top left, at `size` pixels, `batch_size` at a time, black
+    outside the photo. CLIP's own antialiased bicubic resize is used, then clamped to 0..1."""
     windows, tops, lefts = _windows(photo, side, steps)
     columns = len(lefts)
     for batch in torch.arange(len(tops) * columns, device=photo.device).split(batch_size):
@@ -88,12 +84,10 @@ def build_clip_target(
     batch_size: int,
     steps: int = HALF,
 ) -> ClipTarget:
-    """Encode the crops of every scale and average the scales on the finest scale's grid.
-
-    `photo` is RGB in 0..1, `crop_sides` has one side in pixels per scale, and `encode` takes crops of
-    `crop_size` pixels in 0..1. `steps` is the spacing of the finest scale's crops; others have two steps per
-    side. All scales have equal weight. Method: Lang3D-XL, average over scales.
-    """
+    """Encode the crops of every scale and average the scales on the finest scale's grid. `photo` is RGB in
+    0..1, `crop_sides` has one side in pixels per scale, and `encode` takes crops of `crop_size` pixels in
+    0..1. `steps` is the spacing of the finest scale's crops; others have two steps per side. All scales have
+    equal weight. Method: Lang3D-XL, average over scales."""
     finest = valid_fractions(photo.shape[0], photo.shape[1], min(crop_sides), steps).shape
     total = torch.zeros(())
     for side in crop_sides:
@@ -140,9 +134,8 @@ def _inside(length: int, side: int, steps: int) -> Float[Tensor, " n"]:
 def _windows(
     photo: Float[Tensor, "h w 3"], side: int, steps: int
 ) -> tuple[Float[Tensor, "3 H W t t"], Int[Tensor, " ny"], Int[Tensor, " nx"]]:
-    """Return a crop at every pixel, and the rows and columns at which the required crops begin.
-
-    The crops are a view of the photo padded with black, so they take no memory each."""
+    """Return a crop at every pixel (views of the photo padded with black, which take no memory each), and the
+    rows and columns at which the required crops begin."""
     half = _half(side)
     padding: list[int] = []
     starts = []

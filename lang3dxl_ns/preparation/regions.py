@@ -57,11 +57,9 @@ class RegionSource(Protocol):
 
 
 def region_source(config: PreparationConfig, data: Path, device: torch.device | str) -> RegionSource | None:
-    """Create the source that `config.regions` names; None for "none", or "auto" without a folder regions/.
-
-    A folder is relative to `data`. Raises UserError if it does not exist, or a network can't be found or
-    downloaded, or is no SAM 3 where prompts name the regions.
-    """
+    """Create the source that `config.regions` names; None for "none", or "auto" without a folder regions/. A
+    folder is relative to `data`. Raises UserError if it does not exist, or a network can't be found or
+    downloaded, or is no SAM 3 where prompts name the regions."""
     choice, level = config.regions, config.region_level
     if choice == "none" or (choice == "auto" and not (data / "regions").is_dir()):
         return None

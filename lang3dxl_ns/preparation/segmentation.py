@@ -68,10 +68,8 @@ class SegmenterFiles:
 
 
 def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
-    """Find a text segmenter's files: a CLIPSeg or SAM 3 alone, or a GroundingDINO with a SAM.
-
-    Raises UserError if one can't be found or downloaded, or is another kind of model.
-    """
+    """Find a text segmenter's files: a CLIPSeg or SAM 3 alone, or a GroundingDINO with a SAM. Raises
+    UserError if one can't be found or downloaded, or is another kind of model."""
     words = find_model(name_or_dir, TEXT_OPTION)
     kind = model_type(words)
     if kind not in ("clipseg", "grounding-dino", *SAM3_TYPES):
@@ -134,9 +132,8 @@ class ClipSeg:
 
 
 class Sam3:
-    """SAM 3 (Carion et al. 2025), which finds all instances of a text in a picture, with masks and scores.
-
-    It encodes a picture once for all prompts."""
+    """SAM 3 (Carion et al. 2025), which finds all instances of a text in a picture, with masks and scores. It
+    encodes a picture once for all prompts."""
 
     def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
         from transformers import Sam3Model, Sam3Processor
@@ -207,10 +204,8 @@ class BoxesAndSam:
         return (self.probabilities(image, prompts) > 0).any(dim=0)
 
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Compute the score of the best box whose mask covers the pixel, else 0, for each prompt.
-
-        The detector sees one prompt at a time, so that prompts don't compete.
-        """
+        """Compute the score of the best box whose mask covers the pixel, else 0, for each prompt. The
+        detector sees one prompt at a time, so that prompts don't compete."""
         found = [self.boxes(image, prompt) for prompt in prompts]
         masks = iter(self._masks(image, torch.cat([boxes for boxes, _ in found])))
         maps = torch.zeros(len(prompts), *image.shape[:2])

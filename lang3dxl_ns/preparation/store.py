@@ -53,10 +53,8 @@ class FeatureStore:
         return self.root / kind / f"{readable}.{digest}.safetensors"
 
     def write(self, kind: str, name: str, tensors: dict[str, Tensor], settings: dict[str, Any]) -> None:
-        """Store an entry atomically: a failure at any moment leaves the old entry, or none.
-
-        Raises UserError on NaN or infinity, and if the disk is full or read-only.
-        """
+        """Store an entry atomically: a failure at any moment leaves the old entry, or none. Raises UserError
+        on NaN or infinity, and if the disk is full or read-only."""
         from safetensors.torch import save
 
         stored = {key: _compact(tensor, f"{key} of {name} ({kind})") for key, tensor in tensors.items()}
@@ -91,10 +89,8 @@ class FeatureStore:
             ) from error
 
     def read(self, kind: str, name: str) -> dict[str, Tensor]:
-        """Map an entry's tensors into memory (CPU, float16): only the parts in use are read from disk.
-
-        Raises UserError if the entry is missing or damaged.
-        """
+        """Map an entry's tensors into memory (CPU, float16): only the parts in use are read from disk. Raises
+        UserError if the entry is missing or damaged."""
         with _opened(self.path(kind, name), f"{kind} of {name}") as file:
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 
@@ -109,11 +105,9 @@ class FeatureStore:
             return json.loads(file.metadata()["settings"])
 
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
-        """Return whether the entry exists, is complete, and was made with these settings.
-
-        A damaged entry counts as absent. Only the header is read, unless the file has changed since it was
-        last found complete.
-        """
+        """Return whether the entry exists, is complete, and was made with these settings. A damaged one
+        counts as absent. Only the header is read, unless the file has changed since it was last found
+        complete."""
         path = self.path(kind, name)
         if not path.exists():
             return False
@@ -134,10 +128,8 @@ class FeatureStore:
             return False
 
     def photo_hashes(self, photos: Sequence[Photo]) -> dict[str, str | UserError]:
-        """Compute a hash of every photo's file by name, or the reason why it can't be read.
-
-        A file is read once, and again if its size, modification time or inode has changed.
-        """
+        """Compute a hash of every photo's file by name, or the reason why it can't be read. A file is read
+        once, and again if its size, modification time or inode has changed."""
         path, known = self.root / _HASHES, dict[str, Any]()
         with contextlib.suppress(OSError, ValueError, TypeError):  # missing or damaged
             known = dict(read_json(path))

@@ -225,12 +225,9 @@ def composite_tiles(tiles, plan, maps, trace, keep):
 @kernel
 def backward_tiles(tiles, plan, maps, trace, sums):
     """Sum the gradients of some tiles per visible Gaussian. `maps` has the gradients of the output maps.
-
     Waves are processed from the back. In each, alpha and weight are recomputed front to back, then used in
     reverse. With v = Σ channel × upstream, and B the same sum for everything behind, composited over black,
-    the gradient with respect to ln(alpha) is weight·(v − B), and B in front of the Gaussian is B + alpha·(v −
-    B).
-    """
+    the gradient with respect to ln(alpha) is weight·(v − B), and B in front is B + alpha·(v − B)."""
     channels, like = plan.table.shape[1], plan.splats
     sums[:] = 0
     upstream = _aligned(channels * PIXELS, like)

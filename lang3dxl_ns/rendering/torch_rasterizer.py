@@ -114,12 +114,9 @@ class _Chunk(NamedTuple):
 def _composite(
     rows: Float[Tensor, "b k columns"], chunk: _Chunk, columns: int, detached: int
 ) -> tuple[Float[Tensor, "b pixels c"], Float[Tensor, "b pixels"]]:
-    """Composite a chunk onto its tiles' maps, and return what it adds and the transmittance behind it.
-
-    In the first `detached` maps, only the channels have a gradient. The quadratic form is
-    steepness·(dx + shear·dy)² + dy²/variance. Unlike the conic itself, it stays accurate in float32 far from
-    the center of a needle.
-    """
+    """Composite a chunk onto its tiles' maps, and return what it adds and the transmittance behind it. In the
+    first `detached` maps, only the channels have a gradient. The quadratic form is steepness·(dx + shear·dy)²
+    + dy²/variance. Unlike the conic itself, it stays accurate in float32 far from the center of a needle."""
     x, y, a, b, variance, opacity = rows[..., :6, None].unbind(2)
     pixel = torch.arange(TILE * TILE, device=rows.device)
     dx = (chunk.tiles % columns * TILE)[:, None, None] + pixel % TILE + 0.5 - x
