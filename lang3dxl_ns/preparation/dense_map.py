@@ -29,11 +29,12 @@ def map_grids(height: int, width: int, tokens: int, least: int) -> tuple[Grid, G
     """Compute the grids of a photo's patches at two sizes, coarse and fine, for windows of `tokens` patches
     per side. At the coarse size one window spans the photo's shorter side. The fine grid has 1.75 times as
     many patches along each side, or `least` along the longer one if those are more."""
-    longer = tokens * max(height, width) / min(height, width)
-    factors = (1.0, max(_FINER, least / longer))
-    sides = [[round(f * tokens * side / min(height, width)) for side in (height, width)] for f in factors]
-    (a, b), (c, d) = sides
-    return (a, b), (c, d)
+    shorter = min(height, width)
+    finer = max(_FINER, least / (tokens * max(height, width) / shorter))
+    coarse, fine = (
+        (round(f * tokens * height / shorter), round(f * tokens * width / shorter)) for f in (1.0, finer)
+    )
+    return coarse, fine
 
 
 def nested_grids(height: int, width: int, tokens: int, side: int, sizes: int) -> tuple[Grid, ...]:

@@ -160,11 +160,12 @@ class Crops:
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Count the rows and columns of the smallest crops in a photo of `height` × `width` pixels."""
-        return _grid(height, width, self.sides[0], self.steps)
+        side = self.sides[0]
+        return crop_count(height, side, self.steps), crop_count(width, side, self.steps)
 
     def count(self, height: int, width: int) -> int:
         """Count the crops in a photo of `height` × `width` pixels."""
-        larger = sum(math.prod(_grid(height, width, side, HALF)) for side in self.sides[1:])
+        larger = sum(crop_count(height, side) * crop_count(width, side) for side in self.sides[1:])
         return math.prod(self.grid(height, width)) + larger
 
 
@@ -205,7 +206,3 @@ def choose_crops(
         if smallest >= width:
             return Crops(sides, HALF)
         smallest = max(smallest, sides[-1] if is_fine else sides[0]) * _GROWTH
-
-
-def _grid(height: int, width: int, side: int, steps: int) -> tuple[int, int]:
-    return crop_count(height, side, steps), crop_count(width, side, steps)

@@ -35,15 +35,8 @@ JOB_BYTES, BUILD_BYTES = 3.5e9, 0.5e9
 """Most memory that one compiler takes, and disk space that a build takes."""
 UNITS = 6
 """Number of translation units for the CUDA sources. Each one pays over a minute for torch's headers."""
+NAME = "gsplat_cuda"
 _COMPILE = "import json, sys; from torch.utils.cpp_extension import load; load(**json.loads(sys.argv[1]))"
-
-
-class Extension(NamedTuple):
-    """CUDA and C++ sources that become one Python module."""
-
-    name: str
-    sources: Sequence[Path]
-    include: Sequence[Path] = ()
 
 
 class Need(NamedTuple):
@@ -52,13 +45,6 @@ class Need(NamedTuple):
     what: str
     found: str | None
     remedy: str
-
-
-def gsplat_extension() -> Extension:
-    """Describe gsplat's kernels."""
-    source = _package("gsplat")[0] / "cuda" / "csrc"
-    sources = sorted([*source.glob("*.cu"), *source.glob("*.cpp")])
-    return Extension("gsplat_cuda", sources, [source, source / "third_party" / "glm"])
 
 
 def _package(name: str) -> list[Path]:
@@ -146,16 +132,16 @@ def build_folder(arch: str) -> Path:
     return cache / "gsplat-{}-py{}{}-sm-{}".format(versions, *sys.version_info[:2], sm)
 
 
-def built(folder: Path, name: str = "gsplat_cuda") -> Path | None:
+def built(folder: Path, name: str = NAME) -> Path | None:
     """Return the library if it was built completely."""
     library = folder / f"{name}.so"
     return library if (folder / "done").is_file() and library.is_file() else None
 
 
-def build(extension: Extension, folder: Path, arch: str) -> Path:
-    """Compile into a folder, with the output in build.log, and return the library. An interrupted build is
-    continued, and another process that builds there is waited for. Raises UserError if something is missing,
-    or the compiler failed."""
+def build(folder: Path, arch: str, sources: Sequence[Path] = (), name: str = NAME) -> Path:
+    """Compile gsplat's kernels (or other sources) into a folder, with the output in build.log, and return the
+    library. An interrupted build is continued, and another process that builds there is waited for. Raises
+    UserError if something is missing, or the compiler failed."""
     missing = [f"{need.what} is missing: {need.remedy}" for need in needs(folder) if need.found is None]
     if missing:
         raise UserError("gsplat's CUDA kernels can't be built here. " + ". ".join(missing))
@@ -167,40 +153,36 @@ def build(extension: Extension, folder: Path, arch: str) -> Path:
         except Timeout:
             say(f"Another process builds gsplat's CUDA kernels in {folder}: waiting for it")
             lock.acquire()
-        return built(folder, extension.name) or _compile(extension, folder, arch)
+        return built(folder, name) or _compile(folder, arch, sources, name)
     except OSError as error:
         raise UserError(f"gsplat's CUDA kernels can't be built in {folder} ({error})") from error
     finally:
         lock.release()
 
 
-def _compile(extension: Extension, folder: Path, arch: str) -> Path:
-    toolkit = find_toolkit(torch.version.cuda or "")
+def _compile(folder: Path, arch: str, sources: Sequence[Path], name: str) -> Path:
+    toolkit, own = find_toolkit(torch.version.cuda or ""), _package("gsplat")[0] / "cuda" / "csrc"
     assert toolkit is not None
+    sources = sources or sorted([*own.glob("*.cu"), *own.glob("*.cpp")])
     jobs = str(max(1, min(os.cpu_count() or 1, int(machine_memory() / JOB_BYTES))))
     jobs = os.environ.get("MAX_JOBS", jobs)
     libraries = str(_linkable(toolkit, folder / "lib")), os.environ.get("LIBRARY_PATH")
-    environment = {
-        **os.environ,
-        "MAX_JOBS": jobs,
-        "TORCH_CUDA_ARCH_LIST": arch,
-        "CUDA_HOME": str(toolkit),
-        "PATH": _path(toolkit / "bin"),
-        "LIBRARY_PATH": os.pathsep.join(filter(None, libraries)),
-    }
+    environment = {**os.environ, "MAX_JOBS": jobs, "TORCH_CUDA_ARCH_LIST": arch, "CUDA_HOME": str(toolkit)}
+    environment["PATH"] = _path(toolkit / "bin")
+    environment["LIBRARY_PATH"] = os.pathsep.join(filter(None, libraries))
     arguments = {
-        "name": extension.name,
-        "sources": [str(path) for path in _united(extension.sources, folder)],
+        "name": name,
+        "sources": [str(path) for path in _united(sources, folder)],
         "extra_cflags": ["-O3"],
         "extra_cuda_cflags": ["-O3", "--use_fast_math"],
-        "extra_include_paths": [str(path) for path in (*extension.include, *_headers(toolkit))],
+        "extra_include_paths": [str(p) for p in (own, own / "third_party" / "glm", *_headers(toolkit))],
         "build_directory": str(folder),
         "verbose": True,
     }
     (folder / "lock").unlink(missing_ok=True)  # older versions of torch would wait forever for its holder
-    log, start, library = folder / "build.log", time.monotonic(), folder / f"{extension.name}.so"
+    log, start, library = folder / "build.log", time.monotonic(), folder / f"{name}.so"
     say(
-        f"Building {extension.name} for compute capability {arch} with {jobs} jobs: once, for some minutes. "
+        f"Building {name} for compute capability {arch} with {jobs} jobs: once, for some minutes. "
         f"Interrupted, it goes on next time. Log: {log}"
     )
     command = [sys.executable, "-c", _COMPILE, json.dumps(arguments)]
@@ -212,7 +194,7 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
         reason = next(named, lines[-1])[:300]
         if status < 0:
             reason = f"signal {-status} stopped it, perhaps for lack of memory (MAX_JOBS=1 takes less)"
-        raise UserError(f"building {extension.name} failed: {reason} (the whole output: {log})")
+        raise UserError(f"building {name} failed: {reason} (the whole output: {log})")
     # This file also marks a complete build.
     (folder / "done").write_text(f"{time.monotonic() - start:.0f} s with {jobs} job(s)\n")
     return library
@@ -239,9 +221,9 @@ def _united(sources: Sequence[Path], folder: Path) -> list[Path]:
     return [*units, *(path for path in sources if path.suffix != ".cu")]
 
 
-def load(library: Path, name: str = "gsplat_cuda") -> ModuleType:
+def load(library: Path) -> ModuleType:
     """Import a built library."""
-    spec = importlib.util.spec_from_file_location(name, library)
+    spec = importlib.util.spec_from_file_location(library.stem, library)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -261,12 +243,12 @@ def make_ready() -> None:
         raise UserError("gsplat's kernels run on NVIDIA's GPUs, and this one is AMD's")
     arch = device_arch()
     folder = build_folder(arch)
-    library = built(folder) or build(gsplat_extension(), folder, arch)
+    library = built(folder) or build(folder, arch)
     try:
         kernels = load(library)
     except ImportError:  # the library is damaged
         library.unlink()
-        kernels = load(build(gsplat_extension(), folder, arch))
+        kernels = load(build(folder, arch))
     gsplat.csrc = sys.modules["gsplat.csrc"] = kernels
 
 

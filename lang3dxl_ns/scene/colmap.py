@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import struct
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -103,17 +102,17 @@ def read_reconstruction(model_dir: Path) -> Reconstruction:
 
 def _name(number: int, image: pycolmap.Image) -> str | None:
     """Return a photo's name; if it can't be used, log the reason and return None."""
+    left_out = "of the COLMAP model is left out: its name"
     try:
         if is_plain(image.name):
             return image.name
-        say(f"photo {image.name} of the COLMAP model is left out: its name has control characters; rename it")
-        return None
+        say(f"photo {image.name} {left_out} has control characters; rename it")
     except UnicodeDecodeError:
         say(
-            f"photo {number} of the COLMAP model is left out: its name is not UTF-8; rename its file (convmv "
-            "-f latin1 -t utf8 --notest images/*) and make the model again"
+            f"photo {number} {left_out} is not UTF-8; rename its file (convmv -f latin1 -t utf8 --notest "
+            "images/*) and make the model again"
         )
-        return None
+    return None
 
 
 def photos_in_model(model_dir: Path) -> int:
@@ -196,37 +195,34 @@ def check_binary_model(folder: Path) -> None:
     continues after its last record."""
     for name, step in _STEPS.items():
         path = folder / f"{name}.bin"
-        if path.is_file():
-            _walk(path, step)
-
-
-def _walk(path: Path, step: Callable[[bytes, int], int]) -> None:
-    with open_file(path) as file:
-        content = file.read()
-    try:
-        count, place = _number("<Q", content, 0), 8
-        for _ in range(count):
-            place = step(content, place)
-            if place > len(content):
-                break
-    except (struct.error, ValueError, RuntimeError):
-        place = -1
-    if place != len(content):
-        raise UserError(
-            f"the COLMAP model in {path.parent} is damaged, copy or make it again: the records of "
-            f"{path.name} do not fill its {len(content)} bytes"
-        )
-
-
-def _camera(content: bytes, place: int) -> int:
-    model = _number("<i", content, place + 4)
-    return place + 24 + 8 * _camera_parameters(model)
+        if not path.is_file():
+            continue
+        with open_file(path) as file:
+            content = file.read()
+        try:
+            count, place = _number("<Q", content, 0), 8
+            for _ in range(count):
+                place = step(content, place)
+                if place > len(content):
+                    break
+        except (struct.error, ValueError, RuntimeError):
+            place = -1
+        if place != len(content):
+            raise UserError(
+                f"the COLMAP model in {folder} is damaged, copy or make it again: the records of "
+                f"{path.name} do not fill its {len(content)} bytes"
+            )
 
 
 @lru_cache
-def _camera_parameters(model: int) -> int:
+def _parameters(model: int) -> int:
+    """Return the number of parameters of a camera model."""
     pycolmap = load_pycolmap()
     return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 2, 2).params)
+
+
+def _camera(content: bytes, place: int) -> int:
+    return place + 24 + 8 * _parameters(_number("<i", content, place + 4))
 
 
 def _image(content: bytes, place: int) -> int:
