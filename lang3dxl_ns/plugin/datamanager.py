@@ -38,7 +38,6 @@ from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset, novel_out
 from lang3dxl_ns.preparation.collection import CropPlan, plan_crops, prepare_collection
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
-from lang3dxl_ns.preparation.handover import Batch, SceneFacts
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
@@ -47,7 +46,7 @@ from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
+from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, SceneFacts, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.scene.colmap import Reconstruction

@@ -34,9 +34,8 @@ from lang3dxl_ns.preparation.photo_collection import (
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.photo import Photo
-from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
+from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
-from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 
 @without(*OF_COLMAP)

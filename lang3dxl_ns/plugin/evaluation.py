@@ -32,7 +32,7 @@ from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos
-from lang3dxl_ns.preparation.handover import Batch
+from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.scene.camera import Camera

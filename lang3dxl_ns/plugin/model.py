@@ -39,7 +39,7 @@ from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
 from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
-from lang3dxl_ns.preparation.handover import Batch
+from lang3dxl_ns.preparation.targets import Batch
 
 DECODE_SIZES = 5
 """Number of sizes at which code maps are decoded in training."""

@@ -78,8 +78,8 @@ def _check_scene(content: Any, folder: Path) -> None:
 
 
 def _check_frame(frame: dict[str, Any], folder: Path) -> None:
-    for key in frame.keys() & _PATHS:
-        _check_path(frame[key], folder)
+    for name in (frame[key] for key in _PATHS if key in frame):
+        _check_path(name, folder)
     width, height, *focal = (frame[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"))
     expect(is_coordinate(width) and is_coordinate(height), "its size is not a number")
     distortion = [frame[key] for key in _DISTORTION if key in frame]

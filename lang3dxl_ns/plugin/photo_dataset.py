@@ -17,7 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.preparation.foreground import find_mask
-from lang3dxl_ns.preparation.handover import Batch
+from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import camera_to_world
 from lang3dxl_ns.scene.colmap import TrackedPhoto

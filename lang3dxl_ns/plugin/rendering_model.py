@@ -25,7 +25,7 @@ from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
-from lang3dxl_ns.preparation.handover import SceneFacts
+from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene
@@ -106,7 +106,7 @@ class RenderingModel(SplatfactoModel):
         else:
             harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
         antialiased = self.config.rasterize_mode == "antialiased"
-        return Splats(*vars(self.activated(g)).values(), harmonics, antialiased)
+        return Splats(**vars(self.activated(g)), harmonics=harmonics, antialiased=antialiased)
 
     @torch.no_grad()
     def scene(

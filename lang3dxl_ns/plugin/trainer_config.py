@@ -24,8 +24,7 @@ from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, check_data
 from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
-from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs

@@ -19,7 +19,16 @@ from torch import Tensor
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.dense_map import mean_of_sizes
-from lang3dxl_ns.preparation.families import FAMILIES, Family, input_side, patch_tokens, vision_inputs
+from lang3dxl_ns.preparation.families import (
+    FAMILIES,
+    Family,
+    PatchHead,
+    head_recipe,
+    input_side,
+    patch_tokens,
+    read_patch_head,
+    vision_inputs,
+)
 from lang3dxl_ns.preparation.model_files import (
     BUILTIN,
     CLIP_OPTION,
@@ -33,7 +42,6 @@ from lang3dxl_ns.preparation.model_files import (
     spoken,
     whole,
 )
-from lang3dxl_ns.preparation.patch_head import PatchHead, head_recipe, read_patch_head
 from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

@@ -20,9 +20,8 @@ from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
-from lang3dxl_ns.scene.photo_folder import find_photos
+from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
-from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
 OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")

@@ -2,7 +2,7 @@
 
 A tile of 16 × 16 pixels is divided into 16 blocks of 8 × 2, one vector each. Front to back, each Gaussian is
 composited into those blocks of its tile that it reaches and that have not stopped. Rows are pairs of tile and
-Gaussian (see `fused_plan.Plan`). They are processed in waves of 32.
+Gaussian (see `fused_compositing.Plan`). They are processed in waves of 32.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lang3dxl_ns.common.jit import kernel
-from lang3dxl_ns.rendering.fused_plan import SPLAT_COLUMNS, TILE, UNROLL
 from lang3dxl_ns.rendering.gaussians import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from lang3dxl_ns.rendering.simd import (
     LANES,
@@ -31,6 +30,14 @@ from lang3dxl_ns.rendering.simd import (
     where,
 )
 
+TILE = 16
+"""Side of a tile, pixels."""
+SPLAT_COLUMNS = 6
+"""Columns of a splat: x, y, shear, steepness, rise and log2 of opacity. At (dx, dy) from the center, log2 of
+alpha is log2 opacity − steepness·(dx + shear·dy)² − rise·dy², which stays accurate far from the center of a
+needle."""
+UNROLL = 4
+"""Channels composited at a time. Their number is rounded up to a multiple of this."""
 WAVE = 32
 PIXELS = TILE * TILE
 CHANNELS_FROM = 6
@@ -61,7 +68,7 @@ class Trace(NamedTuple):
 
 
 class _Splat(NamedTuple):
-    """A Gaussian on the screen, in pixels from the tile's corner (see `fused_plan.SPLAT_COLUMNS`)."""
+    """A Gaussian on the screen, in pixels from the tile's corner (see `SPLAT_COLUMNS`)."""
 
     x: float
     y: float

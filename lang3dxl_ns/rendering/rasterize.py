@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
-from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Gaussians, Raster
+from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Ellipses, Gaussians, Raster
 from lang3dxl_ns.rendering.projection import project
 from lang3dxl_ns.rendering.torch_rasterizer import Compositing
 from lang3dxl_ns.scene.camera import Camera
@@ -152,10 +153,13 @@ def _composite(
 ) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
     """Composite channels over black: those with a gradient to the geometry (then the depth, if requested),
     those without, and alpha, [h, w, …] each. The last value is `Raster.info`."""
-    to_screen, compositing = project, Compositing
+    to_screen: Callable[..., Ellipses] = project
+    compositing: type[torch.autograd.Function] = Compositing
     if backend == "numba":
-        from lang3dxl_ns.rendering.fused_compositing import FusedCompositing as compositing
-        from lang3dxl_ns.rendering.fused_projection import project as to_screen
+        from lang3dxl_ns.rendering.fused_compositing import FusedCompositing
+        from lang3dxl_ns.rendering.fused_projection import project as fused_project
+
+        to_screen, compositing = fused_project, FusedCompositing
     ellipses = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
     maps, detached_map, alpha = compositing.apply(
         ellipses.means2d, ellipses.conics, ellipses.opacities,

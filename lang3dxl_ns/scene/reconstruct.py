@@ -29,10 +29,16 @@ from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
-from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.photo_folder import (
+    PhotoFolder,
+    extract_frames,
+    find_photos,
+    is_video,
+    readable,
+    shared_cameras,
+)
 from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruction import ReconstructionReport, ReconstructionSettings
-from lang3dxl_ns.scene.video import extract_frames, is_video
 
 if TYPE_CHECKING:
     import pycolmap
