@@ -56,7 +56,7 @@ def check_transforms(dataparser: DataParserConfig) -> None:
 
 
 def _check_scene(content: Any, folder: Path) -> None:
-    frames = content.get("frames") if isinstance(content, dict) else None
+    frames: Any = content.get("frames") if isinstance(content, dict) else None
     expect(isinstance(frames, list) and bool(frames), "it lists no photo under frames")
     model = content.get("camera_model", "OPENCV")
     known = isinstance(model, str) and model in CAMERA_MODEL_TO_TYPE

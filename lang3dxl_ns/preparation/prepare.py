@@ -178,7 +178,7 @@ def _plan(
         )
         grids: tuple[Grid, ...] | None = None
         # Everything that determines the photo's pixels; the lens matters only if it is undistorted.
-        source = {"photo": content, "size": [*size], "undistorted": photo.lens.undistortion}
+        source: dict[str, Any] = {"photo": content, "size": [*size], "undistorted": photo.lens.undistortion}
         if photo.quarter_turns:
             source["turned"] = photo.quarter_turns
         clip = {**source, "encoder": clip_model.identity}
