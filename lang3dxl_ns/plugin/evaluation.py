@@ -261,8 +261,8 @@ class Evaluation:
     def _protocol(self, split: Split, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
         scorer, masked = self._scorer_of(split), sum(photo.masked for photo in evaluated)
         trained = {photo.name for photo in self._data.train_dataset.photos}
-        seen = sum(photo.name in trained for photo in evaluated)
-        photos = {"split": split, "evaluated_photos": len(evaluated), "seen_in_training": seen}
+        photos: dict[str, Any] = {"split": split, "evaluated_photos": len(evaluated)}
+        photos["seen_in_training"] = sum(photo.name in trained for photo in evaluated)
         if self._fits_looks(split):
             photos["colors"] = PROTOCOL
         if scorer is None:

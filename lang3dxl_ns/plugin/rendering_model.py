@@ -266,7 +266,7 @@ class RenderingModel(SplatfactoModel):
         moves = self.config.feature_gradient_to_geometry
         together = None if moves or in_photo is not gaussians else features
         photo = rasterize(in_photo.seen_from(view), view, colors, background, features=together, **settings)
-        if together is features:
+        if features is None or together is features:
             return photo, background
         # Semantics and coverage belong to the scene, not to a photo, so they keep the scene's opacities.
         if moves:

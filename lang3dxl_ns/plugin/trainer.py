@@ -278,7 +278,7 @@ class Lang3DXLTrainer(Trainer):
 
         def stop(number: int, _frame: FrameType | None) -> None:
             self.interrupted, self.stop_training = signal.Signals(number), True
-            signal.signal(number, previous[number])
+            signal.signal(number, previous[self.interrupted])
             if self._is_learning_words:
                 raise _Stopped
 
