@@ -426,7 +426,7 @@ def _load_pretrained(cls, *args, **kwargs):
 
 def gsplat_stand_in(
     means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, near_plane, eps2d, packed,
-    render_mode="RGB", rasterize_mode="classic", absgrad=False,
+    render_mode="RGB", rasterize_mode="classic",
 ):  # fmt: skip
     """gsplat.rasterization (1.4) of one camera, by the torch backend; asserts what gsplat's kernels want."""
     from lang3dxl_ns.rendering import Gaussians, rasterize
@@ -443,7 +443,7 @@ def gsplat_stand_in(
         drawn = rasterize(
             Gaussians(means, quats, scales, opacities), Camera(viewmats[0], Ks[0], width, height), colors,
             near=near_plane, eps2d=eps2d, antialiased=rasterize_mode == "antialiased",
-            absgrad=absgrad, render_depth=render_mode == "RGB+D", backend="torch",
+            render_depth=render_mode == "RGB+D", backend="torch",
         )  # fmt: skip
     _syncs["gsplat"] += 1  # the number of intersections, for which memory is allocated
     image = drawn.image

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from PIL import Image
 
-from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+from lang3dxl_ns.scene.colmap import load_pycolmap
 
 SIZES = ((160, 120), (120, 160), (200, 150), (240, 160), (180, 180))
 """Width and height of the photos, used in turn."""

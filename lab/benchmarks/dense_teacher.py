@@ -30,7 +30,7 @@ from lab.landmark.landmark import Landmark
 from lab.landmark.photography import random_view, take_photo
 from lang3dxl_ns.attachment.learn import prepare_photos, settled
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.components.grouping import DENSE_AXES, sharpen
+from lang3dxl_ns.components.learn_codes import DENSE_AXES, sharpen
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import score_scene

@@ -213,8 +213,8 @@ def _crops(clip: str) -> list[Stage]:
     import torch
     from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
-    from lang3dxl_ns.preparation.crop_budget import choose_crops
     from lang3dxl_ns.preparation.encoders import load_image_text_encoder
+    from lang3dxl_ns.preparation.pyramid import choose_crops
 
     side, batch = 224, 8
     encode: Callable[[torch.Tensor], object]

@@ -29,9 +29,8 @@ from lab.clip_training.photos import store_photos
 from lab.clip_training.small_clip import GRID, PATCH, as_encoder, load_clip, normalize
 from lab.clip_training.views import COLOR, ELEMENT, PART, SPLITS, ViewFolder, background_rendering
 from lang3dxl_ns.preparation.dense_map import build_dense_map, nested_grids
-from lang3dxl_ns.preparation.families import patch_tokens
+from lang3dxl_ns.preparation.families import FILE, PatchHead, patch_tokens
 from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model
-from lang3dxl_ns.preparation.patch_head import FILE, PatchHead
 
 SIDES = (20, 90)
 """Range of the smallest windows' sides in pixels of a stored view, as in scenes of 480 to 1,024 pixels."""

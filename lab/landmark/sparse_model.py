@@ -13,7 +13,7 @@ from numpy import ndarray as Array
 from lab.landmark.labels import PART
 from lab.landmark.photography import Shot
 from lab.landmark.raycast import Camera
-from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+from lang3dxl_ns.scene.colmap import load_pycolmap
 
 POINTS = 24_000
 """Number of candidate points over the whole collection. Those found in too few photos are dropped."""

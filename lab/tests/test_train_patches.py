@@ -8,7 +8,7 @@ import torch.nn.functional as F
 
 from lab.clip_training.captions import CLASSES, MAY_BE
 from lab.clip_training.train_patches import fit
-from lang3dxl_ns.preparation.patch_head import PatchHead
+from lang3dxl_ns.preparation.families import PatchHead
 
 WIDTH, CHANNELS, COUNT = 24, 32, 6_000
 

@@ -8,10 +8,9 @@ from typing import Literal, get_args
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.baselines.feature3dgs import Feature3DGS
 from lang3dxl_ns.baselines.fmgs import PlaceField
 from lang3dxl_ns.baselines.langsplat import LangSplat
-from lang3dxl_ns.baselines.lifting import DirectFeatures, LiftedFeatures
+from lang3dxl_ns.baselines.lifting import DirectFeatures, Feature3DGS, LiftedFeatures
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, JointField
@@ -61,10 +60,8 @@ def make_decoder(
     center: Float[Tensor, "3"],
     radius: float,
 ) -> Decoder:
-    """Build the feature decoder that `config` names.
-
-    `settings` applies to decoders with a hash grid; `center` and `radius` are the scene's, in world units.
-    """
+    """Build the feature decoder that `config` names. `settings` applies to decoders with a hash grid;
+    `center` and `radius` are the scene's, in world units."""
     if config.name == "feature3dgs":
         decoder: Decoder = Feature3DGS(clip_dim, dense_dim)
     elif config.name == "fmgs":

@@ -24,14 +24,10 @@ _MOST_FEATURES = 400_000
 class LangSplat(Decoder):
     """Decoder of unit-length codes after rendering: the frozen second half of an autoencoder.
 
-    The autoencoder learns the scene's CLIP targets before the run, as unit vectors; decoded features are
-    scaled back to the targets' typical length. There are no dense features. The published system trains a
-    model for each of three levels of SAM segments; this one uses the targets that all decoders share here.
-
-    Args:
-        clip_dim: channels of the CLIP features.
-        steps: iterations of the autoencoder.
-    """
+    The autoencoder learns the scene's CLIP targets before the run, as unit vectors, in `steps` iterations;
+    decoded features are scaled back to the targets' typical length. There are no dense features. The
+    published system trains a model for each of three levels of SAM segments; this one uses the targets that
+    all decoders share here."""
 
     def __init__(self, clip_dim: int, steps: int) -> None:
         super().__init__(clip_dim, 0)

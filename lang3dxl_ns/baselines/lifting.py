@@ -1,4 +1,4 @@
-"""Uncompressed features on the Gaussians: averaged from the photos (lifting), or learned from renderings."""
+"""Baselines without a network: lifted or learned features on the Gaussians, or wide codes (Feature 3DGS)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from lang3dxl_ns.components.feature_decoder import Decoder, Features, Gathered
 
@@ -16,9 +16,8 @@ _LEAST_COVERAGE = 1e-4
 class LiftedFeatures(Decoder):
     """Decoder of features that are averaged onto the Gaussians after training, by contribution.
 
-    Gaussians carry nothing in training. Afterwards they carry the lifted features and a 1, whose rendering is
-    the coverage. So a map is the mean feature of the visible Gaussians, however little of a pixel they cover.
-    """
+    Gaussians then also carry a 1, whose rendering is the coverage. So a map is the mean feature of the
+    visible Gaussians, however little of a pixel they cover."""
 
     needs_lifting = True
 
@@ -43,3 +42,24 @@ class DirectFeatures(Decoder):
 
     def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
         return self._split(self.output_mean + self.output_std * rendered)
+
+
+class Feature3DGS(Decoder):
+    """Decoder of codes half as wide as CLIP's features (256 for ViT-B/32) by the method's "speed-up" layer.
+
+    This 1×1 convolution outputs CLIP and dense features. They are whitened as in the semantic field, which
+    can only help this baseline."""
+
+    def __init__(self, clip_dim: int, dense_dim: int) -> None:
+        super().__init__(clip_dim, dense_dim)
+        self.code_dim = max(clip_dim // 2, 1)
+        self.layer = nn.Linear(self.code_dim, clip_dim + dense_dim)
+
+    def initial_codes(self, count: int) -> Float[Tensor, "count code"]:
+        return self.output_mean.new_zeros(count, self.code_dim)
+
+    def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
+        return self._split(self.output_mean + self.output_std * self.layer(rendered))
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {"feature3dgs_decoder": list(self.layer.parameters())}

@@ -71,7 +71,7 @@ class Doctor:
         if not arch:
             raise UserError("torch sees no GPU to build for: name a compute capability, such as --arch 8.6")
         folder = gsplat_build.build_folder(arch)
-        library = gsplat_build.build(gsplat_build.gsplat_extension(), folder, arch)
+        library = gsplat_build.build(folder, arch)
         gsplat_build.load(library)
         print(f"gsplat's kernels for {arch}: {library}, built in {(folder / 'done').read_text().strip()}")
 

@@ -121,13 +121,12 @@ class AppearanceField(nn.Module):
         visible: Int[Tensor, " m"],
         seed: int | None = None,
     ) -> tuple[Float[Tensor, "n 3"], Gaussians]:
-        """Compute colors, and with `opacity_shift` also opacities, under a photo's vector.
-
-        The Gaussians' positions get no gradient from it. Colors are at least 0, opacities in 0…1.
+        """Compute colors, and with `opacity_shift` also opacities, under a photo's vector. Positions get no
+        gradient.
 
         Args:
             gaussians: Gaussians in the world frame, which are returned unchanged without `opacity_shift`.
-            colors: colors before the shift, at least 0.
+            colors: colors before the shift, at least 0, as after it.
             vector: the photo's vector.
             visible: rows of the Gaussians to change; the others stay as they are.
             seed: seed of the opacity shift's noise in training; None for no noise.
@@ -149,11 +148,7 @@ class AppearanceField(nn.Module):
         return [parameter for parameter in self.parameters() if parameter is not self.vectors]
 
     def vector(self, name: str) -> Float[Tensor, " v"]:
-        """Return the vector of a training photo.
-
-        Raises:
-            UserError: no training photo has this name.
-        """
+        """Return the vector of a training photo. Raises UserError if none has this name."""
         if name not in self._rows:
             raise UserError(
                 f"{name} is not a training photo of this scene: choose one of "
@@ -180,9 +175,8 @@ class AppearanceField(nn.Module):
     def vector_of_view(
         self, position: Float[Tensor, "3"], direction: Float[Tensor, "3"]
     ) -> Float[Tensor, " v"]:
-        """Return a vector for a view that is not a training photo, by the rule `AppearanceConfig.unseen`.
-
-        It is zero before any training."""
+        """Return a vector for a view that is not a training photo, by the rule `AppearanceConfig.unseen`. It
+        is zero before any training."""
         vectors = self.vectors[self.learned]
         if len(vectors) == 0:
             return self.vectors.new_zeros(self.config.vector_dim)
@@ -195,10 +189,8 @@ class AppearanceField(nn.Module):
         return vectors[(moved.square() + turned.square()).argmin()]
 
     def _unit_cube(self, means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Convert positions to grid coordinates in [0, 1].
-
-        Space is contracted to a ball (Mip-NeRF 360, Barron et al. 2022): the scene fills the inner half, and
-        everything out to the sky the rest."""
+        """Convert positions to grid coordinates in [0, 1]. Space is contracted to a ball (Mip-NeRF 360,
+        Barron et al. 2022): the scene fills the inner half, and everything out to the sky the rest."""
         x = (means.detach() - self.center) / self.radius
         largest = x.abs().amax(1, keepdim=True).clamp_min(1.0)
         # Lengths are in units of the largest component, since the squares of far positions would overflow.
@@ -208,9 +200,8 @@ class AppearanceField(nn.Module):
     def _binary_concrete(
         self, logits: Float[Tensor, " m"], visible: Int[Tensor, " m"], count: int, seed: int | None
     ) -> Float[Tensor, " m"]:
-        """Sample a relaxed coin per Gaussian, which is close to 0 or 1 (Maddison et al. 2017).
-
-        With noise u, it is sigmoid((logit + log u − log(1 − u)) / temperature); without a seed, u is 1/2."""
+        """Sample a relaxed coin per Gaussian, which is close to 0 or 1 (Maddison et al. 2017). With noise u,
+        it is sigmoid((logit + log u − log(1 − u)) / temperature); without a seed, u is 1/2."""
         if seed is not None:
             # Noise for all Gaussians is sampled on the CPU, so it depends neither on device nor visibility.
             noise = torch.rand(count, generator=torch.Generator().manual_seed(seed))
@@ -256,14 +247,9 @@ class Look:
 
     @torch.no_grad()
     def apply(self, splats: Splats, camera: Camera, everywhere: bool = True) -> Splats:
-        """Return the Gaussians under this lighting, in the colors that one camera sees.
-
-        Args:
-            splats: the Gaussians in the field's world frame.
-            camera: the view. Its position matters only if colors depend on it, because the change of lighting
-                depends on the visible color.
-            everywhere: whether to relight all Gaussians, or only those that the camera may see.
-        """
+        """Return the Gaussians (in the field's world frame) under this lighting, in the colors that one
+        camera sees; `everywhere` relights all of them, not only those that it may see. The camera's position
+        matters only if colors depend on it, because the change of lighting depends on the visible color."""
         camera = camera.to(splats.means.device)
         rows = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
         if not everywhere:
@@ -282,17 +268,9 @@ def render_in_look(
     background: Float[Tensor, "3"] | None = None,
     backend: Backend = "auto",
 ) -> Rendering:
-    """Render Gaussians under a photo's lighting.
-
-    Coverage, depth and further channels belong to the scene, not to a photo. If a look changes opacities,
-    they are rendered separately, with the opacities of the scene.
-
-    Args:
-        splats: the Gaussians, world frame.
-        camera: the view.
-        look: the lighting; None for the Gaussians' own colors.
-        channels, background, backend: see `render`.
-    """
+    """Render Gaussians (world frame) under a photo's lighting, or in their own colors without a look; for the
+    other arguments see `render`. Coverage, depth and further channels belong to the scene, not to a photo. If
+    a look changes opacities, they are rendered separately, with the opacities of the scene."""
     settings = {"background": background, "backend": backend}
     if look is None:
         return render(splats, camera, channels, **settings)  # type: ignore[arg-type]

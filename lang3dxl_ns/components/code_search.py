@@ -31,10 +31,9 @@ _FARTHEST = 6.0
 def nearest(
     field: SemanticField, head: Head, codes: Float[Tensor, "m code"], features: Float[Tensor, "n c"]
 ) -> Float[Tensor, "n code"]:
-    """Find, for each feature, the code that decodes nearest to it.
-
-    Distances are measured in the leading principal components of the decoded features. Of more than
-    `_LISTED` codes, evenly spaced ones are searched."""
+    """Find, for each feature, the code that decodes nearest to it. Distances are measured in the leading
+    principal components of the decoded features. Of more than `_LISTED` codes, evenly spaced ones are
+    searched."""
     codes = codes[:: -(-len(codes) // _LISTED)]
     decoded = F.linear(field.hidden(codes), *head)
     mean = decoded.mean(0)
@@ -49,9 +48,8 @@ def nearest(
 def settle(
     field: SemanticField, head: Head, codes: Float[Tensor, "n code"], features: Float[Tensor, "n c"]
 ) -> Float[Tensor, "n code"]:
-    """Move codes so that they decode nearer to the features (Levenberg 1944, Marquardt 1963).
-
-    A code for which no step is better is returned as it is."""
+    """Move codes so that they decode nearer to the features (Levenberg 1944, Marquardt 1963). A code for
+    which no step is better is returned as it is."""
     weight, bias = head
     gram, wanted = weight.T @ weight, (features - bias) @ weight
 

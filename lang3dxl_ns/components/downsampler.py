@@ -96,9 +96,8 @@ class AttenuatedDownsampler(nn.Module):
         crop_sides: Sequence[float],
         mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
     ) -> tuple[Float[Tensor, "a b c"], Float[Tensor, "a b c"], Float[Tensor, "a b"]]:
-        """Bring features and target to one grid: the target's unless configured otherwise.
-
-        Return both, and the cells' loss weight (the share described in `forward`)."""
+        """Bring features and target to one grid, the target's unless configured otherwise. Return both, and
+        the cells' loss weight (the share described in `forward`)."""
         inside = features.new_ones(features.shape[:2]) if mask is None else mask.to(features.dtype)
         if self.config.match == "resize-target":
             return features, _resized(target, (features.shape[0], features.shape[1])), inside
@@ -177,11 +176,9 @@ def mean_with_window_maxima(
     mask: Float[Tensor, "h w"],
 ) -> Float[Tensor, "hd wd c"]:
     """Compute every window's weighted mean with its own shift of the logits; for any logits, −∞ included.
-
     This works axis by axis. Along y every window has its own maximum, which is subtracted before `exp`; along
     x those maxima are the logits. Only differences of logits are taken, and no logarithm. A shift changes no
-    mean, so the maxima carry no gradient.
-    """
+    mean, so the maxima carry no gradient."""
     (boxes, hd, h), (_, wd, w) = kernel.rows.shape, kernel.columns.shape
     rows = kernel.rows.reshape(boxes * hd, h)
     along_y, maxima = _exp_shifted((logits + (mask > 0).log()).T[:, None], rows)  # [w, j·hd, h]
@@ -227,7 +224,6 @@ def separable_kernel(
     device: torch.device,
 ) -> SeparableKernel:
     """Build the kernel's matrices for a map size, a target grid and crop sides (fractions of the width).
-
     Raises ValueError for crop sides that are not positive and ascending."""
     if not sides or sides[0] <= 0 or list(sides) != sorted(sides):
         raise ValueError(f"crop_sides must be positive and ascending, smallest first; got {sides}")
@@ -256,12 +252,10 @@ def _nested_rows(size: int, cells: int, sides: Sequence[float]) -> Float[Tensor,
 
 
 def _window_means(size: int, centers: Float[Tensor, " n"], side: float) -> Float[Tensor, "n a"]:
-    """Compute the weights of an axis' pixels in windows of the given side, as shares of the whole window.
-
-    A pixel counts by the part of it that the window covers, sampled at that part's center by interpolating
-    between neighboring pixels. So whole pixels are averaged, a window narrower than a pixel interpolates,
-    and a ramp keeps its position exactly wherever the window is inside the map.
-    """
+    """Compute the weights of an axis' pixels in windows of the given side, as shares of the whole window. A
+    pixel counts by the part of it that the window covers, sampled at that part's center by interpolating
+    between neighboring pixels. So whole pixels are averaged, a window narrower than a pixel interpolates, and
+    a ramp keeps its position exactly wherever the window is inside the map."""
     pixel = torch.arange(size, dtype=torch.float64)
     start = torch.maximum(centers[:, None] - side / 2, pixel)
     end = torch.minimum(centers[:, None] + side / 2, pixel + 1)

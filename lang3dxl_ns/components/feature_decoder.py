@@ -124,11 +124,8 @@ class Decoder(nn.Module, ABC):
         """Learn from the photos' CLIP targets. The model calls this before training."""
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
-        """Set the per-channel mean and deviation of the targets, CLIP then dense.
-
-        Raises:
-            ValueError: wrong number of channels, a non-finite value, or a negative deviation.
-        """
+        """Set the per-channel mean and deviation of the targets, CLIP then dense. Raises ValueError for a
+        wrong number of channels, a non-finite value, or a negative deviation."""
         if mean.shape != self.output_mean.shape or std.shape != self.output_std.shape:
             raise ValueError(
                 f"output statistics need {len(self.output_mean)} channels (CLIP {self.clip_dim}, dense "

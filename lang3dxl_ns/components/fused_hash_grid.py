@@ -38,10 +38,8 @@ def interpolate(
     lattices: Lattices,
     level_weights: Float[Tensor, " levels"],
 ) -> Float[Tensor, "n out"]:
-    """Interpolate the features of points like `HashGrid.forward`; differentiable in points and table.
-
-    Points and table must be on the CPU and of one number type, float32 or float64.
-    """
+    """Interpolate the features of points like `HashGrid.forward`; differentiable in points and table, which
+    must be on the CPU and of one number type, float32 or float64."""
     return _Interpolate.apply(x, table, lattices, level_weights)
 
 
@@ -71,9 +69,8 @@ class _Interpolate(torch.autograd.Function):
 
 @numba.njit(forceinline=True)
 def _look_up(point, level, lattices, entries, sides):
-    """Compute the table rows of a cell's corners, and the weights of its two sides along every axis.
-
-    Bit k of a corner's number is its side along axis k."""
+    """Compute the table rows of a cell's corners, and the weights of its two sides along every axis. Bit k of
+    a corner's number is its side along axis k."""
     count, stride, one = lattices.cells[level], 1, sides.dtype.type(1)
     resolution = count + 2
     entries[0] = 0
@@ -130,7 +127,6 @@ def _features(first, last, x, table, level_weights, lattices, features):
 @kernel
 def _gradients(first, last, x, table, level_weights, lattices, grad, grad_table, of_points):
     """Add to the table's gradient, and return the part of the points' gradient that comes from these levels.
-
     The latter is two thirds of the work, and 0 unless `of_points`."""
     dimensions, width = x.shape[1], table.shape[1]
     entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)

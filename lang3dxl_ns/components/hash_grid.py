@@ -95,10 +95,8 @@ class HashGrid(nn.Module):
         self, x: Float[Tensor, "n d"], level_weights: Float[Tensor, " levels"] | None = None
     ) -> Float[Tensor, "n out"]:
         """Interpolate the features of every point; `level_weights` scales each level (see `coarse_to_fine`).
-
         Features have the table's number type. Coordinates are computed in at least float32, because in 16
-        bits a fine level would have no fractions left.
-        """
+        bits a fine level would have no fractions left."""
         if not self.levels:
             return x.new_zeros(len(x), 0)
         x = x.to(torch.promote_types(self.table.dtype, torch.float32)).clamp(
@@ -132,10 +130,8 @@ class HashGrid(nn.Module):
         return (0.5 - 0.5 * torch.cos(math.pi * amount)).to(self.table)
 
     def _vertex_entries(self, lower: Int[Tensor, "d levels n"]) -> Int[Tensor, "corners levels n"]:
-        """Compute the table rows of the corners of each point's cell; the last axis varies fastest.
-
-        Any integer is a valid vertex, even one that NaN was converted to.
-        """
+        """Compute the table rows of the corners of each point's cell; the last axis varies fastest. Any
+        integer is a valid vertex, even one that NaN was converted to."""
         vertices = torch.stack((lower, lower + 1), 1)
         dense, hashed = vertices[:, :, : self.dense_levels], vertices[:, :, self.dense_levels :]
         dense = dense % self.dense_resolutions[:, None]

@@ -1,31 +1,47 @@
-"""Initial Gaussians of training: one per COLMAP point, and a sky."""
+"""Gaussians of training: the initial ones, one per COLMAP point and a sky; bounds on all of them.
+
+Gaussians that few photos see may grow into sheets across the scene, or float where only new views see them.
+"""
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import Parameter
 
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.rendering.splats import harmonics_of
-from lang3dxl_ns.scene.geometry import sphere_around
 
 FIRST_OPACITY = 0.1
 FEWEST = 4
 """Smallest number of positions, so that each has three neighbors."""
 
+LONGEST = 1.0
+"""Longest standard deviation, relative to the scene's radius or, outside, to the distance from its center."""
+NEEDLE = 0.25
+"""Like `LONGEST`, for Gaussians more than twice as long as wide; ground and distant hills are wide."""
+EVERY = 10
+"""Training steps between two corrections; with harmonics, one takes a fifth of the time of a short step."""
+FREE = 0.02
+"""Radius of the space around every training camera that stays empty, relative to the scene's radius."""
+_STEEPEST = 0.5
+"""Largest norm of a color's harmonics above degree 0, per channel."""
+_ROWS = 16_384
+"""Number of Gaussians processed at a time, to bound memory."""
+
 
 def seed_positions(
     points: tuple[Tensor, Tensor] | None, count: int, side: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Choose the initial positions of Gaussians and their colors (0…1).
-
-    They are those of the points (whose colors are bytes) or, without points, `count` random ones in a box
-    with this side in world units. Raises UserError if there are too few points.
-    """
+    """Choose the initial positions of Gaussians and their colors (0…1): those of the points (whose colors are
+    bytes) or, without points, `count` random ones in a box with this side in world units. Raises UserError if
+    there are too few points."""
     if points is None:
         return (torch.rand(count, 3) - 0.5) * side, torch.rand(count, 3)
     if len(points[0]) < FEWEST:
@@ -39,16 +55,9 @@ def seed_positions(
 def initial_gaussians(
     means: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], sky: int, degree: int
 ) -> dict[str, Parameter]:
-    """Create the parameters of the sky's Gaussians, then of one Gaussian per position.
-
-    Gaussians are as wide as the mean distance to their three nearest neighbors.
-
-    Args:
-        means: at least `FEWEST` positions, world units.
-        colors: colors at these positions, 0…1.
-        sky: number of Gaussians on a sphere around the positions.
-        degree: degree of the colors' spherical harmonics.
-    """
+    """Create the parameters of the sky's Gaussians (`sky` of them, on a sphere around the positions), then of
+    one Gaussian per position, as wide as the mean distance to its three nearest neighbors. There are at least
+    `FEWEST` positions (world units), with colors in 0…1, stored as spherical harmonics of a degree."""
     sphere = sphere_around(means, sky)
     means = torch.cat([sphere, means])
     colors = torch.cat([torch.full_like(sphere, 0.5), colors])
@@ -75,3 +84,45 @@ def _spacing(means: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
     spacing = torch.from_numpy(distances).float().mean(dim=-1, keepdim=True)
     # Coincident points would make Gaussians of zero size.
     return spacing.clamp_min(1e-3 * float(spacing.median().clamp_min(1e-6)))
+
+
+def center_and_radius(points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], float]:
+    """Compute the median point of a scene, and the radius around it that contains 90 % of the points."""
+    center = points.median(dim=0).values
+    return center, float((points - center).norm(dim=1).quantile(0.9))
+
+
+def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "count 3"]:
+    """Spread points evenly (as a Fibonacci lattice) on a sphere of ten times the scene's radius."""
+    center, radius = center_and_radius(points)
+    i = torch.arange(count) + 0.5
+    z, longitude = 1 - 2 * i / count, i * math.pi * (3 - math.sqrt(5))
+    around = (1 - z * z).sqrt()
+    return center + 10 * radius * torch.stack([around * longitude.cos(), around * longitude.sin(), z], dim=1)
+
+
+@torch.no_grad()
+def keep_in_bounds(
+    gaussians: torch.nn.ParameterDict, center: Float[Tensor, "3"], radius: float, first: int, degree: int
+) -> None:
+    """Shorten Gaussians that are too long and bring their colors to 0…1, in place. Those before row `first`
+    are the sky's, and stay. `center` and `radius` are the scene's, in world units; `degree` is that of the
+    colors' spherical harmonics."""
+    g = {name: parameter[first:] for name, parameter in gaussians.items()}
+    away = (g["means"] - to_device(center, g["means"].device)).norm(dim=1, keepdim=True).clamp_min(radius)
+    wide = 2 * g["scales"].median(dim=1, keepdim=True).values.exp()
+    longest = wide.maximum(NEEDLE * away).minimum(LONGEST * away)
+    g["scales"].copy_(g["scales"].minimum(longest.log()))
+    if degree > 0:  # otherwise colors are logits
+        g["features_dc"].clamp_(*color_parameters(torch.tensor([[0.0], [1.0]]), degree).flatten().tolist())
+        norms = g["features_rest"].norm(dim=1, keepdim=True)
+        g["features_rest"].mul_(_STEEPEST / norms.clamp_min(_STEEPEST))
+
+
+@torch.no_grad()
+def near_cameras(
+    means: Float[Tensor, "n 3"], cameras: Float[Tensor, "p 3"], distance: float
+) -> Bool[Tensor, " n"]:
+    """Return which positions lie within a distance of any of the cameras, all in world units."""
+    cameras = cameras.to(means)
+    return torch.cat([torch.cdist(some, cameras).amin(1) < distance for some in means.split(_ROWS)])

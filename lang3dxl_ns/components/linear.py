@@ -14,14 +14,9 @@ def linear(
     bias: bool = True,
     fan_in: int | None = None,
 ) -> nn.Linear:
-    """Create a linear layer with torch's default initial range, drawn from a generator.
-
-    Args:
-        inputs, outputs: number of channels.
-        generator: source of the weights; None for torch's global generator.
-        bias: whether to add a bias.
-        fan_in: number of inputs that determines the range, for a layer that is part of a wider one.
-    """
+    """Create a linear layer with torch's default initial range, drawn from a generator (None: torch's global
+    one). `fan_in` is the number of inputs that determines the range, for a layer that is part of a wider
+    one."""
     # torch's `skip_init` would take a third of a second to import at its first use.
     with torch.random.fork_rng(devices=[]):
         layer = nn.Linear(inputs, outputs, bias=bias)

@@ -30,11 +30,9 @@ def rgb_loss(
     mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
     ssim_weight: float = 0.5,
 ) -> Float[Tensor, ""]:
-    """Compute (1 − w)·L1 + w·(1 − SSIM) of colors in [0, 1]; SSIM's window is 11 pixels with σ 1.5.
-
-    L1 is a mean over the mask. SSIM sees the whole images, as in the published system. An image narrower than
-    the window is extended by its border.
-    """
+    """Compute (1 − w)·L1 + w·(1 − SSIM) of colors in [0, 1]; SSIM's window is 11 pixels with σ 1.5. L1 is a
+    mean over the mask. SSIM sees the whole images, as in the published system. An image narrower than the
+    window is extended by its border."""
     color = _weighted_mean((prediction - target).abs(), mask)
     if mask is None:
         return torch.lerp(color, 1 - _ssim(prediction, target), ssim_weight)
@@ -82,10 +80,8 @@ def region_variance_loss(
     mask: Bool[Tensor, "h w"] | Float[Tensor, "h w"] | None = None,
 ) -> Float[Tensor, ""]:
     """Compute the variance of features inside regions, summed over channels and averaged over valid pixels.
-
     It is Σ_r Σ_{i∈r} ‖f_i − mean_r‖² / (number of valid pixels). Labels are any integers, negative for no
-    region; the mask is thresholded at 0.5. A region of one pixel only adds to the pixel count.
-    """
+    region; the mask is thresholded at 0.5. A region of one pixel only adds to the pixel count."""
     valid = labels >= 0 if mask is None else (labels >= 0) & (mask >= 0.5)
     features, valid = features.flatten(0, 1), valid.flatten()
     rough, rest = _region_means(features, torch.where(valid, labels.flatten(), -1))
@@ -98,12 +94,10 @@ def region_variance_loss(
 def _region_means(
     features: Float[Tensor, "n c"], labels: Int[Tensor, " n"]
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, "n c"]]:
-    """Compute the mean of each pixel's region, as a rounded value and its rounding error.
-
-    Both are needed where features are large compared with their spread: subtract one, then the other. They
-    carry no gradient. The loss above is still exact, because the deviations in a region sum to zero, and so
-    does the gradient through its mean.
-    """
+    """Compute the mean of each pixel's region, as a rounded value and its rounding error, to be subtracted
+    one after the other where features are large compared with their spread. They carry no gradient. The loss
+    above is still exact, because the deviations in a region sum to zero, and so does the gradient through its
+    mean."""
     # Regions are numbered without reading how many there are, which would synchronize a GPU.
     order = labels.argsort()
     ranked = labels[order]

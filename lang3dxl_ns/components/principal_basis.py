@@ -19,11 +19,9 @@ class PrincipalBasis:
 
     @classmethod
     def of(cls, maps: Iterable[Float[Tensor, "*pixels c"]], most: int) -> PrincipalBasis:
-        """Compute the first `most` principal components of all rows of all maps, which are read once.
-
-        Rows with a value that isn't finite are left out. Moments are merged in float64 (Chan, Golub & LeVeque
-        1983). Raises ValueError if no row is left.
-        """
+        """Compute the first `most` principal components of all rows of all maps, which are read once. Rows
+        with a value that isn't finite are left out. Moments are merged in float64 (Chan, Golub & LeVeque
+        1983). Raises ValueError if no row is left."""
         count, mean, scatter = 0, torch.zeros(()), torch.zeros(())
         for values in maps:
             rows = values.flatten(0, -2).double()

@@ -117,12 +117,9 @@ class SemanticFieldConfig:
     Otherwise the network's output is used as it is."""
 
     def resolved(self) -> FieldSettings:
-        """Return all settings, with unset ones taken from the preset.
-
-        Raises:
-            UserError: the preset is unknown, the code has too many or too few channels for the grid, or the
-                decoder has no hidden layer or no input.
-        """
+        """Return all settings, with unset ones taken from the preset. Raises UserError if the preset is
+        unknown, the code has too many or too few channels for the grid, or the decoder has no hidden layer or
+        no input."""
         name = "default" if self.preset == "auto" else self.preset
         if name not in PRESETS:
             raise UserError(
@@ -248,9 +245,8 @@ class SemanticField(Decoder):
         return torch.cat((coordinates, angles.sin(), angles.cos()), 1)
 
     def _head(self, channels: slice) -> tuple[Float[Tensor, "out hidden"], Float[Tensor, " out"]]:
-        """Return weight and bias of the last layer for some of its outputs, with whitening folded in.
-
-        Scaling its few weights costs less than scaling a feature map."""
+        """Return weight and bias of the last layer for some of its outputs, with whitening folded in. Scaling
+        its few weights costs less than scaling a feature map."""
         std = self.output_std[channels]
         weight = self.output.weight[channels] * std[:, None]
         return weight, self.output.bias[channels] * std + self.output_mean[channels]

@@ -20,13 +20,9 @@ OPACITY = 0.98
 
 
 class Sky(nn.Module):
-    """Sky of a scene, which is its first Gaussians. In training they don't move, and share nine colors.
-
-    Outside training they are Gaussians like any others, with the colors that they had last.
-
-    Args:
-        directions: directions from the scene's center to the Gaussians, of any length.
-    """
+    """Sky of a scene, which is its first Gaussians, in given directions (of any length) from its center. In
+    training they don't move, and share nine colors. Outside training they are Gaussians like any others, with
+    the colors that they had last."""
 
     directions: Float[Tensor, "k 3"]
 
@@ -48,7 +44,6 @@ class Sky(nn.Module):
         self, gaussians: Gaussians, colors: Float[Tensor, "n 3"]
     ) -> tuple[Gaussians, Float[Tensor, "n 3"]]:
         """Replace the colors of the first Gaussians by the sky's, and return all Gaussians and their colors.
-
         No gradient moves the sky's Gaussians; the gradient of their colors reaches the harmonics."""
 
         def still(values: Tensor) -> Tensor:

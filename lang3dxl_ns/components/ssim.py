@@ -23,11 +23,9 @@ _GAUSSIAN /= _GAUSSIAN.sum()
 
 
 def ssim(prediction: Float[Tensor, "c h w"], target: Float[Tensor, "c h w"]) -> Float[Tensor, ""]:
-    """Compute the mean SSIM (Wang et al. 2004) of values in 0…1, over channels and windows inside the images.
-
-    Windows have 11 pixels, σ 1.5. Both images are at least a window wide and high, on the CPU, in float32 or
-    float64. The gradient reaches the prediction alone.
-    """
+    """Compute the mean SSIM (Wang et al. 2004) of values in 0…1, over channels and windows (11 pixels, σ 1.5)
+    inside the images, which are at least a window wide and high, on the CPU, in float32 or float64. The
+    gradient reaches the prediction alone."""
     return _Similarity.apply(prediction, target)
 
 

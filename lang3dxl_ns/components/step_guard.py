@@ -34,11 +34,9 @@ class StepGuard:
         groups: Mapping[str, Iterable[Tensor]],
         scale: float = 1.0,
     ) -> bool:
-        """Return whether all losses and all gradients of the parameter groups are finite.
-
-        This takes one reduction per gradient, and one synchronization in all. `scale` is the scale of the
-        gradients under mixed precision. Raises UserError after too many broken steps in a row.
-        """
+        """Return whether all losses and all gradients of the parameter groups are finite, by one reduction
+        per gradient and one synchronization in all. `scale` is the scale of the gradients under mixed
+        precision. Raises UserError after too many broken steps in a row."""
         named = {f"loss {name}": value.detach().float() for name, value in losses.items()}
         for name, parameters in groups.items():
             norms = [torch.linalg.vector_norm(p.grad).float() for p in parameters if p.grad is not None]

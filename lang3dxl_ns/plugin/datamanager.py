@@ -9,9 +9,9 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import numpy as np
 import torch
 import tyro
-from jaxtyping import Bool
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
@@ -34,19 +34,19 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for, recorded_scene
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
-from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset, novel_outputs, novel_pixel_sizes
+from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset, novel_outputs
 from lang3dxl_ns.preparation.collection import CropPlan, plan_crops, prepare_collection
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
-from lang3dxl_ns.preparation.handover import Batch, SceneFacts
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
-from lang3dxl_ns.preparation.needs import Need, Sources, needs_table, scene_needs
+from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
+from lang3dxl_ns.preparation.physical_scale import pixel_size
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
+from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, SceneFacts, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.scene.colmap import Reconstruction
@@ -245,12 +245,17 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return plan_crops(list(self.photos.values()), self._reconstruction(), self.config)
 
     def test_pixel_sizes(self, photos: list[Photo]) -> dict[str, float] | None:
-        """Return the world units per pixel of the test views' photos; None if crops are relative."""
+        """Return the world units per pixel of the test views' photos, by the same rules as for all others;
+        None if crops are relative."""
         if self.crop_plan.pixel_sizes is None or self.test_views is None:
             return None
-        sizes = novel_pixel_sizes(self.test_views, self.config)  # per pixel of the views' files
-        widths = {view.name: view.width for view in self.test_views.cameras}
-        return {photo.name: sizes[photo.name] * widths[photo.name] / photo.width for photo in photos}
+        views, rules = self.test_views.cameras, (self.config.pixel_distance, self.config.pixel_angle)
+        sizes = {
+            view.name: (pixel_size(view, *rules), view.width) for view in views
+        }  # per pixel of the files
+        usual = float(np.median([size for size, _ in sizes.values() if size is not None]))
+        named = ((photo, *sizes[photo.name]) for photo in photos)
+        return {p.name: (usual if size is None else size) * width / p.width for p, size, width in named}
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
@@ -259,12 +264,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @cached_property
     def needs(self) -> list[Need]:
         """Needs of the scene for optional components, measured on first use."""
-        learns = self.config.clip != "none"
-        sources = Sources(
-            dense=learns and self.config.makes_dense,
-            regions=learns and self._region_source is not None,
+        learns, photos = self.config.clip != "none", list(self.photos.values())
+        dense, regions = self.config.makes_dense, self._region_source is not None
+        return scene_needs(
+            photos, self._reconstruction(), self.crop_plan, learns and dense, learns and regions
         )
-        return scene_needs(list(self.photos.values()), self._reconstruction(), self.crop_plan, sources)
 
     @cached_property
     def photos(self) -> dict[str, Photo]:
@@ -279,10 +283,6 @@ class Lang3DXLDataManager(FullImageDatamanager):
         for dataset in datasets:
             dataset.photos[:] = [photos[photo.name] for photo in dataset.photos]
         return photos
-
-    def foreground(self, name: str) -> Bool[Tensor, "h w"] | None:
-        """Return a photo's foreground at training resolution; None if it is the whole photo."""
-        return self._working.mask(self.photos[name], self.config.camera_res_scale_factor)
 
     def scene_file(self) -> SceneFile:
         """Describe the scene for the run's folder: photos, cameras and CLIP."""
@@ -348,10 +348,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return usable
 
     def next_train(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
-        """Return camera and batch of the next training photo; every photo appears once per round.
-
-        A photo found to be damaged is left out from then on, and logged.
-        """
+        """Return camera and batch of the next training photo; every photo appears once per round. A photo
+        found to be damaged is left out from then on, and logged."""
         while True:
             index = self.train_unseen_cameras.pop(0)
             if not self.train_unseen_cameras:
@@ -384,11 +382,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def round_state(self) -> dict[str, Any]:
         """Return the photos left in this round, and the state that determines the next, for a checkpoint."""
-        names = [photo.name for photo in self.train_dataset.photos]
-        generator = getattr(self, "random_generator", None)  # "fps" sampling has none
+        photos, generator = self.train_dataset.photos, getattr(self, "random_generator", None)
         return {
-            "upcoming": [names[i] for i in self.train_unseen_cameras],
-            "generator": generator and generator.getstate(),
+            "upcoming": [photos[i].name for i in self.train_unseen_cameras],
+            "generator": generator and generator.getstate(),  # "fps" sampling has none
         }
 
     def restore_round(self, state: dict[str, Any]) -> None:
@@ -443,12 +440,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
 
     def _read(self, dataset: PhotoDataset, index: int, with_targets: bool = True) -> dict[str, Any]:
-        """Read a photo's data for a step as they are kept in memory: bytes and half precision.
-
-        The data are `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target`
-        [Hd, Wd, C], `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions`
-        [h, w] (labels, −1 for none).
-        """
+        """Read a photo's data for a step as they are kept in memory: bytes and half precision. The data are
+        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target` [Hd, Wd, C],
+        `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
+        (labels, −1 for none)."""
         data: dict[str, Any] = dict(dataset.read(index))
         if self.targets is not None and with_targets:
             name = dataset.photos[index].name

@@ -27,15 +27,15 @@ from lang3dxl_ns.preparation.photo_collection import (
     MODEL_FOLDERS,
     OWN_MODEL,
     TRANSFORMS,
+    find_colmap_model,
     images_path,
     usable_photos,
 )
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.photo import Photo
-from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
+from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
-from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 
 @without(*OF_COLMAP)
@@ -69,7 +69,6 @@ class PhotoCollectionDataParser(ColmapDataParser):
 
     def __init__(self, config: PhotoCollectionDataParserConfig):
         super().__init__(config)
-        self.reconstruction: Reconstruction | None = None
         self.photos: dict[Path, Photo] = {}
         self._left_out: dict[str, UserError] = {}
 
@@ -84,13 +83,10 @@ class PhotoCollectionDataParser(ColmapDataParser):
             raise UserError(
                 f"{data} is not a folder: pass the folder that holds images/ and sparse/0 as --data"
             )
-        self.config.colmap_path = _first_folder(
-            data, (self.config.colmap_path, *MODEL_FOLDERS, OWN_MODEL), "*.*"
-        )
+        named = self.config.colmap_path
+        self.config.colmap_path = find_colmap_model(data, (named, *MODEL_FOLDERS, OWN_MODEL)) or named
         self.config.images_path = images_path(data, self.config.images_path)
-        if self.reconstruction is None:
-            self._read_collection()
-            self._mention_what_is_not_used()
+        _ = self.reconstruction  # read before the parent looks for anything
         # The parent would require a mask for every photo; here masks are optional and found per photo.
         masks, scaled = self.config.masks_path, self.config.auto_scale_poses
         self.config.masks_path, self.config.auto_scale_poses = None, scaled and self._cameras_are_apart
@@ -143,7 +139,6 @@ class PhotoCollectionDataParser(ColmapDataParser):
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict:
         """Build the parent's frames, sorted by name, so that interval splits don't depend on COLMAP's ids."""
-        assert self.reconstruction is not None
         frames = [self._frame(tracked) for tracked in self.reconstruction.photos.values()]
         applied = np.eye(4)[:3][[0, 2, 1]]
         applied[2] *= -1
@@ -152,26 +147,24 @@ class PhotoCollectionDataParser(ColmapDataParser):
     @cached_property
     def _origin(self) -> np.ndarray:
         """Center of the cameras, which is subtracted from positions as the origin while they are in float64.
+        The parent casts to float32, which resolves map coordinates (millions of meters) only to half a
+        meter."""
+        return np.zeros(3) if self.config.center_method == "none" else self._centers.mean(axis=0)
 
-        The parent casts to float32, which resolves map coordinates (millions of meters) only to half a meter.
-        """
-        assert self.reconstruction is not None
-        if self.config.center_method == "none":
-            return np.zeros(3)
-        return np.mean([tracked.center for tracked in self.reconstruction.photos.values()], axis=0)
+    @property
+    def _centers(self) -> np.ndarray:
+        return np.array([tracked.center for tracked in self.reconstruction.photos.values()])
 
     @property
     def _cameras_are_apart(self) -> bool:
         """Whether cameras are far enough apart to scale the scene by their distance."""
-        assert self.reconstruction is not None
-        centers = np.array([tracked.center for tracked in self.reconstruction.photos.values()])
+        centers = self._centers
         distances = np.linalg.norm(self.reconstruction.points - centers.mean(axis=0), axis=1)
         typical = np.median(distances) if len(distances) else 0.0
         return bool(np.ptp(centers, axis=0).max() > 1e-6 * typical)
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: torch.Tensor, scale_factor: float) -> dict:
         """Return the model's points in the scene's frame, with their colors."""
-        assert self.reconstruction is not None
         transform = transform_matrix.double()
         points = torch.from_numpy(self.reconstruction.points - self._origin)
         return {
@@ -195,13 +188,13 @@ class PhotoCollectionDataParser(ColmapDataParser):
     def _images_folder(self) -> Path:
         return self.config.data / self.config.images_path
 
-    def _read_collection(self) -> None:
-        """Read the model's usable photos, and log which are left out, and why."""
-        reconstruction = read_reconstruction(self.config.data / self.config.colmap_path)
-        self.photos, kept, left_out = usable_photos(
-            reconstruction, self._images_folder, self._mask_path, self.config.follow_links
+    @cached_property
+    def reconstruction(self) -> Reconstruction:
+        """The model with its usable photos alone. Which are left out, and why, is logged once."""
+        found = read_reconstruction(self.config.data / self.config.colmap_path)
+        self.photos, kept, self._left_out = usable_photos(
+            found, self._images_folder, self._mask_path, self.config.follow_links
         )
-        self._left_out = left_out
         if len(self.photos) == 1:
             raise UserError(
                 f"{self.config.data} has one usable photo: a scene needs at least two, one to "
@@ -209,16 +202,16 @@ class PhotoCollectionDataParser(ColmapDataParser):
             )
         if not self.photos:
             raise UserError(
-                f"none of the model's {len(left_out)} photos can be used; "
-                f"the first: {next(iter(left_out.values()))}. Name the photos' folder with "
+                f"none of the model's {len(self._left_out)} photos can be used; "
+                f"the first: {next(iter(self._left_out.values()))}. Name the photos' folder with "
                 f"`lang3dxl-colmap --images-path FOLDER` after the other options"
             )
-        if left_out:
-            CONSOLE.log(f"[yellow]{len(left_out)} photos of the model are left out:[/yellow]")
-            for name, why in left_out.items():
+        if self._left_out:
+            CONSOLE.log(f"[yellow]{len(self._left_out)} photos of the model are left out:[/yellow]")
+            for name, why in self._left_out.items():
                 CONSOLE.log(f"  {escape(printable(f'{name}: {why}'))}")
-        kept = {name: tracked for name, tracked in kept.items() if name not in left_out}
-        self.reconstruction = replace(reconstruction, photos=kept)
+        self._mention_what_is_not_used()
+        return replace(found, photos={name: p for name, p in kept.items() if name not in self._left_out})
 
     def _mask_path(self, name: str) -> Path | None:
         """Find the photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""
@@ -229,7 +222,9 @@ class PhotoCollectionDataParser(ColmapDataParser):
     def _mention_what_is_not_used(self) -> None:
         """Log other models beside the one in use, and photos missing from it."""
         model = self.config.data / self.config.colmap_path
-        others = [folder for folder in _models_beside(model) if folder != model]
+        # COLMAP's mapper leaves its models in one folder: 0, 1, …
+        beside = sorted(model.parent.glob("[0-9]*")) if model.name.isdigit() else []
+        others = [f for f in beside if f != model and f.name.isdigit() and any(f.glob("images.*"))]
         if others:
             counts = (f"{f.relative_to(self.config.data)} with {photos_in_model(f)}" for f in others)
             CONSOLE.log(
@@ -237,27 +232,13 @@ class PhotoCollectionDataParser(ColmapDataParser):
                 f"with {photos_in_model(model)} photos.[/yellow] There are also {', '.join(counts)}: choose "
                 "with `lang3dxl-colmap --colmap-path FOLDER` after all other options"
             )
-        known = set(self.photos)
         names = photos_below(self._images_folder)
-        unknown = [n for n in names if self._images_folder / n not in known and n not in self._left_out]
+        unknown = [n for n in names if self._images_folder / n not in self.photos and n not in self._left_out]
         if unknown:
             CONSOLE.log(
                 f"{len(unknown)} photos of {self._images_folder} are not in the COLMAP model and not used: "
                 f"{escape(some(unknown))}"
             )
-
-
-def _models_beside(model: Path) -> list[Path]:
-    """List the models that COLMAP's mapper left in one folder: 0, 1, …; only this one if it has no number."""
-    if not model.name.isdigit():
-        return [model]
-    numbered = (folder for folder in model.parent.iterdir() if folder.name.isdigit())
-    return sorted(folder for folder in numbered if any(folder.glob("images.*")))
-
-
-def _first_folder(data: Path, candidates: tuple[Path, ...], contents: str) -> Path:
-    """Return the first folder (relative to `data`) that exists and holds files, or else the first one."""
-    return next((c for c in candidates if any(p.is_file() for p in (data / c).glob(contents))), candidates[0])
 
 
 # ── a run whose photos are gone ───────────────────────────────────────────────────────────────────────────
@@ -319,26 +300,22 @@ def parser_for(
     parser: PhotoCollectionDataParserConfig, cache_dir: Path | None, may_reconstruct: bool
 ) -> DataParserConfig:
     """Choose the dataparser for `parser.data`. Photos without a model are reconstructed, if allowed; a video
-    becomes a folder of frames. A folder with only a transforms.json gets nerfstudio's own parser.
-
-    Raises UserError if the photos don't make a scene.
-    """
+    becomes a folder of frames. A folder with only a transforms.json gets nerfstudio's own parser. Raises
+    UserError if the photos don't make a scene."""
     data = expanded(parser.data).absolute()
     if is_video(data) or (not data.exists() and frames_folder(data).is_dir()):
         data = parser.data = extract_frames(data) if may_reconstruct else frames_folder(data)
-    named = parser.colmap_path
-    folders: tuple[Path, ...] = (named, *MODEL_FOLDERS, OWN_MODEL)
+    named, usual = parser.colmap_path, type(parser)().colmap_path
+    folders = [named, *MODEL_FOLDERS, OWN_MODEL]
     if cache_dir is not None:
-        folders = (*folders, expanded(cache_dir).absolute() / "reconstruction/sparse/0")
-    known = next((f for f in folders if any((data / f).glob("images.*"))), None)
+        folders.append(expanded(cache_dir).absolute() / "reconstruction/sparse/0")
+    known = find_colmap_model(data, folders)
     if known is not None:
         parser.colmap_path = known
     elif (data / TRANSFORMS).is_file():
         CONSOLE.log(f"{data} has a {TRANSFORMS} and no COLMAP model: read as nerfstudio-data")
         return NerfstudioDataParserConfig(data=data)
-    elif (
-        may_reconstruct and named == type(parser)().colmap_path and data.is_dir() and find_photos(data).names
-    ):
+    elif may_reconstruct and named == usual and data.is_dir() and find_photos(data).names:
         data, model = reconstruct_scene(data, cache_dir)
         parser.colmap_path = model.relative_to(data) if model.is_relative_to(data) else model
     elif may_reconstruct and data.is_dir() and not any(data.iterdir()):

@@ -11,7 +11,7 @@ from gsplat.strategy.ops import remove
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.components.bounds import near_cameras
+from lang3dxl_ns.components.initialization import near_cameras
 
 _BEYOND = 1.1
 """Factor by which growth may exceed the cap before the least opaque Gaussians are removed."""
@@ -52,8 +52,7 @@ class Densification(DefaultStrategy):
     ) -> None:
         """Add a step's gradients as gsplat does, but unscaled. The visible Gaussians are not selected,
         because the host would have to wait for their number."""
-        means2d = info[self.key_for_gradient]
-        gradient: Tensor = (means2d.absgrad if self.absgrad else means2d.grad) / self.loss_scale
+        gradient: Tensor = info[self.key_for_gradient].grad / self.loss_scale
         half = info["width"] / 2.0 * info["n_cameras"], info["height"] / 2.0 * info["n_cameras"]
         norms = torch.stack([gradient[..., i] * half[i] for i in range(2)], dim=-1).norm(dim=-1)
         seen = info["radii"] > 0

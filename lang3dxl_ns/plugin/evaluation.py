@@ -32,7 +32,7 @@ from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos
-from lang3dxl_ns.preparation.handover import Batch
+from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.scene.camera import Camera
@@ -61,13 +61,8 @@ class EvaluationSettings:
 
 
 class Evaluation:
-    """Scores of a model on photos of its scene.
-
-    Args:
-        model: the model, trained or still in training.
-        datamanager: data manager with the photos and their targets.
-        settings: which photos to evaluate, against which ground truth.
-    """
+    """Scores of a model, trained or still in training, on photos of its scene, which the data manager reads
+    with their targets, against the ground truth of the settings."""
 
     def __init__(
         self, model: Lang3DXLModel, datamanager: Lang3DXLDataManager, settings: EvaluationSettings
@@ -163,10 +158,8 @@ class Evaluation:
         return protocol.measure(to_rasterizer(camera), model.get_gt_img(batch["image"]), mask)
 
     def _photos_of(self, split: Split) -> EvalPhotos:
-        if split == "held-out":
-            return self._data.fixed_indices_eval_dataloader
-        if split == "test":
-            return self._data.evaluated(self._data.test_dataset)
+        if split != "seen":
+            return self._data.evaluated(self._data.test_dataset if split == "test" else None)
         if self.scorer is None:
             raise UserError("seen photos can be evaluated only with ground truth and CLIP")
         seen = self._data.train_dataset
@@ -178,13 +171,10 @@ class Evaluation:
     def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Camera], Maps]:
         """Build a function that renders the labels themselves, lifted from the photos to the Gaussians."""
         truth = scorer.truth
-
-        def labels():
-            for camera, photo in photos.cameras():
-                truths = truths_of(truth, photo, truth.scoring_size(photo.height, photo.width))
-                yield to_rasterizer(camera), {category: found.mask for category, found in truths.items()}
-
-        return label_limit(self._model.splats(), labels(), truth.categories, self._model.backend)
+        sized = ((camera, p, truth.scoring_size(p.height, p.width)) for camera, p in photos.cameras())
+        labels = ((to_rasterizer(camera), truths_of(truth, photo, size)) for camera, photo, size in sized)
+        masks = ((view, {name: t.mask for name, t in truths.items()}) for view, truths in labels)
+        return label_limit(self._model.splats(), masks, truth.categories, self._model.backend)
 
     def _evaluate_photo(self, camera, batch: Batch, photo: Photo, score: Score | None) -> EvaluatedPhoto:
         start = perf_counter()
@@ -244,12 +234,9 @@ class Evaluation:
 
     def scored(self, output_path: Path | None = None, get_std: bool = False) -> dict[str, Any]:
         """Compute means and totals over the evaluated photos, and `peak_memory_mb` of the process (or of the
-        GPU, if one is used); see `evaluation.aggregate.average`.
-
-        output_path: folder for a picture of every photo, optional. get_std: add standard deviations,
-        `protocol` (what was scored, and how), `photos` (the figures of each), and, for held-out photos, the
-        same for the scene's `test_views`.
-        """
+        GPU, if one is used); see `evaluation.aggregate.average`. output_path: folder for a picture of every
+        photo, optional. get_std: add standard deviations, `protocol` (what was scored, and how), `photos`
+        (the figures of each), and, for held-out photos, the same for the scene's `test_views`."""
         results = self._averages(self._settings.evaluated_photos, output_path, get_std)
         on_gpu = torch.device(self._model.device).type == "cuda"
         results["peak_memory_mb"] = (torch.cuda.max_memory_allocated() if on_gpu else host_peak()) / 2**20
@@ -274,12 +261,8 @@ class Evaluation:
     def _protocol(self, split: Split, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
         scorer, masked = self._scorer_of(split), sum(photo.masked for photo in evaluated)
         trained = {photo.name for photo in self._data.train_dataset.photos}
-        seen = sum(photo.name in trained for photo in evaluated)
-        photos: dict[str, Any] = {
-            "split": split,
-            "evaluated_photos": len(evaluated),
-            "seen_in_training": seen,
-        }
+        photos: dict[str, Any] = {"split": split, "evaluated_photos": len(evaluated)}
+        photos["seen_in_training"] = sum(photo.name in trained for photo in evaluated)
         if self._fits_looks(split):
             photos["colors"] = PROTOCOL
         if scorer is None:

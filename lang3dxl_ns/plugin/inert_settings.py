@@ -12,6 +12,7 @@ OF_SPLATFACTO = (
     *("cull_scale_thresh", "cull_screen_size", "split_screen_size", "stop_screen_size_at"),
     *("use_scale_regularization", "max_gauss_ratio", "use_bilateral_grid", "grid_shape"),
     *("color_corrected_metrics", "resolution_schedule", "num_downscales", "output_depth_during_training"),
+    "use_absgrad",
 )
 """Settings of splatfacto's own schedule and parts, which this model does not have."""
 OF_IMAGE_CACHES = (
@@ -32,10 +33,8 @@ _OF_RENDERINGS = (
 
 
 def check_inert(model: Any, data: Any) -> None:
-    """Raise UserError if a setting that has no effect in this run differs from its default.
-
-    model, data: settings of the model and of the data manager.
-    """
+    """Raise UserError if a setting that has no effect in this run differs from its default. model, data:
+    settings of the model and of the data manager."""
     changed = [
         *_changed(model, OF_SPLATFACTO, "--pipeline.model."),
         *_changed(data, OF_IMAGE_CACHES, "--pipeline.datamanager."),

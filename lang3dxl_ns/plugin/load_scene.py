@@ -13,7 +13,7 @@ from nerfstudio.data.scene_box import SceneBox
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
-from lang3dxl_ns.preparation.handover import SceneFacts
+from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_checkpoint import latest_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, find_config

@@ -24,16 +24,22 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components import losses, schedules
-from lang3dxl_ns.components.bounds import EVERY, FREE, keep_in_bounds
-from lang3dxl_ns.components.initialization import color_parameters, initial_gaussians, seed_positions
+from lang3dxl_ns.components.initialization import (
+    EVERY,
+    FREE,
+    center_and_radius,
+    color_parameters,
+    initial_gaussians,
+    keep_in_bounds,
+    seed_positions,
+)
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
 from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
-from lang3dxl_ns.preparation.handover import Batch
-from lang3dxl_ns.scene.geometry import center_and_radius
+from lang3dxl_ns.preparation.targets import Batch
 
 DECODE_SIZES = 5
 """Number of sizes at which code maps are decoded in training."""
@@ -104,12 +110,8 @@ class Lang3DXLModel(RenderingModel):
     def learn_from_photos(
         self, photos: Iterable[tuple[Cameras, Batch]], advance: Callable[[], None] = lambda: None
     ) -> None:
-        """Give the Gaussians codes that represent the photos' targets; see `learn_codes`.
-
-        Args:
-            photos: cameras and batches, with targets.
-            advance: called `learning_steps` times as the decoder learns.
-        """
+        """Give the Gaussians codes that represent the targets of the photos (cameras and batches); see
+        `learn_codes`. `advance` is called `learning_steps` times as the decoder learns."""
         decoder, facts = self.semantic_field, self.facts
         assert decoder is not None and facts.clip_targets is not None
         views, means = (self._target_view(*photo) for photo in photos), self.means.detach()
@@ -183,18 +185,19 @@ class Lang3DXLModel(RenderingModel):
                 difference = losses.dense_loss(dense, batch["dense_target"], shown, c.dense_compare)
                 loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
-                labels = resize_nearest(batch["regions"][..., None].float(), clip.shape[:2])[..., 0].long()
-                loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
+                labels = _resized(batch["regions"], clip.shape[:2])
+                loss["regions"] = c.region_weight * losses.region_variance_loss(
+                    clip, labels.long(), small_mask
+                )
             own = self.semantic_field.own_losses(clip, dense)
         return loss | {name: ramp * value for name, value in own.items()}
 
     def _decode_small(self, codes: Float[Tensor, "H W 3"], mask: Tensor | None, size: tuple[int, int]):
         """Resize a code map to a size (nearest), and decode it → clip [h, w, C], dense, mask [h, w]."""
-        small_mask = None if mask is None else resize_nearest(mask[..., None].float(), size)[..., 0]
         assert self.semantic_field is not None
         with part("decode"):
             clip, dense = self.semantic_field(resize_nearest(codes, size))
-        return clip, dense, small_mask
+        return clip, dense, _resized(mask, size)
 
     def _random_size(self) -> int:
         """Draw the longer side at which this iteration decodes. It is one of a few, since a GPU's libraries
@@ -278,20 +281,14 @@ class Lang3DXLModel(RenderingModel):
         maps = self.composite(camera, torch.cat([hidden, known.to(hidden)], dim=1))
         size = fitted_size(maps, longer_side)
         maps = resize_nearest(maps, size)
-        clip = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3)
-        head = decoder.clip_head()
-        if head is not None:
-            clip = F.linear(clip, *head)
-        small = None if mask is None else resize_nearest(mask[..., None].float(), size)[..., 0]
-        return clip, None, small
+        clip, head = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3), decoder.clip_head()
+        return clip if head is None else F.linear(clip, *head), None, _resized(mask, size)
 
     # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs):  # type: ignore[override]
-        """Load a checkpoint of any number of Gaussians, with or without semantics.
-
-        Parameters are resized in place: the optimizers hold them, and new ones would never be trained.
-        """
+        """Load a checkpoint of any number of Gaussians, with or without semantics. Parameters are resized in
+        place: the optimizers hold them, and new ones would never be trained."""
         match_components(self, state)
         self.config.sh_degree = isqrt(state["gauss_params.features_rest"].shape[1] + 1) - 1
         self.step = self.config.total_steps
@@ -306,3 +303,8 @@ class Lang3DXLModel(RenderingModel):
                 )
             parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super(SplatfactoModel, self).load_state_dict(state, **kwargs)
+
+
+def _resized(values: Tensor | None, size: tuple[int, int]) -> Any:
+    """Resize a mask or labels [h, w] to a size (nearest), as floats; None stays None."""
+    return None if values is None else resize_nearest(values[..., None].float(), size)[..., 0]

@@ -12,7 +12,7 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from lang3dxl_ns.common.checks import is_coordinate
+from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import check_regular, expanded, read_json
@@ -26,15 +26,15 @@ from lang3dxl_ns.scene.photo import Photo
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4")
 _PATHS = ("file_path", "mask_path", "depth_file_path")
 _NAMES = ("train_filenames", "val_filenames", "test_filenames")
+_MOST_BYTES = 1 << 30
+_NONE = np.zeros((0, 3))
 
 
 def check_transforms(dataparser: DataParserConfig) -> None:
-    """Check the transforms.json of a scene as COLMAP models are checked, before nerfstudio reads it.
-
-    Raises UserError for a file that is not JSON or lists no photo, an impossible lens or pose, an unknown
-    camera model, and a path that leads out of the scene's folder, also through a link inside it. (A folder in
-    the scene's may be a link itself, such as images/.) Scenes of other dataparsers are not checked.
-    """
+    """Check the transforms.json of a scene as COLMAP models are checked, before nerfstudio reads it. Raises
+    UserError for a file that is not JSON or lists no photo, an impossible lens or pose, an unknown camera
+    model, and a path that leads out of the scene's folder, also through a link inside it. (A folder in the
+    scene's may be a link itself, such as images/.) Scenes of other dataparsers are not checked."""
     if not isinstance(dataparser, NerfstudioDataParserConfig):
         return
     data = expanded(dataparser.data)
@@ -42,31 +42,27 @@ def check_transforms(dataparser: DataParserConfig) -> None:
     try:
         content = read_json(path, _MOST_BYTES)
         _check_scene(content, path.parent)
-        if "ply_file_path" not in content and not (path.parent / "colmap").exists():
-            say(
-                f"{path} names no points (ply_file_path): training starts from random ones, which costs "
-                "several dB; without this file, the photos are reconstructed with points"
-            )
     except FileNotFoundError as error:
         raise UserError(f"there is no {path}: give its folder as --data, or the file itself") from error
     except KeyError as error:
         raise UserError(f"{path} can't be used: a photo has no {error}; make the file again") from error
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{path} can't be used: {error}; correct it, or make it again") from error
-
-
-_MOST_BYTES = 1 << 30
+    if "ply_file_path" not in content and not (path.parent / "colmap").exists():
+        say(
+            f"{path} names no points (ply_file_path): training starts from random ones, which costs "
+            "several dB; without this file, the photos are reconstructed with points"
+        )
 
 
 def _check_scene(content: Any, folder: Path) -> None:
-    if not isinstance(content, dict) or not isinstance(content.get("frames"), list) or not content["frames"]:
-        raise ValueError("it lists no photo under frames")
+    frames: Any = content.get("frames") if isinstance(content, dict) else None
+    expect(isinstance(frames, list) and bool(frames), "it lists no photo under frames")
     model = content.get("camera_model", "OPENCV")
-    if not isinstance(model, str) or model not in CAMERA_MODEL_TO_TYPE:
-        raise ValueError(f"the camera model {str(model)[:40]!r} is unknown")
-    for frame in content["frames"]:
-        if not isinstance(frame, dict):
-            raise ValueError("a photo is not described by names and values")
+    known = isinstance(model, str) and model in CAMERA_MODEL_TO_TYPE
+    expect(known, f"the camera model {str(model)[:40]!r} is unknown")
+    for frame in frames:
+        expect(isinstance(frame, dict), "a photo is not described by names and values")
         name = str(frame["file_path"])[:80]
         try:
             _check_frame({**content, **frame}, folder)
@@ -78,21 +74,17 @@ def _check_scene(content: Any, folder: Path) -> None:
     if "applied_transform" in content:
         check_pose(content["applied_transform"])
     scale = content.get("applied_scale", 1.0)
-    if not (is_coordinate(scale) and scale > 0):
-        raise ValueError(f"applied_scale is {str(scale)[:40]}")
+    expect(is_coordinate(scale) and scale > 0, f"applied_scale is {str(scale)[:40]}")
 
 
 def _check_frame(frame: dict[str, Any], folder: Path) -> None:
-    for key in _PATHS:
-        if key in frame:
-            _check_path(frame[key], folder)
+    for name in (frame[key] for key in _PATHS if key in frame):
+        _check_path(name, folder)
     width, height, *focal = (frame[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"))
-    if not (is_coordinate(width) and is_coordinate(height)):
-        raise ValueError("its size is not a number")
-    distortion = tuple(frame[key] for key in _DISTORTION if key in frame)
-    distortion += tuple(frame.get("distortion_params", ()))
-    if not all(map(is_coordinate, distortion)):
-        raise ValueError("its lens has a distortion that is not a number")
+    expect(is_coordinate(width) and is_coordinate(height), "its size is not a number")
+    distortion = [frame[key] for key in _DISTORTION if key in frame]
+    numbers = all(map(is_coordinate, (*distortion, *frame.get("distortion_params", ()))))
+    expect(numbers, "its lens has a distortion that is not a number")
     Lens(int(width), int(height), *focal).check()
     check_pose(frame["transform_matrix"])
 
@@ -103,8 +95,8 @@ def _check_path(name: object, folder: Path) -> None:
         raise ValueError(f"{str(name)[:40]!r} is not a path")
     path = folder / name
     if Path(name).is_absolute():
-        if not Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder.absolute())):
-            raise ValueError(f"{name} lies outside {folder}: copy it there, and name it relative to it")
+        within = Path(os.path.normpath(path)).is_relative_to(os.path.normpath(folder.absolute()))
+        expect(within, f"{name} lies outside {folder}: copy it there, and name it relative to it")
         name = os.path.relpath(path, folder.absolute())
     try:
         inside(folder, name, follow_links=True)
@@ -117,10 +109,8 @@ def _check_path(name: object, folder: Path) -> None:
 
 
 def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
-    """Build `Photo`s for the outputs of any nerfstudio dataparser.
-
-    Raises UserError for a camera that is not a perspective camera, and for a photo outside the data folder.
-    """
+    """Build `Photo`s for the outputs of any nerfstudio dataparser. Raises UserError for a camera that is not
+    a perspective camera, and for a photo outside the data folder."""
     cameras, folder = outputs.cameras, data if data.is_dir() else data.parent
     photos = []
     for i, path in enumerate(outputs.image_filenames):
@@ -151,22 +141,16 @@ def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
 def reconstruction_of(splits: list[DataparserOutputs]) -> Reconstruction:
     """Build a reconstruction in the scene's original units from cameras and seed points, for scenes without
     tracks. A photo's points are the seed points that project into it."""
-    metadata = splits[0].metadata
-    scale = splits[0].dataparser_scale
-    points = (
-        metadata["points3D_xyz"].double().numpy() / scale if "points3D_xyz" in metadata else np.zeros((0, 3))
-    )
+    scale, metadata, points, colors = splits[0].dataparser_scale, splits[0].metadata, _NONE, _NONE
+    if "points3D_xyz" in metadata:
+        points = metadata["points3D_xyz"].double().numpy() / scale
+        colors = metadata["points3D_rgb"].numpy() if len(points) else colors
     photos = {}
     for outputs in splits:
-        for photo, pose in zip(outputs.metadata["photos"], outputs.cameras.camera_to_worlds, strict=True):
-            tracked = _tracked(photo, pose.double().numpy(), scale)
+        poses = outputs.cameras.camera_to_worlds.double().numpy()
+        for photo, pose in zip(outputs.metadata["photos"], poses, strict=True):
+            rotation = (pose[:, :3] * [1, -1, -1]).T  # OpenGL camera axes to OpenCV's, inverted
+            camera_from_world = np.hstack([rotation, -rotation @ pose[:, 3:] / scale])
+            tracked = TrackedPhoto(photo.name, photo.lens, camera_from_world, _NONE, _NONE[:, :2])
             photos[photo.name] = replace(tracked, points=points_in_view(points, tracked))
-    colors = metadata["points3D_rgb"].numpy() if len(points) else np.zeros((0, 3))
-    return Reconstruction(photos=dict(sorted(photos.items())), points=points, colors=colors)
-
-
-def _tracked(photo: Photo, world_from_camera: np.ndarray, scale: float) -> TrackedPhoto:
-    rotation = (world_from_camera[:, :3] * [1, -1, -1]).T  # OpenGL camera axes to OpenCV's, inverted
-    camera_from_world = np.hstack([rotation, -rotation @ world_from_camera[:, 3:] / scale])
-    nowhere = np.zeros((0, 3)), np.zeros((0, 2))
-    return TrackedPhoto(photo.name, photo.lens, camera_from_world, *nowhere)
+    return Reconstruction(dict(sorted(photos.items())), points, colors)

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from torch import Tensor
 from torch.nn import Parameter
@@ -52,9 +51,7 @@ def leave_out_components(model: RenderingModel) -> None:
 
 def component_parameters(model: RenderingModel) -> dict[str, list[Parameter]]:
     """Return the optimizer groups of the components that the model has, by name."""
-    groups: dict[str, list[Parameter]] = {}
-    if model.sky is not None:
-        groups["sky"] = [model.sky.harmonics]
+    groups = {} if model.sky is None else {"sky": [model.sky.harmonics]}
     model.camera_optimizer.get_param_groups(groups)
     if model.semantic_field is not None and model.downsampler is not None:
         groups |= model.semantic_field.parameter_groups()
@@ -68,9 +65,7 @@ def component_parameters(model: RenderingModel) -> dict[str, list[Parameter]]:
 
 def match_components(model: RenderingModel, state: Mapping[str, Any]) -> None:
     """Add, replace or leave out components to match a checkpoint, which names tensors as the model does.
-
-    Raises UserError if the model's settings contradict the checkpoint.
-    """
+    Raises UserError if the model's settings contradict the checkpoint."""
     directions = state.get("sky.directions")
     if directions is None:
         model.sky = None
@@ -154,9 +149,7 @@ def _match_semantics(model: RenderingModel, state: Mapping[str, Any]) -> None:
             )
 
 
-def _add_decoder(
-    model: RenderingModel, clip_mean: Float[Tensor, " c"], dense_mean: Float[Tensor, " d"]
-) -> None:
+def _add_decoder(model: RenderingModel, clip_mean: Tensor, dense_mean: Tensor) -> None:
     model.register_buffer("clip_mean", clip_mean)
     model.register_buffer("dense_mean", dense_mean)
     c, channels = model.config, (len(clip_mean), len(dense_mean))

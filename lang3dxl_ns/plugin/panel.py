@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
+import numpy as np
 import viser
 import viser.theme
+from jaxtyping import Float
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl
+from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
@@ -22,7 +26,6 @@ from lang3dxl_ns.query.run_file import SceneFile, overview
 from lang3dxl_ns.query.web.viewer_guard import Guard, guard_viewers
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera
-from lang3dxl_ns.scene.stand import stand_of
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
@@ -228,10 +231,27 @@ class AskPanel(ViewerControl):
 def _place_camera(client: viser.ClientHandle, camera: Camera, target: tuple[float, ...] | None) -> None:
     from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO as SCALE  # imports the models
 
-    stand = stand_of(camera, client.camera.aspect, target)
+    position, look_at, fov = stand_of(camera, client.camera.aspect, target)
     with client.atomic():
-        client.camera.position, client.camera.look_at = stand.position * SCALE, stand.look_at * SCALE
-        client.camera.fov = stand.fov
+        client.camera.position, client.camera.look_at = position * SCALE, look_at * SCALE
+        client.camera.fov = fov
+
+
+def stand_of(
+    camera: Camera, aspect: float, target: tuple[float, ...] | None = None
+) -> tuple[Float[Array, "3"], Float[Array, "3"], float]:
+    """Compute the viewer's position, orbit center (both in the model's axes) and vertical field of view
+    (radians) that show all of a photo in a window of this aspect ratio (width ÷ height), without roll, which
+    the viewer's controls lack. The orbit center is `target`, moved onto the photo's axis at its distance;
+    None puts it a unit away."""
+    view = camera.view_matrix.double().cpu().numpy()
+    forward, position = view[2, :3], -view[:3, :3].T @ view[:3, 3]
+    ahead = 1.0 if target is None else float((np.asarray(target) - position) @ forward)
+    k = camera.intrinsics.double().cpu().numpy()
+    half_height = max(k[1, 2], camera.height - k[1, 2]) / k[1, 1]
+    half_width = max(k[0, 2], camera.width - k[0, 2]) / k[0, 0]
+    fov = 2 * math.atan(max(half_height, half_width / aspect))
+    return position, position + max(ahead, 0.05) * forward, fov
 
 
 # ── sizes of frames ─────────────────────────────────────────────────────────────────────────────────────────

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
@@ -18,22 +17,17 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.preparation.foreground import find_mask
-from lang3dxl_ns.preparation.handover import Batch
-from lang3dxl_ns.preparation.physical_scale import pixel_size
-from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import camera_to_world
+from lang3dxl_ns.scene.colmap import TrackedPhoto
 from lang3dxl_ns.scene.novel_views import NovelViews
 from lang3dxl_ns.scene.photo import Photo
 
 
 class PhotoDataset(InputDataset):
     """nerfstudio's dataset over `Photo`s: upright, undistorted and resized on demand, with pinhole cameras.
-
-    Args:
-        scale: scale of the pictures that are read, relative to the photos.
-        working: source of the photos at their size.
-    """
+    `scale` is that of the pictures relative to the photos, which `working` reads at their size."""
 
     def __init__(self, outputs: DataparserOutputs, scale: float, working: WorkingPhotos):
         super().__init__(outputs)
@@ -107,27 +101,20 @@ class EvalPhotos:
 def novel_outputs(views: NovelViews, trained: DataparserOutputs, masked: bool) -> DataparserOutputs:
     """Build dataparser outputs of the test views. trained: outputs of the photos, whose transform and scale
     also apply to the views' cameras. masked: whether to include the views' foreground masks, if any."""
-    photos = [
-        Photo.from_model(
-            view,
-            views.image(view),
-            find_mask(views.folder / "masks", views.image(view).name) if masked else None,
+
+    def photo(view: TrackedPhoto) -> Photo:
+        picture = views.image(view)
+        return Photo.from_model(
+            view, picture, find_mask(views.folder / "masks", picture.name) if masked else None
         )
-        for view in views.cameras
-    ]
+
+    photos = [photo(view) for view in views.cameras]
     transform, scale = trained.dataparser_transform.double(), trained.dataparser_scale
     poses = [_pose(torch.from_numpy(g.camera_from_world), transform, scale) for g in views.cameras]
     cameras = to_nerfstudio([photo.lens for photo in photos], torch.stack(poses).float())
     files = [photo.path for photo in photos]
     metadata = {"photos": photos}
     return replace(trained, image_filenames=files, mask_filenames=None, cameras=cameras, metadata=metadata)
-
-
-def novel_pixel_sizes(views: NovelViews, config: PreparationConfig) -> dict[str, float]:
-    """Compute the world units per pixel of every test view, by the same rules as for photos."""
-    sizes = {g.name: pixel_size(g, config.pixel_distance, config.pixel_angle) for g in views.cameras}
-    median = float(np.median([size for size in sizes.values() if size is not None]))
-    return {name: median if size is None else size for name, size in sizes.items()}
 
 
 def _pose(

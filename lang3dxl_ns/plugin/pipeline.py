@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -14,7 +16,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.checks import disk_trouble
+from lang3dxl_ns.common.console import accept_any_console, say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
@@ -22,7 +25,6 @@ from lang3dxl_ns.plugin.evaluation import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.panel import AskPanel
-from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
 from lang3dxl_ns.query.match import Match
 from lang3dxl_ns.query.question import Question, pictures
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
@@ -166,3 +168,25 @@ class Lang3DXLPipeline(VanillaPipeline):
                 f"the checkpoint does not fit this configuration: {error}. "
                 f"Load it with the config.yml beside it, or with the options that it was trained with"
             ) from error
+
+
+_previous_hook = sys.excepthook
+
+
+def print_user_errors_plainly() -> None:
+    """Make commands end on a `UserError` with its message alone, without a traceback, on any console."""
+    global _previous_hook
+    accept_any_console()
+    if sys.excepthook is not _print_user_error:
+        _previous_hook, sys.excepthook = sys.excepthook, _print_user_error
+
+
+def _print_user_error(
+    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    message = disk_trouble(error) if isinstance(error, OSError) else None
+    message = str(error) if isinstance(error, UserError) else message
+    if message is not None:
+        CONSOLE.print(f"[bold red]Error:[/bold red] {escape(message)}", soft_wrap=True)
+    else:
+        _previous_hook(kind, error, traceback)

@@ -25,7 +25,7 @@ from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
-from lang3dxl_ns.preparation.handover import SceneFacts
+from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene
@@ -101,13 +101,12 @@ class RenderingModel(SplatfactoModel):
     def splats(self) -> Splats:
         """Return the present Gaussians, which share memory with the model; `scene` takes copies."""
         g = {name: parameter.detach() for name, parameter in self.gauss_params.items()}
-        shapes = self.activated(g)
-        harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
         if self.config.sh_degree > 0:
-            coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
-            harmonics = coefficients[:, : (self.degree + 1) ** 2]
+            harmonics = _coefficients(g)[:, : (self.degree + 1) ** 2]
+        else:
+            harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
         antialiased = self.config.rasterize_mode == "antialiased"
-        return Splats(shapes.means, shapes.quats, shapes.scales, shapes.opacities, harmonics, antialiased)
+        return Splats(**vars(self.activated(g)), harmonics=harmonics, antialiased=antialiased)
 
     @torch.no_grad()
     def scene(
@@ -119,11 +118,9 @@ class RenderingModel(SplatfactoModel):
         cache: Path | None = None,
         watch: Callable[[str], None] | None = None,
     ) -> Scene:
-        """Copy the present state to a separate scene, which later training doesn't change.
-
-        file: photos, cameras and CLIP. For the other arguments see `Scene`. While a model has no words yet,
-        its scene has colors only.
-        """
+        """Copy the present state to a separate scene, which later training doesn't change, with the photos,
+        cameras and CLIP of a file; for the other arguments see `Scene`. While a model has no words yet, its
+        scene has colors only."""
         codes, looks = self.carried, self.appearance
         return Scene(
             self.splats().copied(),
@@ -150,9 +147,8 @@ class RenderingModel(SplatfactoModel):
         start, answers = time.perf_counter(), self.answers
         if answers is None:
             return self.get_outputs(camera)  # type: ignore[return-value]
-        asked = answers.channels()
         colors = self._code_colors() if answers.shows_bottleneck else None
-        rendering, outputs = self._shown(camera, asked, colors)
+        rendering, outputs = self._shown(camera, answers.channels(), colors)
         found = answers.outputs(rendering, time.perf_counter() - start)
         return {"rgb": outputs["rgb"], **found, **outputs}
 
@@ -166,31 +162,23 @@ class RenderingModel(SplatfactoModel):
     def seen(
         self, camera: Cameras, look: Look | None = None, channels: Float[Tensor, "n d"] | None = None
     ) -> Rendering:
-        """Render the present Gaussians from a camera, under a look (default: by the appearance's rule).
-
-        channels: further values to composite.
-        """
-        view = to_rasterizer(camera)
+        """Render the present Gaussians, and composite further `channels`, from a camera, under a look
+        (default: by the appearance's rule)."""
+        view, splats, background = to_rasterizer(camera), self.splats(), self._get_background_color()
         if look is None and self.appearance is not None:
             look = self.appearance.of_view(view)
-        splats, keep = self.splats(), None
         if self.crop_box is not None:
             keep = self.crop_box.within(splats.means).squeeze(-1)
             splats, channels = splats.select(keep), None if channels is None else channels[keep]
-        background = self._get_background_color()
         return render_in_look(splats, view, look, channels, background=background, backend=self.backend)
 
     def _shown(
-        self,
-        camera: Cameras,
-        asked: Float[Tensor, "n d"] | None,
-        colors: Float[Tensor, "n 3"] | None,
+        self, camera: Cameras, asked: Float[Tensor, "n d"] | None, colors: Float[Tensor, "n 3"] | None
     ) -> tuple[Rendering, dict[str, Tensor]]:
         """Return a rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
         parts = [part for part in (asked, colors) if part is not None]
         rendering = self.seen(camera, channels=torch.cat(parts, dim=1) if parts else None)
-        background = self._get_background_color().expand_as(rendering.rgb)
-        depth = rendering.depth
+        background, depth = self._get_background_color().expand_as(rendering.rgb), rendering.depth
         outputs = {
             "rgb": rendering.rgb,
             "accumulation": rendering.alpha[..., None],
@@ -273,17 +261,12 @@ class RenderingModel(SplatfactoModel):
             visible = in_view(near, gaussians.means, gaussians.scales).nonzero().squeeze(1)
             with part("appearance"):
                 colors, in_photo = self.appearance(gaussians, colors, vector, visible, self.step)
-        antialiased, absgrad = self.config.rasterize_mode == "antialiased", self.strategy.absgrad
+        antialiased = self.config.rasterize_mode == "antialiased"
         settings: dict[str, Any] = {"backend": self.backend, "antialiased": antialiased}
-        moves = self.config.feature_gradient_to_geometry and features is not None
-        if in_photo is gaussians and not moves:
-            raster = rasterize(
-                gaussians.seen_from(view), view, colors, background,
-                features=features, absgrad=absgrad, **settings,
-            )  # fmt: skip
-            return raster, background
-        photo = rasterize(in_photo.seen_from(view), view, colors, background, absgrad=absgrad, **settings)
-        if features is None:
+        moves = self.config.feature_gradient_to_geometry
+        together = None if moves or in_photo is not gaussians else features
+        photo = rasterize(in_photo.seen_from(view), view, colors, background, features=together, **settings)
+        if features is None or together is features:
             return photo, background
         # Semantics and coverage belong to the scene, not to a photo, so they keep the scene's opacities.
         if moves:
@@ -315,8 +298,11 @@ class RenderingModel(SplatfactoModel):
         if self.config.sh_degree == 0:
             return torch.sigmoid(g["features_dc"])
         directions = g["means"].detach() - camera_center
-        coefficients = torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
-        return (spherical_harmonics(self.degree, directions, coefficients) + 0.5).clamp_min(0.0)
+        return (spherical_harmonics(self.degree, directions, _coefficients(g)) + 0.5).clamp_min(0.0)
+
+
+def _coefficients(g: Mapping[str, Tensor]) -> Float[Tensor, "n k 3"]:
+    return torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
 
 
 def _frozen(module: Any) -> Any:

@@ -10,7 +10,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from time import perf_counter
 from types import FrameType
 from typing import Any, Literal
@@ -57,9 +56,7 @@ class _Stopped(BaseException):
 @contextmanager
 def _disk_kept_out_of_training() -> Iterator[None]:
     """Let training continue if its log (tensorboard's events) can't be written, as on a full disk.
-
-    tensorboard's own thread keeps such an error, and raises it in the step that adds to the log.
-    """
+    tensorboard's own thread keeps such an error, and raises it in the step that adds to the log."""
     write = writer.write_out_storage
 
     def guarded() -> None:
@@ -149,11 +146,16 @@ class Lang3DXLTrainer(Trainer):
                     folder.rmdir()  # the first folder that is not empty raises, and ends the loop
 
     def _load_checkpoint(self) -> None:
-        """Load a checkpoint as nerfstudio does, but keep the run state until everything is set up. Raises
-        UserError for a damaged checkpoint, or another file."""
-        path = self._checkpoint_to_load()
+        """Load the requested checkpoint, if any, as nerfstudio does, but keep the run state until everything
+        is set up. Raises UserError if it doesn't exist, is damaged, or is another file."""
+        folder, path = self.config.load_dir, self.config.load_checkpoint
+        if folder is not None:
+            step = "*" if self.config.load_step is None else f"{self.config.load_step:09d}"
+            path = max(folder.glob(f"step-{step}.ckpt"), default=folder / f"step-{step}.ckpt")
         if path is None:
             return
+        if not path.is_file():
+            raise UserError(f"there is no checkpoint {path}: pass the folder nerfstudio_models of a run")
         check_checkpoint(path)
         state = read_checkpoint(path)
         try:
@@ -171,16 +173,6 @@ class Lang3DXLTrainer(Trainer):
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
             ) from error
         CONSOLE.log(f"Loaded {path}")
-
-    def _checkpoint_to_load(self) -> Path | None:
-        """Find the requested checkpoint, if any. Raises UserError if it doesn't exist."""
-        folder, path = self.config.load_dir, self.config.load_checkpoint
-        if folder is not None:
-            step = "*" if self.config.load_step is None else f"{self.config.load_step:09d}"
-            path = max(folder.glob(f"step-{step}.ckpt"), default=folder / f"step-{step}.ckpt")
-        if path is not None and not path.is_file():
-            raise UserError(f"there is no checkpoint {path}: pass the folder nerfstudio_models of a run")
-        return path
 
     def setup_optimizers(self) -> Optimizers:
         """Build the optimizers, with the guard before them."""
@@ -211,10 +203,8 @@ class Lang3DXLTrainer(Trainer):
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run), then
-        learn words. A run that was stopped between the two learns words only.
-
-        Raises SystemExit after a signal stopped the run: 130 for Ctrl-C, 143 for SIGTERM.
-        """
+        learn words. A run that was stopped between the two learns words only. Raises SystemExit after a
+        signal stopped the run: 130 for Ctrl-C, 143 for SIGTERM."""
         total = self.config.max_num_iterations
         if self.is_finished:
             raise UserError(
@@ -282,28 +272,25 @@ class Lang3DXLTrainer(Trainer):
     def _stoppable(self) -> Iterator[None]:
         """Let Ctrl-C or SIGTERM end training after the current iteration, with a checkpoint. Learning words,
         which a checkpoint precedes, ends at once. A second signal ends anything at once."""
-
-        def restore(number: signal.Signals) -> None:
-            # None stands for a handler that Python did not install, and cannot restore.
-            signal.signal(number, signal.SIG_DFL if previous[number] is None else previous[number])
-
-        def stop(number: int, _frame: FrameType | None) -> None:
-            self.interrupted, self.stop_training = signal.Signals(number), True
-            restore(self.interrupted)
-            if self._is_learning_words:
-                raise _Stopped
-
         if threading.current_thread() is not threading.main_thread():  # only this thread may handle signals
             yield
             return
-        previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+        def stop(number: int, _frame: FrameType | None) -> None:
+            self.interrupted, self.stop_training = signal.Signals(number), True
+            signal.signal(number, previous[self.interrupted])
+            if self._is_learning_words:
+                raise _Stopped
+
+        # None stands for a handler that Python did not install, and cannot restore.
+        previous = {n: signal.getsignal(n) or signal.SIG_DFL for n in (signal.SIGINT, signal.SIGTERM)}
         for number in previous:
             signal.signal(number, stop)
         try:
             yield
         finally:
-            for number in previous:
-                restore(number)
+            for number, handler in previous.items():
+                signal.signal(number, handler)
 
     def _stop_early(self) -> str:
         """Save a checkpoint when training can't continue, and return a message about it."""
@@ -321,9 +308,9 @@ class Lang3DXLTrainer(Trainer):
         step may have left incomplete tensors."""
         count = self.pipeline.model.num_points
         when = "while learning words" if self._is_ending else f"at iteration {self.step}"
-        saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
+        saved = max(self.checkpoint_dir.glob("step-*.ckpt"), default=None)
         kept = (
-            f"{saved[-1]} is kept: --load-dir {self.checkpoint_dir} resumes there"
+            f"{saved} is kept: --load-dir {self.checkpoint_dir} resumes there"
             if saved
             else "none is saved yet"
         )
@@ -386,14 +373,21 @@ class Lang3DXLTrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write the checkpoint beside its folder and move it in, so that a killed run leaves no partial one.
-
-        If it can't be written, training continues; at the end of training, UserError is raised.
-        """
+        If it can't be written, training continues; at the end of training, UserError is raised."""
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         partial = self.base_dir / f"{path.name}.partial"
+        state = {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
+            "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+            "run": _run_state(self.pipeline),
+            "words": self.words_are_learned,
+        }
         try:
             self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
-            self._write_checkpoint(step, partial)
+            torch.save(state, partial)
             replace_durably(partial, path)
         except (OSError, RuntimeError) as error:  # torch raises RuntimeError for a full disk
             with suppress(OSError):
@@ -408,38 +402,19 @@ class Lang3DXLTrainer(Trainer):
             CONSOLE.log(f"[red]{escape(message)}. Training continues.[/red]")
             return
         if self.config.save_only_latest_checkpoint:
-            for other in self.checkpoint_dir.glob("*.ckpt"):
-                if other != path:
-                    other.unlink()
+            for other in set(self.checkpoint_dir.glob("*.ckpt")) - {path}:
+                other.unlink()
         done = self.words_are_learned or not self.pipeline.has_words_to_learn
         if self._is_ending and not self.interrupted and done:
             self.write_scene()
 
-    def _write_checkpoint(self, step: int, path: Path) -> None:
-        torch.save(
-            {
-                "step": step,
-                "pipeline": self.pipeline.state_dict(),
-                "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
-                "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
-                "scalers": self.grad_scaler.state_dict(),
-                "run": _run_state(self.pipeline),
-                "words": self.words_are_learned,
-            },
-            path,
-        )
-
 
 def _run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
     """Collect densification statistics, whether codes have begun, the current round through the photos, and
-    the random generators' states.
-
-    The state has only tensors and plain values, which torch's weights-only loader accepts.
-    """
-    model = pipeline.model
+    the random generators' states, all in types that torch's weights-only loader accepts."""
     return {
-        "strategy": dict(model.strategy_state),
-        "codes_have_begun": model.codes_have_begun,
+        "strategy": dict(pipeline.model.strategy_state),
+        "codes_have_begun": pipeline.model.codes_have_begun,
         "photos": pipeline.datamanager.round_state(),
         "random": torch.get_rng_state(),
         "random_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],

@@ -24,8 +24,7 @@ from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, check_data
 from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
-from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
@@ -195,10 +194,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
 
 
 def read_config(path: Path) -> TrainerConfig:
-    """Read the configuration of a run as `read_settings` does.
-
-    Raises UserError for a missing or damaged file, one of another version, and one that requests more.
-    """
+    """Read the configuration of a run as `read_settings` does. Raises UserError for a missing or damaged
+    file, one of another version, and one that requests more."""
     (config,) = read_settings(path, [()])
     if not isinstance(config, TrainerConfig):
         raise no_config(path)
@@ -207,11 +204,9 @@ def read_config(path: Path) -> TrainerConfig:
 
 def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPipeline, int]:
     """Open a run: return settings, pipeline (in evaluation mode) and iteration of its latest checkpoint. No
-    code is executed, while nerfstudio's own `eval_setup` trusts config.yml.
-
-    run: as for `find_config`. Raises UserError for a config.yml that is damaged, requests more than settings,
-    or is of another method; and for a checkpoint that is missing, damaged, or does not match the settings.
-    """
+    code is executed, while nerfstudio's own `eval_setup` trusts config.yml. run: as for `find_config`. Raises
+    UserError for a config.yml that is damaged, requests more than settings, or is of another method; and for
+    a checkpoint that is missing, damaged, or does not match the settings."""
     config_path = find_config(run).absolute()
     config = read_config(config_path)
     if not isinstance(config, Lang3DXLTrainerConfig):

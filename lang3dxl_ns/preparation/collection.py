@@ -48,12 +48,10 @@ class CropPlan:
 def plan_crops(
     photos: Sequence[Photo], reconstruction: Reconstruction, config: PreparationConfig
 ) -> CropPlan:
-    """Choose crop sizes, which are configured or proposed from the scene.
-
-    Crops have one size in the world, unless relative sizes are configured, the scene has no 3D points to
-    measure with, or (under "auto") its photos are so similar in scale that one size in the photo is
-    equivalent (`SCALE_RATIO`). Raises UserError for physical sizes without 3D points.
-    """
+    """Choose crop sizes, which are configured or proposed from the scene. Crops have one size in the world,
+    unless relative sizes are configured, the scene has no 3D points to measure with, or (under "auto") its
+    photos are so similar in scale that one size in the photo is equivalent (`SCALE_RATIO`). Raises UserError
+    for physical sizes without 3D points."""
     if config.scale_mode == "physical" and not len(reconstruction.points):
         raise UserError(
             "crops of physical size need 3D points, and the scene has none: reconstruct it with COLMAP, or "

@@ -26,31 +26,21 @@ _OVERLAP = 0.25
 
 
 def map_grids(height: int, width: int, tokens: int, least: int) -> tuple[Grid, Grid]:
-    """Compute the grids of a photo's patches at two sizes, coarse and fine.
-
-    At the coarse size one window spans the photo's shorter side. The fine grid has 1.75 times as many patches
-    along each side, or `least` along the longer one if those are more.
-
-    Args:
-        tokens: patches per side of a window.
-        least: minimum number of patches along the longer side of the fine grid.
-    """
-    longer = tokens * max(height, width) / min(height, width)
-    factors = (1.0, max(_FINER, least / longer))
-    sides = [[round(f * tokens * side / min(height, width)) for side in (height, width)] for f in factors]
-    (a, b), (c, d) = sides
-    return (a, b), (c, d)
+    """Compute the grids of a photo's patches at two sizes, coarse and fine, for windows of `tokens` patches
+    per side. At the coarse size one window spans the photo's shorter side. The fine grid has 1.75 times as
+    many patches along each side, or `least` along the longer one if those are more."""
+    shorter = min(height, width)
+    finer = max(_FINER, least / (tokens * max(height, width) / shorter))
+    coarse, fine = (
+        (round(f * tokens * height / shorter), round(f * tokens * width / shorter)) for f in (1.0, finer)
+    )
+    return coarse, fine
 
 
 def nested_grids(height: int, width: int, tokens: int, side: int, sizes: int) -> tuple[Grid, ...]:
-    """Compute the grids of a photo's patches in windows of `side` pixels, twice that, and so on, coarse to
-    fine.
-
-    Args:
-        tokens: patches per side of a window.
-        side: side of the smallest windows in pixels of the photo. A window is at most as large as the photo.
-        sizes: number of grids.
-    """
+    """Compute the grids of a photo's patches, coarse to fine, in windows of `side` pixels, twice that, and so
+    on, for a number of `sizes`. A window has `tokens` patches per side, and is at most as large as the
+    photo."""
     sides = [side * 2**n for n in reversed(range(sizes))]
     return tuple(
         (max(round(tokens * height / s), tokens), max(round(tokens * width / s), tokens)) for s in sides

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -17,8 +19,16 @@ from torch import Tensor
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.dense_map import mean_of_sizes
-from lang3dxl_ns.preparation.families import FAMILIES, Family, input_side, patch_tokens, vision_inputs
-from lang3dxl_ns.preparation.light import in_known_light
+from lang3dxl_ns.preparation.families import (
+    FAMILIES,
+    Family,
+    PatchHead,
+    head_recipe,
+    input_side,
+    patch_tokens,
+    read_patch_head,
+    vision_inputs,
+)
 from lang3dxl_ns.preparation.model_files import (
     BUILTIN,
     CLIP_OPTION,
@@ -32,7 +42,6 @@ from lang3dxl_ns.preparation.model_files import (
     spoken,
     whole,
 )
-from lang3dxl_ns.preparation.patch_head import PatchHead, head_recipe, read_patch_head
 from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
 
 _IMAGENET_MEAN, _IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -40,6 +49,10 @@ _NORMALIZE_THEMSELVES = ("radio",)
 """Vision transformers that take pictures in 0…1."""
 _HEAD_ROWS = 16
 """Number of rows of a map that a head for patches reads at once, to bound memory."""
+_DIM = 0.75
+"""Share of the known brightness below which a photo is dark; nearly all photos of landmarks are above it."""
+_DARKEST = 0.02
+"""Lower bound on a photo's mean brightness, so that black photos stay black and exponents stay moderate."""
 _VOCABULARIES = (
     ("tokenizer.json",),
     ("vocab.json", "merges.txt"),
@@ -147,10 +160,8 @@ class PatchReading:
 
 
 def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> PatchReading | None:
-    """Return how an encoder (a name or folder) makes maps; None if it reads crops alone.
-
-    Raises UserError like `load_image_text_encoder`.
-    """
+    """Return how an encoder (a name or folder) makes maps; None if it reads crops alone. Raises UserError
+    like `load_image_text_encoder`."""
     files = find_model(clip, CLIP_OPTION)
     family, head = _family(files), head_recipe(files.folder)
     by_crops = (family.features if features == "auto" else features) == "crops"
@@ -162,25 +173,17 @@ def patch_reading(clip: str, features: Literal["auto", "crops", "dense"]) -> Pat
 
 
 def usual_dense(config: PreparationConfig, learned: bool) -> str:
-    """Resolve the dense encoder "auto" of a configuration.
-
-    Args:
-        config: settings; another name than "auto" is returned as it is.
-        learned: whether the semantics learn dense features, as in the paper, instead of sharpening by them.
-    """
+    """Resolve the dense encoder "auto" of a configuration; another name is returned as it is. `learned` says
+    whether the semantics learn dense features, as in the paper, instead of sharpening by them."""
     if config.dense != "auto":
         return config.dense
-    if not learned and _has_head(config):
-        return "none"
+    with suppress(
+        UserError
+    ):  # `check_encoders` reports a missing CLIP, together with a missing dense encoder
+        reading = None if learned else patch_reading(config.clip, config.clip_features)
+        if reading is not None and reading.sizes is not None:
+            return "none"
     return BUILTIN if config.clip == BUILTIN else DENSE_MODEL
-
-
-def _has_head(config: PreparationConfig) -> bool:
-    try:
-        reading = patch_reading(config.clip, config.clip_features)
-    except UserError:  # `check_encoders` reports a missing CLIP, together with a missing dense encoder
-        return False
-    return reading is not None and reading.sizes is not None
 
 
 def _family(files: ModelFiles) -> Family:
@@ -213,9 +216,7 @@ class DenseEncoder:
     @torch.no_grad()
     def encode(self, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "t t d"]:
         """Normalized patch tokens of the last layer, float32, for a photo (RGB in 0…1) squashed to a square.
-
-        Token (i, j) covers rows i/t…(i+1)/t and columns j/t…(j+1)/t of the photo.
-        """
+        Token (i, j) covers rows i/t…(i+1)/t and columns j/t…(j+1)/t of the photo."""
         image = _resize(photo.to(self._device, torch.float32).permute(2, 0, 1)[None], self._side)
         with _half_precision_on_cuda(self._device):
             output = self._model(pixel_values=(image - self._mean) / self._std, **self._arguments)
@@ -225,10 +226,8 @@ class DenseEncoder:
 
 
 def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str) -> ImageTextEncoder:
-    """An image-text encoder in Hugging Face format, from a folder, by name, or "builtin".
-
-    Raises UserError if it can't be found or downloaded, is of no known family, or is incomplete.
-    """
+    """An image-text encoder in Hugging Face format, from a folder, by name, or "builtin". Raises UserError if
+    it can't be found or downloaded, is of no known family, or is incomplete."""
     from transformers import AutoModel
 
     files = find_model(name_or_dir, CLIP_OPTION)
@@ -285,10 +284,8 @@ def _image_processor(files: ModelFiles) -> Any:
 
 
 def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, tokens: int = 64) -> DenseEncoder:
-    """DINOv2 or another vision transformer with patch tokens, read at `tokens`×`tokens`.
-
-    Raises UserError if it can't be found or downloaded, has no patch tokens, or is incomplete.
-    """
+    """DINOv2 or another vision transformer with patch tokens, read at `tokens`×`tokens`. Raises UserError if
+    it can't be found or downloaded, has no patch tokens, or is incomplete."""
     from transformers import AutoModel
 
     files = find_model(name_or_dir, DENSE_OPTION)
@@ -307,6 +304,18 @@ def _say_what_builtin_knows() -> None:
         "The built-in CLIP knows landmarks and street façades and nothing else; a real one knows more: "
         f"{spoken(CLIP_OPTION)} openai/clip-vit-base-patch32"
     )
+
+
+def in_known_light(photo: Float[Tensor, "h w 3"], brightness: float) -> Float[Tensor, "h w 3"]:
+    """Bring a dark photo (RGB in 0…1) to about this mean, the same in all channels; others stay unchanged. A
+    gamma curve sets the brightness, which keeps black and white. Then each channel is multiplied (gray
+    world), which removes a tint. Encoders trained on millions of photos need neither."""
+    mean = max(float(photo.mean()), _DARKEST)
+    if mean >= _DIM * brightness:
+        return photo
+    lit = photo ** (math.log(brightness) / math.log(mean))
+    channels = lit.mean((0, 1))
+    return (lit * (channels.mean() / channels.clamp_min(_DARKEST))).clamp(0, 1)
 
 
 def _channels(values: Sequence[float], device: torch.device) -> Float[Tensor, "3 1 1"]:

@@ -45,11 +45,9 @@ def with_foreground(
     device: torch.device | str,
     log: Log = print,
 ) -> list[Photo]:
-    """Return the photos with the masks configured in `config.foreground`, and log the photos without one.
-
-    A folder is relative to `data`. Raises UserError if it is missing or matches no photo, if masks are
-    damaged or all black, and if a model can't be loaded.
-    """
+    """Return the photos with the masks configured in `config.foreground` (a folder is relative to `data`),
+    and log the photos without one. Raises UserError if a folder is missing or matches no photo, if masks are
+    damaged or all black, and if a model can't be loaded."""
     if config.foreground == "none":
         return [replace(photo, mask_path=None) for photo in photos]
     if config.foreground == "text":
@@ -82,10 +80,9 @@ def with_foreground(
 
 
 def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
-    """Read all masks, log the black ones, and return the photos.
-
-    Unreadable masks raise one UserError that names them all; with `skip`, they are logged, and their photos
-    count whole. Raises UserError if all masks are black."""
+    """Read all masks, log the black ones, and return the photos. Unreadable masks raise one UserError that
+    names them all; with `skip`, they are logged, and their photos count whole. Raises UserError if all masks
+    are black."""
     masked = [photo for photo in photos if photo.mask_path is not None]
     with ThreadPoolExecutor(_READERS) as pool, progress("checking masks", len(masked)) as advance:
         states = []
@@ -133,9 +130,8 @@ def _prompted(
     device: torch.device | str,
     log: Log,
 ) -> list[Photo]:
-    """Make missing or outdated masks and return the photos with them.
-
-    Photos in which nothing is found are logged and used whole."""
+    """Make missing or outdated masks and return the photos with them. Photos in which nothing is found are
+    logged and used whole."""
     if not config.foreground_prompts:
         raise UserError("foreground text needs prompts: --pipeline.datamanager.foreground-prompts building")
     files = find_text_segmenter(config.foreground_model, config.sam)

@@ -49,11 +49,9 @@ class ModelFiles:
 
 
 def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
-    """Find a model's files by a local folder, a Hugging Face name (downloaded once), or "builtin".
-
-    "builtin" is the CLIP or dense encoder that ships with this package, depending on the option. Raises
-    UserError if there is no such folder, the model can't be downloaded, or files are missing.
-    """
+    """Find a model's files by a local folder, a Hugging Face name (downloaded once), or "builtin", which is
+    the CLIP or dense encoder that ships with this package, depending on the option. Raises UserError if there
+    is no such folder, the model can't be downloaded, or files are missing."""
     name = str(name_or_dir)
     local = expanded(name)
     if name == BUILTIN:
@@ -68,9 +66,8 @@ class _NotDownloaded(UserError):
 
 
 def check_encoders(clip: str, dense: str) -> None:
-    """Find both encoders, downloading missing ones; "none" and "auto" are skipped.
-
-    Raises a single UserError that names all unavailable ones and the remedy."""
+    """Find both encoders, downloading missing ones; "none" and "auto" are skipped. Raises a single UserError
+    that names all unavailable ones and the remedy."""
     wanted = {CLIP_OPTION: clip, DENSE_OPTION: dense}
     missing: dict[str, str] = {}
     for option, name in wanted.items():
@@ -99,9 +96,8 @@ def spoken(option: str) -> str:
 
 
 def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
-    """Load a model, frozen and in float32.
-
-    Raises UserError for missing weights, which transformers would fill with random numbers."""
+    """Load a model, frozen and in float32. Raises UserError for missing weights, which transformers would
+    fill with random numbers."""
     from transformers.utils import logging
 
     logging.disable_progress_bar()  # loading takes a second, and its bar would draw over ours

@@ -54,21 +54,11 @@ class Need:
         return "needed" if self.needed else "left out"
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Sources that the configuration adds to the photos."""
-
-    dense: bool
-    regions: bool
-
-
 def scene_needs(
-    photos: Sequence[Photo],
-    reconstruction: Reconstruction,
-    crops: CropPlan,
-    sources: Sources,
+    photos: Sequence[Photo], reconstruction: Reconstruction, crops: CropPlan, dense: bool, regions: bool
 ) -> list[Need]:
-    """Measure the need for every optional component, which takes seconds for a hundred photos."""
+    """Measure the need for every optional component, which takes seconds for a hundred photos. `dense` and
+    `regions`: whether the configuration has a dense encoder, and a source of regions."""
     light = measure_photometry(photos, reconstruction)
     # Levels are clipped to 32 pixels and to the photo; duplicates are never made.
     sizes = {p.name: 1 / p.width for p in photos} if crops.pixel_sizes is None else crops.pixel_sizes
@@ -89,8 +79,8 @@ def scene_needs(
             f"distinct pyramid levels per photo, mean over the photos, of {len(crops.scales)}", levels, 1.0,
         ),
         _foreground(photos),
-        Need("regions", sources.regions, "a source of regions is given", None, None),
-        Need("dense features", sources.dense, "a dense encoder is given: it sharpens words", None, None),
+        Need("regions", regions, "a source of regions is given", None, None),
+        Need("dense features", dense, "a dense encoder is given: it sharpens words", None, None),
         _measured(
             "camera optimizer", "reprojection error of the model (pixels, median over the photos)",
             float(np.median(errors)) if errors else None, REPROJECTION, unmeasured=False,

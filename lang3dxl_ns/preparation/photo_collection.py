@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,8 @@ from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
-from lang3dxl_ns.scene.photo_folder import find_photos
+from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
-from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
 OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
@@ -43,26 +42,18 @@ class PhotoCollection:
     """Poses and points of the photos, in the frame of the file from which they were read."""
     left_out: dict[str, str]
     """Photos of that file that can't be used, with reasons."""
-    reconstructed: bool = False
-    """Whether the poses were computed here, in a frame that no other program knows."""
 
 
 def read_collection(data: str | Path) -> PhotoCollection:
-    """Read the photos of a folder or video. Photos without poses are reconstructed, which takes minutes.
-
-    Args:
-        data: a folder with a COLMAP model or a transforms.json, a folder of photos alone, or a video.
-
-    Raises:
-        UserError: there are no photos, or they can't be used, or the poses are damaged.
-    """
+    """Read the photos of a folder with a COLMAP model or a transforms.json, a folder of photos alone, or a
+    video. Photos without poses are reconstructed, which takes minutes. Raises UserError if there are no
+    photos, or they can't be used, or the poses are damaged."""
     folder = expanded(data).absolute()
     if is_video(folder) or (not folder.exists() and frames_folder(folder).is_dir()):
         folder = extract_frames(folder)
     if not folder.is_dir():
         raise UserError(f"{folder} is not a folder: give the folder of the splat's photos as --data")
-    own = any((folder / OWN_MODEL).glob("images.*"))
-    model = next((f for f in MODEL_FOLDERS if any((folder / f).glob("images.*"))), OWN_MODEL if own else None)
+    model = find_colmap_model(folder)
     if model is None and (folder / TRANSFORMS).is_file():
         return _collection(folder, *read_transforms(folder / TRANSFORMS))
     place = folder / model if model is not None else reconstruct_scene(folder)[1]
@@ -70,25 +61,23 @@ def read_collection(data: str | Path) -> PhotoCollection:
     photos, kept, left_out = usable_photos(
         reconstruction, images, lambda name: find_mask(folder / "masks", name)
     )
-    reconstruction = replace(reconstruction, photos=kept)
-    return _collection(folder, photos, left_out, reconstruction, model is None or model == OWN_MODEL)
+    return _collection(folder, photos, left_out, replace(reconstruction, photos=kept))
+
+
+def find_colmap_model(data: Path, folders: Sequence[Path] = (*MODEL_FOLDERS, OWN_MODEL)) -> Path | None:
+    """Return the first of some folders (relative to `data`) that holds a COLMAP model; None if none does."""
+    return next((folder for folder in folders if any((data / folder).glob("images.*"))), None)
 
 
 def _collection(
-    folder: Path,
-    photos: dict[Path, Photo],
-    left_out: Mapping[str, UserError],
-    reconstruction: Reconstruction,
-    reconstructed: bool = False,
+    folder: Path, photos: dict[Path, Photo], left_out: Mapping[str, UserError], reconstruction: Reconstruction
 ) -> PhotoCollection:
     if not photos:
         first = next(iter(left_out.values()), "it lists none")
         raise UserError(f"none of the {len(left_out)} photos of {folder} can be used; the first: {first}")
     kept = {name: tracked for name, tracked in reconstruction.photos.items() if name not in left_out}
     reasons = {name: str(reason) for name, reason in left_out.items()}
-    return PhotoCollection(
-        folder, list(photos.values()), replace(reconstruction, photos=kept), reasons, reconstructed
-    )
+    return PhotoCollection(folder, list(photos.values()), replace(reconstruction, photos=kept), reasons)
 
 
 def images_path(data: Path, named: Path = Path("images")) -> Path:
@@ -101,17 +90,9 @@ def images_path(data: Path, named: Path = Path("images")) -> Path:
 def usable_photos(
     reconstruction: Reconstruction, images: Path, mask_of: MaskOf, follow_links: bool = False
 ) -> tuple[dict[Path, Photo], dict[str, TrackedPhoto], dict[str, UserError]]:
-    """Find the photos of a COLMAP model on disk.
-
-    Args:
-        reconstruction: the model.
-        images: folder of the photos.
-        mask_of: function that finds a photo's foreground mask by its name.
-        follow_links: whether photos may be links that leave the folder.
-
-    Returns:
-        Usable photos by file, their entries in the model turned like the files, and reasons for the others.
-    """
+    """Find the photos of a COLMAP model on disk, below the folder `images`: usable ones by file, their
+    entries in the model turned like the files, and reasons for the others. `mask_of` finds a photo's
+    foreground mask by its name; `follow_links` allows links that leave the folder."""
     photos, left_out = dict[Path, Photo](), dict[str, UserError]()
     kept = dict[str, TrackedPhoto]()
     for name, tracked in reconstruction.photos.items():
@@ -129,20 +110,14 @@ def usable_photos(
 # ── transforms.json ─────────────────────────────────────────────────────────────────────────────────────
 
 
-_FISHEYES = ("OPENCV_FISHEYE",)
-_LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_FISHEYES)
+_LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV_FISHEYE")
 _Read = tuple[dict[Path, Photo], dict[str, UserError], Reconstruction]
 
 
 def read_transforms(path: Path) -> _Read:
-    """Read the photos and poses of a transforms.json, as instant-ngp and nerfstudio write it.
-
-    Returns:
-        Photos by file, reasons for those left out, and the reconstruction (without points) in its frame.
-
-    Raises:
-        UserError: the file is damaged, or lists no photo.
-    """
+    """Read the photos and poses of a transforms.json, as instant-ngp and nerfstudio write it: photos by file,
+    reasons for those left out, and the reconstruction (without points) in its frame. Raises UserError if the
+    file is damaged."""
     try:
         content = read_json(path)
         frames = content["frames"]
@@ -195,7 +170,7 @@ def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
             width, height = image.size
     angle = None if "fl_x" in frame else float(frame["camera_angle_x"])
     fx = float(frame["fl_x"]) if angle is None else width / 2 / math.tan(angle / 2)
-    fisheye = model in _FISHEYES
+    fisheye = model == "OPENCV_FISHEYE"
     names = ["k1", "k2", "k3", "k4"] if fisheye else ["k1", "k2", "p1", "p2", *["k3"] * bool(frame.get("k3"))]
     distortion = tuple(float(frame.get(key, 0.0)) for key in names)
     fy, cx, cy = (

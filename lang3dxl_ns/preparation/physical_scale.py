@@ -67,11 +67,9 @@ def pixel_size(
 def pixel_sizes(
     reconstruction: Reconstruction, distance: DistanceRule = "median", angle: AngleRule = "half"
 ) -> tuple[dict[str, float], list[str]]:
-    """Compute every photo's pixel size, and list the photos for which it is a fallback.
-
-    A photo without tracked points is measured by the points in its view; without those, it gets the median of
-    the other photos. Raises UserError if no photo can be measured.
-    """
+    """Compute every photo's pixel size, and list the photos for which it is a fallback: one without tracked
+    points is measured by the points in its view; without those, it gets the median of the others. Raises
+    UserError if no photo can be measured."""
     photos = reconstruction.photos
     sizes = {name: pixel_size(photo, distance, angle) for name, photo in photos.items()}
     untracked = [name for name, size in sizes.items() if size is None]
@@ -88,11 +86,9 @@ def pixel_sizes(
 
 
 def physical_scales(smallest: float, largest: float) -> list[float]:
-    """List crop sides in world units, geometric from `smallest` to `largest`, both included.
-
-    There are round(log_√2(largest / smallest)) of them, at least 1 (then the smallest alone). Raises
-    UserError for an empty range. Method: Lang3D-XL, scale list.
-    """
+    """List crop sides in world units, geometric from `smallest` to `largest`, both included:
+    round(log_√2(largest / smallest)) of them, at least 1 (then the smallest alone). Raises UserError for an
+    empty range. Method: Lang3D-XL, scale list."""
     if not 0 < smallest <= largest < math.inf:
         raise UserError(
             f"scale range {smallest}–{largest} is empty: give 0 < smallest ≤ largest, in world units"
@@ -109,11 +105,9 @@ def relative_scales(count: int = 7, smallest: float = 0.05, largest: float = 0.5
 def crop_sides(
     scales: Sequence[float], pixel_size: float, width: int, smallest: float = SMALLEST_CROP
 ) -> list[int]:
-    """Convert scales to crop sides in pixels of a photo of `width` pixels, ascending.
-
-    Sides are clipped to `smallest` … `width` pixels. Duplicates are dropped, so a photo can have fewer sides
-    than there are scales. For relative scales, the pixel size is 1 / width.
-    """
+    """Convert scales to crop sides in pixels of a photo of `width` pixels, ascending. Sides are clipped to
+    `smallest` … `width` pixels. Duplicates are dropped, so a photo can have fewer sides than there are
+    scales. For relative scales, the pixel size is 1 / width."""
     sides = (min(max(scale / pixel_size, smallest), width) for scale in sorted(scales))
     return list(dict.fromkeys(math.floor(side + 1e-6) for side in sides))  # 0.47 / 0.01 is 46.99…
 
@@ -151,11 +145,9 @@ def _extent(points: Float[Array, "m 3"]) -> float:
 
 
 def _subject_distance(photo: TrackedPhoto, rule: DistanceRule) -> float | None:
-    """Compute the distance from the camera to the middle of its tracked points; None without a usable one.
-
-    The middle is taken in the camera's frame, since a per-axis median depends on the frame. Points behind the
-    camera can't be seen, so such tracks are wrong and ignored.
-    """
+    """Compute the distance from the camera to the middle of its tracked points in the camera's frame (a
+    per-axis median depends on the frame); None without a usable one. Points behind the camera can't be seen,
+    so such tracks are wrong and ignored."""
     points = (photo.points - photo.center) @ photo.camera_from_world[:, :3].T
     in_front = points[:, 2] > 0
     points = points[in_front]

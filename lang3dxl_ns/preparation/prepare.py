@@ -22,7 +22,6 @@ from torch import Tensor
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.stages import roughly
-from lang3dxl_ns.preparation.crop_budget import USUAL_INPUT, Crops, choose_crops
 from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids, nested_grids
 from lang3dxl_ns.preparation.encoders import (
     DenseEncoder,
@@ -39,7 +38,7 @@ from lang3dxl_ns.preparation.model_files import (
     read_config,
     spoken,
 )
-from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
+from lang3dxl_ns.preparation.pyramid import THIRD, USUAL_INPUT, Crops, build_clip_target, choose_crops
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -93,11 +92,6 @@ class _Task:
     def clip(self) -> str | None:
         """Kind of CLIP target to make; None if it is complete."""
         return next((kind for kind in (CLIP, FINE) if kind in self.missing), None)
-
-    @property
-    def count(self) -> int:
-        """Number of the photo's crops."""
-        return self.crops.count(self.photo.height, self.photo.width)
 
     def bytes(self, clip: ImageTextEncoder | None, dense: DenseEncoder | None) -> int:
         """Compute the size of the entries to make, at two bytes per number."""
@@ -183,7 +177,10 @@ def _plan(
             choose_crops(scales, pixel_size, size, is_fine, input_pixels, quality) for quality in qualities
         )
         grids: tuple[Grid, ...] | None = None
-        source = _source(photo, content)
+        # Everything that determines the photo's pixels; the lens matters only if it is undistorted.
+        source: dict[str, Any] = {"photo": content, "size": [*size], "undistorted": photo.lens.undistortion}
+        if photo.quarter_turns:
+            source["turned"] = photo.quarter_turns
         clip = {**source, "encoder": clip_model.identity}
         if patches is not None and (is_fine or not patches.fine_alone):
             if patches.sizes is None:
@@ -212,30 +209,20 @@ def _plan(
     return tasks, left_out
 
 
-def _source(photo: Photo, content: str) -> dict[str, Any]:
-    """Collect everything that determines the photo's pixels. The lens matters only if it is undistorted."""
-    source = {
-        "photo": content,
-        "size": [photo.width, photo.height],
-        "undistorted": photo.lens.undistortion,
-    }
-    return {**source, "turned": photo.quarter_turns} if photo.quarter_turns else source
-
-
 class _ReadAhead:
     """Reader of the tasks' photos in background threads, a few ahead of their turn."""
 
     def __init__(self, read: Callable[[Photo], UInt8[Tensor, "h w 3"]], tasks: Sequence[_Task]) -> None:
-        self._read, self._waiting = read, deque(tasks)
+        self._read, self._waiting = read, deque(task.photo for task in tasks)
         self._pool = ThreadPoolExecutor(_READERS, thread_name_prefix="photo-reader")
-        self._read_by_name: dict[str, Future[UInt8[Tensor, "h w 3"]]] = {}
+        self._ahead: dict[str, Future[UInt8[Tensor, "h w 3"]]] = {}
 
     def get(self, photo: Photo) -> UInt8[Tensor, "h w 3"]:
         """Return the photo's pixels. Raises UserError if it cannot be read."""
-        while self._waiting and len(self._read_by_name) <= _READERS:
-            ahead = self._waiting.popleft().photo
-            self._read_by_name[ahead.name] = self._pool.submit(self._read, ahead)
-        future = self._read_by_name.pop(photo.name, None)
+        while self._waiting and len(self._ahead) <= _READERS:
+            ahead = self._waiting.popleft()
+            self._ahead[ahead.name] = self._pool.submit(self._read, ahead)
+        future = self._ahead.pop(photo.name, None)
         return self._read(photo) if future is None else future.result()
 
 
@@ -340,7 +327,7 @@ class _Maker:
     ) -> None:
         """Log how many crops will be encoded and an estimate of the duration, measured with noise."""
         config, tasks = self._config, [task for task in self._tasks if task.clip and not task.grids]
-        crops = sum(task.count for task in tasks)
+        crops = sum(task.crops.count(task.photo.height, task.photo.width) for task in tasks)
         if crops < _ANNOUNCED_CROPS:
             return
         noise, rest = torch.rand(3, clip.crop_size, clip.crop_size, device=device), 0.0

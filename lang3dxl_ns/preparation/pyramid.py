@@ -1,7 +1,8 @@
-"""Crop pyramid: a photo's CLIP target as the mean over scales of square crops on regular grids."""
+"""Crop pyramid: a photo's CLIP target as the mean over scales of square crops; a budget of their number."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.memory import with_less_memory
+from lang3dxl_ns.preparation.physical_scale import SMALLEST_CROP, crop_sides, fine_crops
+from lang3dxl_ns.preparation.settings import Quality
 
 
 @dataclass
@@ -28,6 +31,15 @@ class ClipTarget:
 
 HALF, THIRD = 2, 3
 """Spacing of crops: the number of steps from center to center that make up a crop's side."""
+MOST_CROPS: dict[Quality, float] = {"fast": 700, "normal": 2_500, "fine": math.inf}
+"""Maximum number of crops per photo for an encoder of 224 pixels, by quality. An encoder of half the side may
+have four times as many, which take about as long."""
+USUAL_INPUT = 224
+"""Side of an encoder's input for which `MOST_CROPS` holds, in pixels."""
+_LEAST_SHARE = 1 / 4
+"""Smallest side of a crop, as a share of the encoder's input; a crop that is enlarged more is a blur."""
+_GROWTH = 1.05
+"""Factor by which crops are enlarged until there are few enough."""
 
 
 def crop_count(length: int, side: int, steps: int = HALF) -> int:
@@ -36,12 +48,10 @@ def crop_count(length: int, side: int, steps: int = HALF) -> int:
 
 
 def crop_centers(length: int, side: int, steps: int = HALF) -> Int[Tensor, " n"]:
-    """Compute the pixel positions of the crop centers along an axis of `length` pixels.
-
-    They are the middles of equal cells, like a target's, about `side` / `steps` apart. A crop covers
-    `side // 2` pixels to either side of its center and may extend beyond the photo. Method: Lang3D-XL, crop
-    grid; there the centers are exactly half a crop apart, and up to half a cell off their cells' middles.
-    """
+    """Compute the pixel positions of the crop centers along an axis of `length` pixels. They are the middles
+    of equal cells, like a target's, about `side` / `steps` apart. A crop covers `side // 2` pixels to either
+    side of its center and may extend beyond the photo. Method: Lang3D-XL, crop grid; there the centers are
+    exactly half a crop apart, and up to half a cell off their cells' middles."""
     count = crop_count(length, side, steps)
     return ((2 * torch.arange(count) + 1) * length + count - 1) // (2 * count)  # rounded
 
@@ -54,10 +64,8 @@ def valid_fractions(height: int, width: int, side: int, steps: int = HALF) -> Fl
 def iterate_crops(
     photo: Float[Tensor, "h w 3"], side: int, size: int, batch_size: int, steps: int = HALF
 ) -> Iterator[Float[Tensor, "n 3 s s"]]:
-    """Yield the photo's crops, row by row from the top left, at `size` pixels, `batch_size` at a time.
-
-    They are black outside the photo. CLIP's own antialiased bicubic resize is used, then clamped to 0..1.
-    """
+    """Yield the photo's crops, row by row from the top left, at `size` pixels, `batch_size` at a time, black
+    outside the photo. CLIP's own antialiased bicubic resize is used, then clamped to 0..1."""
     windows, tops, lefts = _windows(photo, side, steps)
     columns = len(lefts)
     for batch in torch.arange(len(tops) * columns, device=photo.device).split(batch_size):
@@ -76,12 +84,10 @@ def build_clip_target(
     batch_size: int,
     steps: int = HALF,
 ) -> ClipTarget:
-    """Encode the crops of every scale and average the scales on the finest scale's grid.
-
-    `photo` is RGB in 0..1, `crop_sides` has one side in pixels per scale, and `encode` takes crops of
-    `crop_size` pixels in 0..1. `steps` is the spacing of the finest scale's crops; others have two steps per
-    side. All scales have equal weight. Method: Lang3D-XL, average over scales.
-    """
+    """Encode the crops of every scale and average the scales on the finest scale's grid. `photo` is RGB in
+    0..1, `crop_sides` has one side in pixels per scale, and `encode` takes crops of `crop_size` pixels in
+    0..1. `steps` is the spacing of the finest scale's crops; others have two steps per side. All scales have
+    equal weight. Method: Lang3D-XL, average over scales."""
     finest = valid_fractions(photo.shape[0], photo.shape[1], min(crop_sides), steps).shape
     total = torch.zeros(())
     for side in crop_sides:
@@ -128,9 +134,8 @@ def _inside(length: int, side: int, steps: int) -> Float[Tensor, " n"]:
 def _windows(
     photo: Float[Tensor, "h w 3"], side: int, steps: int
 ) -> tuple[Float[Tensor, "3 H W t t"], Int[Tensor, " ny"], Int[Tensor, " nx"]]:
-    """Return a crop at every pixel, and the rows and columns at which the required crops begin.
-
-    The crops are a view of the photo padded with black, so they take no memory each."""
+    """Return a crop at every pixel (views of the photo padded with black, which take no memory each), and the
+    rows and columns at which the required crops begin."""
     half = _half(side)
     padding: list[int] = []
     starts = []
@@ -142,3 +147,62 @@ def _windows(
     padded = F.pad(photo.permute(2, 0, 1), padding)
     lefts, tops = starts
     return padded.unfold(1, 2 * half, 1).unfold(2, 2 * half, 1), tops, lefts
+
+
+@dataclass(frozen=True)
+class Crops:
+    """Sizes and spacing of a photo's crops."""
+
+    sides: list[int]
+    """Sides of the crops in pixels, ascending."""
+    steps: int
+    """Spacing of the smallest crops: this many steps make up a side. Others have two."""
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Count the rows and columns of the smallest crops in a photo of `height` × `width` pixels."""
+        side = self.sides[0]
+        return crop_count(height, side, self.steps), crop_count(width, side, self.steps)
+
+    def count(self, height: int, width: int) -> int:
+        """Count the crops in a photo of `height` × `width` pixels."""
+        larger = sum(crop_count(height, side) * crop_count(width, side) for side in self.sides[1:])
+        return math.prod(self.grid(height, width)) + larger
+
+
+def choose_crops(
+    scales: Sequence[float],
+    pixel_size: float,
+    size: tuple[int, int],
+    is_fine: bool,
+    input_side: int,
+    quality: Quality,
+) -> Crops:
+    """Choose a photo's crops: those of the scales, without crops too small for the encoder.
+
+    If there are more than the quality allows, fine crops first move apart, from a third to half of their
+    side; then the crops grow.
+
+    Args:
+        scales: sides in world units, or in photo widths.
+        pixel_size: world units per pixel of the photo; 1 / width for relative scales.
+        size: width and height of the photo in pixels.
+        is_fine: whether to cut small crops alone (`fine_crops`) instead of the whole pyramid.
+        input_side: side of the encoder's input in pixels.
+        quality: bound on the number; "fine" has no bound, and allows crops down to 32 pixels.
+    """
+    width, height = size
+    most = MOST_CROPS[quality] * (USUAL_INPUT / input_side) ** 2
+    least = 0.0 if quality == "fine" else _LEAST_SHARE * input_side
+    smallest = float(SMALLEST_CROP)
+    while True:
+        sides = crop_sides(scales, pixel_size, width, smallest)
+        if is_fine:
+            sides = fine_crops(sides[0])
+        if sides[0] >= min(least, width):
+            for steps in (THIRD, HALF) if is_fine else (HALF,):
+                crops = Crops(sides, steps)
+                if crops.count(height, width) <= most or smallest >= width:
+                    return crops
+        if smallest >= width:
+            return Crops(sides, HALF)
+        smallest = max(smallest, sides[-1] if is_fine else sides[0]) * _GROWTH

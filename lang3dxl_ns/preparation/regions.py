@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,11 +18,10 @@ from lang3dxl_ns.common.files import read_array
 from lang3dxl_ns.common.image import fitted_size, resize
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.model_files import ModelFiles
-from lang3dxl_ns.preparation.sam3 import Sam3
 from lang3dxl_ns.preparation.segmentation import (
     TEXT_OPTION,
     AutomaticSam,
-    SegmenterFiles,
+    Sam3,
     find_sam,
     find_text_segmenter,
     is_sam3,
@@ -43,6 +42,10 @@ _RULE = 1
 """Version of the label maps, increased when they are made in another way, to make older ones again."""
 
 
+FindMasks = Callable[[UInt8[Tensor, "h w 3"]], Sequence[Bool[Tensor, "h w"]]]
+"""Function from a picture to masks of it, on the CPU."""
+
+
 class RegionSource(Protocol):
     """Source of a scene's label maps."""
 
@@ -54,24 +57,29 @@ class RegionSource(Protocol):
 
 
 def region_source(config: PreparationConfig, data: Path, device: torch.device | str) -> RegionSource | None:
-    """Create the source that `config.regions` names; None for "none", or "auto" without a folder regions/.
-
-    A folder is relative to `data`. Raises UserError if it does not exist, or a network can't be found or
-    downloaded.
-    """
-    if config.regions == "auto":
-        folder = data / "regions"
-        return FolderRegions(folder) if folder.is_dir() else None
-    if config.regions == "none":
+    """Create the source that `config.regions` names; None for "none", or "auto" without a folder regions/. A
+    folder is relative to `data`. Raises UserError if it does not exist, or a network can't be found or
+    downloaded, or is no SAM 3 where prompts name the regions."""
+    choice, level = config.regions, config.region_level
+    if choice == "none" or (choice == "auto" and not (data / "regions").is_dir()):
         return None
-    if config.regions == "felzenszwalb":
+    if choice == "felzenszwalb":
         return FelzenszwalbRegions()
-    if config.regions == "sam":
-        return SamRegions(find_sam(config.sam), config.region_level, device)
-    if config.regions == "text":
-        files = find_text_segmenter(config.foreground_model, config.sam)
-        return TextRegions(files, config.region_prompts, config.region_level, device)
-    return FolderRegions(named_folder(config.regions, data, "regions"))
+    if choice == "sam":
+        files = find_sam(config.sam)
+        return MaskRegions(partial(_sam_masks, files, device), level, regions="sam", model=files.identity)
+    if choice == "text":
+        found, prompts = (
+            find_text_segmenter(config.foreground_model, config.sam),
+            sorted(config.region_prompts),
+        )
+        if not is_sam3(found):
+            raise UserError(
+                f"regions text needs a SAM 3, and {found.words.name} is none: {TEXT_OPTION} facebook/sam3"
+            )
+        load = partial(_masks_of_instances, found.words, prompts, device)
+        return MaskRegions(load, level, regions="text", prompts=prompts, model=found.identity)
+    return FolderRegions(data / "regions" if choice == "auto" else named_folder(choice, data, "regions"))
 
 
 class FelzenszwalbRegions:
@@ -88,12 +96,22 @@ class FelzenszwalbRegions:
         return torch.from_numpy(felzenszwalb(_shrunk(image, LONGER_SIDE).numpy(), **_FELZENSZWALB))
 
 
-class _MaskRegions:
-    """Regions from a network's masks, which may overlap. It is loaded when the first photo needs it."""
+class MaskRegions:
+    """Regions from a network's masks, which may overlap.
 
-    def __init__(self, level: RegionLevel, device: torch.device | str, **made_with: Any) -> None:
-        self._level, self._device = level, device
+    Args:
+        load: function that loads the network, when the first photo needs it, and returns its masks' function.
+        level: which mask a pixel of several gets.
+        made_with: settings of the masks, the network's identity among them.
+    """
+
+    def __init__(self, load: Callable[[], FindMasks], level: RegionLevel, **made_with: Any) -> None:
+        self._load, self._level = load, level
         self._made_with = {**made_with, "level": level, "rule": _RULE}
+
+    @cached_property
+    def _masks(self) -> FindMasks:
+        return self._load()
 
     def settings(self, photo: Photo) -> dict[str, Any]:
         """Return the network's identity and the settings of its masks."""
@@ -106,44 +124,14 @@ class _MaskRegions:
         masks = [_nearest(mask, size) for mask in self._masks(small)]
         return label_map(torch.stack(masks), self._level) if masks else torch.full(size, -1)
 
-    def _masks(self, image: UInt8[Tensor, "h w 3"]) -> Sequence[Bool[Tensor, "h w"]]:
-        raise NotImplementedError
+
+def _sam_masks(files: ModelFiles, device: torch.device | str) -> FindMasks:
+    return AutomaticSam(files, device).masks
 
 
-class SamRegions(_MaskRegions):
-    """Regions from SAM's automatic masks."""
-
-    def __init__(self, files: ModelFiles, level: RegionLevel, device: torch.device | str) -> None:
-        super().__init__(level, device, regions="sam", model=files.identity)
-        self._files = files
-
-    def _masks(self, image: UInt8[Tensor, "h w 3"]) -> Sequence[Bool[Tensor, "h w"]]:
-        return self._sam.masks(image)
-
-    @cached_property
-    def _sam(self) -> AutomaticSam:
-        return AutomaticSam(self._files, self._device)
-
-
-class TextRegions(_MaskRegions):
-    """Regions from SAM 3, one for each instance of a prompt. Raises UserError for another model."""
-
-    def __init__(
-        self, files: SegmenterFiles, prompts: Sequence[str], level: RegionLevel, device: torch.device | str
-    ) -> None:
-        if not is_sam3(files):
-            raise UserError(
-                f"regions text needs a SAM 3, and {files.words.name} is none: {TEXT_OPTION} facebook/sam3"
-            )
-        self._files, self._prompts = files, sorted(prompts)
-        super().__init__(level, device, regions="text", prompts=self._prompts, model=files.identity)
-
-    def _masks(self, image: UInt8[Tensor, "h w 3"]) -> Sequence[Bool[Tensor, "h w"]]:
-        return [mask for masks, _ in self._sam.instances(image, self._prompts) for mask in masks]
-
-    @cached_property
-    def _sam(self) -> Sam3:
-        return Sam3(self._files.words, self._device)
+def _masks_of_instances(files: ModelFiles, prompts: Sequence[str], device: torch.device | str) -> FindMasks:
+    sam = Sam3(files, device)
+    return lambda image: [mask for masks, _ in sam.instances(image, prompts) for mask in masks]
 
 
 class FolderRegions:

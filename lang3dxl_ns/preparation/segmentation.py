@@ -5,9 +5,9 @@ All are loaded from a local folder or by Hugging Face name, like the encoders.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -23,11 +23,14 @@ from lang3dxl_ns.preparation.model_files import (
     load_weights,
     model_type,
 )
-from lang3dxl_ns.preparation.sam3 import MODEL_TYPES, Sam3
 
 TEXT_OPTION = "--pipeline.datamanager.foreground-model"
 SAM_OPTION = "--pipeline.datamanager.sam"
 
+SAM3_TYPES = ("sam3", "sam3_video")
+"""Model types in SAM 3's configuration; published checkpoints contain the detector inside a video model."""
+_LEAST_SCORE = 0.5
+"""Lowest score of an instance, and of its mask at a pixel."""
 _BOX_THRESHOLD = 0.3
 """Minimum confidence of a box (LangSAM's)."""
 # These are LangSplat's settings of SAM's automatic masks, published for language fields. Its extra round over
@@ -65,13 +68,11 @@ class SegmenterFiles:
 
 
 def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
-    """Find a text segmenter's files: a CLIPSeg or SAM 3 alone, or a GroundingDINO with a SAM.
-
-    Raises UserError if one can't be found or downloaded, or is another kind of model.
-    """
+    """Find a text segmenter's files: a CLIPSeg or SAM 3 alone, or a GroundingDINO with a SAM. Raises
+    UserError if one can't be found or downloaded, or is another kind of model."""
     words = find_model(name_or_dir, TEXT_OPTION)
     kind = model_type(words)
-    if kind not in ("clipseg", "grounding-dino", *MODEL_TYPES):
+    if kind not in ("clipseg", "grounding-dino", *SAM3_TYPES):
         raise UserError(
             f"{words.name} is a {kind} model: {TEXT_OPTION} takes a GroundingDINO "
             "(IDEA-Research/grounding-dino-tiny), a CLIPSeg (CIDAS/clipseg-rd64-refined) or facebook/sam3"
@@ -97,7 +98,7 @@ def load_text_segmenter(files: SegmenterFiles, device: torch.device | str) -> Te
 
 def is_sam3(files: SegmenterFiles) -> bool:
     """Return whether a text segmenter is a SAM 3, which distinguishes instances."""
-    return model_type(files.words) in MODEL_TYPES
+    return model_type(files.words) in SAM3_TYPES
 
 
 class ClipSeg:
@@ -130,6 +131,58 @@ class ClipSeg:
         return F.interpolate(logits, tuple(image.shape[:2]), mode="bilinear")[:, 0].sigmoid()
 
 
+class Sam3:
+    """SAM 3 (Carion et al. 2025), which finds all instances of a text in a picture, with masks and scores. It
+    encodes a picture once for all prompts."""
+
+    def __init__(self, files: ModelFiles, device: torch.device | str) -> None:
+        from transformers import Sam3Model, Sam3Processor
+
+        self._model = load_weights(Sam3Model, files, device)
+        self._processor = load_processor(Sam3Processor, files)
+
+    def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
+        """Combine the masks of all instances (see `TextSegmenter.segment`)."""
+        found = self.instances(image, prompts)
+        return torch.cat([masks for masks, _ in found]).any(dim=0)
+
+    def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
+        """Compute, for each prompt and pixel, the highest instance score × mask, without a threshold."""
+        maps = []
+        for output in self._outputs(image, prompts):
+            scores = (output.pred_logits.sigmoid() * output.presence_logits.sigmoid())[0]
+            maps.append((scores[:, None, None] * output.pred_masks[0].sigmoid()).amax(dim=0))
+        size = tuple(image.shape[:2])
+        return F.interpolate(torch.stack(maps)[None].float(), size, mode="bilinear")[0].cpu()
+
+    def instances(
+        self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]
+    ) -> list[tuple[Bool[Tensor, "n h w"], Float[Tensor, " n"]]]:
+        """Find each prompt's instances: masks at the size of the image, and scores, on the CPU."""
+        size, found = tuple(image.shape[:2]), []
+        for output in self._outputs(image, prompts):
+            (result,) = self._processor.post_process_instance_segmentation(
+                output, _LEAST_SCORE, _LEAST_SCORE, target_sizes=[size]
+            )
+            masks = result["masks"].reshape(-1, *size)  # an empty result has another shape
+            found.append((masks.bool().cpu(), result["scores"].float().cpu()))
+        return found
+
+    @torch.no_grad()
+    def _outputs(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Iterator[Any]:
+        device = self._model.device
+        pixels = self._processor(images=image.permute(2, 0, 1), return_tensors="pt")["pixel_values"]
+        vision = self._model.get_vision_features(pixel_values=pixels.to(device))
+        longest = self._model.config.text_config.max_position_embeddings
+        for prompt in prompts:
+            tokens = self._processor.tokenizer(
+                [prompt], padding="max_length", truncation=True, max_length=longest, return_tensors="pt"
+            ).to(device)
+            yield self._model(
+                vision_embeds=vision, input_ids=tokens["input_ids"], attention_mask=tokens["attention_mask"]
+            )
+
+
 class BoxesAndSam:
     """LangSAM: GroundingDINO (Liu et al. 2023) finds boxes, and SAM (Kirillov et al. 2023) segments each."""
 
@@ -151,10 +204,8 @@ class BoxesAndSam:
         return (self.probabilities(image, prompts) > 0).any(dim=0)
 
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Compute the score of the best box whose mask covers the pixel, else 0, for each prompt.
-
-        The detector sees one prompt at a time, so that prompts don't compete.
-        """
+        """Compute the score of the best box whose mask covers the pixel, else 0, for each prompt. The
+        detector sees one prompt at a time, so that prompts don't compete."""
         found = [self.boxes(image, prompt) for prompt in prompts]
         masks = iter(self._masks(image, torch.cat([boxes for boxes, _ in found])))
         maps = torch.zeros(len(prompts), *image.shape[:2])

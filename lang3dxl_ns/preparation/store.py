@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.scene.photo import Photo
 
 logger = logging.getLogger(__name__)
@@ -53,10 +53,8 @@ class FeatureStore:
         return self.root / kind / f"{readable}.{digest}.safetensors"
 
     def write(self, kind: str, name: str, tensors: dict[str, Tensor], settings: dict[str, Any]) -> None:
-        """Store an entry atomically: a failure at any moment leaves the old entry, or none.
-
-        Raises UserError on NaN or infinity, and if the disk is full or read-only.
-        """
+        """Store an entry atomically: a failure at any moment leaves the old entry, or none. Raises UserError
+        on NaN or infinity, and if the disk is full or read-only."""
         from safetensors.torch import save
 
         stored = {key: _compact(tensor, f"{key} of {name} ({kind})") for key, tensor in tensors.items()}
@@ -91,10 +89,8 @@ class FeatureStore:
             ) from error
 
     def read(self, kind: str, name: str) -> dict[str, Tensor]:
-        """Map an entry's tensors into memory (CPU, float16): only the parts in use are read from disk.
-
-        Raises UserError if the entry is missing or damaged.
-        """
+        """Map an entry's tensors into memory (CPU, float16): only the parts in use are read from disk. Raises
+        UserError if the entry is missing or damaged."""
         with _opened(self.path(kind, name), f"{kind} of {name}") as file:
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 
@@ -109,11 +105,9 @@ class FeatureStore:
             return json.loads(file.metadata()["settings"])
 
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
-        """Return whether the entry exists, is complete, and was made with these settings.
-
-        A damaged entry counts as absent. Only the header is read, unless the file has changed since it was
-        last found complete.
-        """
+        """Return whether the entry exists, is complete, and was made with these settings. A damaged one
+        counts as absent. Only the header is read, unless the file has changed since it was last found
+        complete."""
         path = self.path(kind, name)
         if not path.exists():
             return False
@@ -122,7 +116,7 @@ class FeatureStore:
                 metadata = file.metadata()
                 if _canonical(json.loads(metadata["settings"])) != _canonical(settings):
                     return False
-                if _is_sealed(path):
+                if path.stat().st_mtime_ns % _SECOND == 0:  # sealed
                     return True
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
                 if metadata.get("checksum") != _checksum(tensors):
@@ -134,12 +128,11 @@ class FeatureStore:
             return False
 
     def photo_hashes(self, photos: Sequence[Photo]) -> dict[str, str | UserError]:
-        """Compute a hash of every photo's file by name, or the reason why it can't be read.
-
-        A file is read once, and again if its size, modification time or inode has changed.
-        """
-        path = self.root / _HASHES
-        known = _read_json(path)
+        """Compute a hash of every photo's file by name, or the reason why it can't be read. A file is read
+        once, and again if its size, modification time or inode has changed."""
+        path, known = self.root / _HASHES, dict[str, Any]()
+        with contextlib.suppress(OSError, ValueError, TypeError):  # missing or damaged
+            known = dict(read_json(path))
 
         def look(photo: Photo) -> tuple[str | UserError, list[Any] | None]:
             try:
@@ -233,18 +226,6 @@ def _seal(path: Path) -> None:
     with contextlib.suppress(OSError):
         seconds = path.stat().st_mtime_ns // _SECOND
         os.utime(path, ns=(seconds * _SECOND, seconds * _SECOND))
-
-
-def _is_sealed(path: Path) -> bool:
-    return path.stat().st_mtime_ns % _SECOND == 0
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; empty for a file that is missing or damaged."""
-    with contextlib.suppress(OSError, ValueError, RecursionError):
-        content = json.loads(path.read_text())
-        return content if isinstance(content, dict) else {}
-    return {}
 
 
 def _canonical(settings: dict[str, Any]) -> str:

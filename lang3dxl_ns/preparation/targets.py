@@ -1,12 +1,13 @@
-"""Reading the prepared targets of a scene, and their channel statistics."""
+"""Reading the prepared targets of a scene, their statistics, and what the data manager hands to the model."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypedDict
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
@@ -16,6 +17,7 @@ from lang3dxl_ns.preparation.store import FeatureStore
 CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
 
 _STD_FLOOR = 0.01
+_KEY = "lang3dxl"
 
 
 @dataclass
@@ -129,3 +131,57 @@ def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:
     std = (squares / count).sqrt()
     floor = max(_STD_FLOOR * float(std.mean()), torch.finfo(torch.float32).eps)
     return ChannelStatistics(mean.float(), std.clamp_min(floor).float())
+
+
+class _Photo(TypedDict):
+    image: UInt8[Tensor, "h w 3"]
+    image_idx: int
+    """Index of the photo in its dataset."""
+    name: str
+
+
+class Batch(_Photo, total=False):
+    """Photo and its targets on the model's device; keys that a scene doesn't have are absent."""
+
+    mask: Bool[Tensor, "h w 1"]
+    """Foreground."""
+    clip_target: Float[Tensor, "hd wd c"]
+    """CLIP target, as in `StoredClipTarget.features`."""
+    crop_sides: list[float]
+    """Sides of the crops in the CLIP target, ascending, as fractions of the photo's width."""
+    dense_target: Float[Tensor, "t t d"]
+    """Dense features of the photo squashed to a square."""
+    regions: Int[Tensor, "hr wr"]
+    """Region labels, −1 for none."""
+
+
+@dataclass
+class SceneFacts:
+    """Facts about a scene from which a model is built, beside its settings and the scene's points."""
+
+    names: list[str] = field(default_factory=list)
+    """Names of the training photos, in the order of their cameras."""
+    positions: Float[Tensor, "p 3"] | None = None
+    """Positions of the training cameras, in the model's frame; None for a model that is loaded."""
+    needs: Mapping[str, bool] = field(default_factory=dict)
+    """Whether the scene needs each optional component; empty if that wasn't measured."""
+    statistics: FeatureStatistics | None = None
+    """Channel statistics of the targets; None for a model without semantics, or one that is loaded."""
+    clip_targets: Callable[[], Iterator[Float[Tensor, "hd wd c"]]] | None = None
+    """Function that yields the CLIP targets of the training photos, one at a time."""
+    dense_targets: Callable[[], Iterator[Float[Tensor, "t t d"]]] | None = None
+    """Function that yields the dense features of the training photos; None without a dense encoder."""
+
+    def wants(self, component: str, choice: str, unmeasured: bool = True) -> bool:
+        """Return whether to build a component (named as in `needs`) for a setting: `on`, `off`, or `auto`,
+        for which its need decides, or `unmeasured` if that is unknown."""
+        return self.needs.get(component, unmeasured) if choice == "auto" else choice == "on"
+
+    def into(self, metadata: dict[str, Any]) -> None:
+        """Put the facts into a dataset's metadata, which nerfstudio hands to the model."""
+        metadata[_KEY] = self
+
+    @staticmethod
+    def of(metadata: Mapping[str, Any]) -> SceneFacts:
+        """Return the facts in a dataset's metadata, or empty ones."""
+        return metadata.get(_KEY) or SceneFacts()

@@ -10,7 +10,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures import TimeoutError as FutureTimeoutError
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
@@ -22,7 +21,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 
 PATIENCE_S = 30.0
-"""Seconds to wait for a Ray cluster to answer."""
+"""Seconds to wait for a named Ray cluster to answer."""
 Item = TypeVar("Item", contravariant=True)
 Result = TypeVar("Result", covariant=True)
 
@@ -36,14 +35,11 @@ class Maker(Protocol[Item, Result]):
 
 @dataclass(frozen=True)
 class Workers:
-    """Number and kind of workers."""
+    """Number and kind of workers, as in `PreparationConfig`."""
 
     count: int = 1
-    """Number of processes."""
     engine: Literal["local", "ray"] = "local"
-    """Where the processes run: on this machine, or on a Ray cluster (which must see the same folders)."""
     address: str | None = None
-    """Address of the Ray cluster; None starts one on this machine."""
 
     def run(
         self, maker: Maker[Item, Result], items: Sequence[Item], device: str
@@ -51,16 +47,13 @@ class Workers:
         """Yield every item with its result, as they finish. Raises the exceptions of the work, and UserError
         if a process dies; earlier results are kept."""
         if self.engine == "ray":
-            return _run_on_ray(self, maker, items, device)
-        if self.count <= 1 or len(items) <= 1:
-            return _run_here(maker, items, device)
-        return _run_in_processes(self.count, maker, items, device)
-
-
-def _run_here(maker: Maker[Item, Result], items: Sequence[Item], device: str):
-    work = maker.start(device)
-    for item in items:
-        yield item, work(item)
+            yield from _run_on_ray(self, maker, items, device)
+        elif self.count > 1 and len(items) > 1:
+            yield from _run_in_processes(self.count, maker, items, device)
+        else:
+            work = maker.start(device)
+            for item in items:
+                yield item, work(item)
 
 
 # --- processes of this machine ----------------------------------------------------------------------------
@@ -89,12 +82,17 @@ def _run_in_processes(count: int, maker: Maker[Item, Result], items: Sequence[It
 
 
 def _start(maker: Maker, device: str, count: int, turn: Any) -> None:
+    """Set up a process for the work on its device, one of the GPUs, or a share of the CPU's cores."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with turn.get_lock():
         number, turn.value = turn.value, turn.value + 1
+    if device.startswith("cuda"):
+        device = f"cuda:{number % torch.cuda.device_count()}"
+    else:
+        torch.set_num_threads(max(torch.get_num_threads() // count, 1))
     global _work
-    _work = maker.start(_device(device, number, count))
+    _work = maker.start(device)
 
 
 def _end_with_parent() -> None:
@@ -107,14 +105,6 @@ def _end_with_parent() -> None:
 
 def _do(item: Any) -> Any:
     return _work(item)
-
-
-def _device(device: str, number: int, count: int) -> str:
-    """Return the worker's device, one of the GPUs; on a CPU, take a share of the cores."""
-    if device.startswith("cuda"):
-        return f"cuda:{number % torch.cuda.device_count()}"
-    torch.set_num_threads(max(torch.get_num_threads() // count, 1))
-    return device
 
 
 # --- a Ray cluster -----------------------------------------------------------------------------------------
@@ -150,42 +140,30 @@ def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[It
             ray.shutdown()
 
 
-def _within(seconds: float, job: Callable[[], Any]) -> None:
-    """Run a job with a time limit. Raises TimeoutError when it is reached (the job stays in a daemon thread),
-    or the job's exception."""
-    ended: Future[None] = Future()
-
-    def run() -> None:
-        try:
-            ended.set_result(job())
-        except BaseException as error:
-            ended.set_exception(error)  # raised below, in the waiting thread
-
-    threading.Thread(target=run, daemon=True).start()
-    try:
-        ended.result(seconds)
-    except FutureTimeoutError as error:
-        raise TimeoutError(f"no answer within {seconds:.0f} s") from error
-
-
-def _connect(ray: Any, workers: Workers, attempts: int = 2) -> None:
-    """Connect to the Ray cluster, or start one here. Raises UserError if it doesn't answer.
-
-    Ray allows its processes half a minute to start; a second attempt finds them in the disk cache."""
+def _connect(ray: Any, workers: Workers) -> None:
+    """Connect to the Ray cluster, or start one here, within the time limit, after which the attempt stays in
+    a daemon thread. Raises UserError if there is no answer."""
     # A cluster started here listens on this machine only.
-    own = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    options = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    if workers.address:
+        say(f"connecting to the Ray cluster at {workers.address}: {PATIENCE_S:.0f} s at most")
+        options = {"address": workers.address}
+    answer: Future[None] = Future()
+
+    def connect() -> None:
+        try:
+            answer.set_result(ray.init(log_to_driver=False, **options))
+        except BaseException as error:
+            answer.set_exception(error)  # raised below, in the waiting thread
+
+    threading.Thread(target=connect, daemon=True).start()
     try:
-        if workers.address:
-            say(f"connecting to the Ray cluster at {workers.address}: {PATIENCE_S:.0f} s at most")
-            _within(PATIENCE_S, lambda: ray.init(log_to_driver=False, address=workers.address))
-        else:
-            ray.init(log_to_driver=False, **own)
-    except Exception as error:  # Ray raises this class itself if its processes don't start in time
-        if not isinstance(error, TimeoutError):
-            ray.shutdown()
-            if attempts > 1 and not workers.address:
-                return _connect(ray, workers, attempts - 1)
+        answer.result(PATIENCE_S if workers.address else None)
+    except Exception as error:
+        if answer.done():
+            ray.shutdown()  # of what it has started
+        reason = error if answer.done() else f"no answer within {PATIENCE_S:.0f} s"
         raise UserError(
-            f"no Ray cluster answers at {workers.address or 'this machine'} ({error}): give --address, or "
+            f"no Ray cluster answers at {workers.address or 'this machine'} ({reason}): give --address, or "
             "start one with `ray start --head`"
         ) from error

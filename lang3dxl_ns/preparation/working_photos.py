@@ -84,10 +84,8 @@ def mask_png(mask: Bool[Tensor, "h w"], made_with: str) -> bytes:
 
 
 def kept_picture(path: Path, made_with: str, mode: str | None = None) -> Image.Image | None:
-    """Read a `mask_png`, or a JPEG with such a comment, if it is complete and was made with these settings.
-
-    Otherwise return None. `mode` is the mode of the pixels; None checks the file and decodes nothing.
-    """
+    """Read a `mask_png`, or a JPEG with such a comment, if it is complete and was made with these settings;
+    else return None. `mode` is the mode of the pixels; None checks the file and decodes nothing."""
     if not path.is_file():
         return None
     try:

@@ -8,25 +8,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
-from lang3dxl_ns.rendering.fused_plan import LOG2_E, make_plan
 from lang3dxl_ns.rendering.fused_tiles import (
     CHANNELS_FROM,
     PIXELS,
+    SPLAT_COLUMNS,
+    TILE,
+    UNROLL,
     WAVE,
     Maps,
     Trace,
     backward_tiles,
     composite_tiles,
 )
+from lang3dxl_ns.rendering.gaussians import REACH_SLACK
 
 PARTS_PER_THREAD = 8
 """Parts per thread. Tiles may stop early, by an unknown amount, so small parts spread the rest over the
 threads."""
+LOG2_E = math.log2(math.e)
 _MOST_KEPT = 64 * 2**20  # bytes
 
 
@@ -63,7 +67,6 @@ class FusedCompositing(torch.autograd.Function):
         depths: Tensor,
         width: int,
         height: int,
-        absgrad: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
         plan = make_plan(
             means2d.view(-1, 2), conics, variances, depths, opacities, channels, detached_channels, width,
@@ -80,7 +83,7 @@ class FusedCompositing(torch.autograd.Function):
         in_threads(composite_tiles, [(tiles, *shared) for tiles in _parts(rows)])
         ctx.save_for_backward(means2d, conics, opacities)
         ctx.set_materialize_grads(False)
-        ctx.plan, ctx.trace, ctx.absgrad = plan, trace, absgrad
+        ctx.plan, ctx.trace = plan, trace
         return maps[0], maps[1], maps[2]
 
     @staticmethod
@@ -99,16 +102,12 @@ class FusedCompositing(torch.autograd.Function):
         dealt = [np.concatenate(parts[k::threads]) for k in range(min(threads, len(parts)))]
         columns = CHANNELS_FROM + plan.table.shape[1]
         sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
-        shared = plan, maps, ctx.trace, ctx.absgrad
-        in_threads(backward_tiles, [(tiles, *shared, sums[k]) for k, tiles in enumerate(dealt)])
-        found = [torch.zeros_like(part) for part in (positions, conics, opacities, positions)]
+        in_threads(backward_tiles, [(tiles, plan, maps, ctx.trace, sums[k]) for k, tiles in enumerate(dealt)])
+        found = [torch.zeros_like(part) for part in (positions, conics, opacities)]
         found += [opacities.new_zeros(len(opacities), size) for size in ctx.sizes[:2]]
         arrays = plan, conics.numpy(), opacities.numpy(), sums, _Gradients(*(g.numpy() for g in found))
         in_threads(_collect, [(*part, *arrays) for part in ranges(len(plan.order), least=4096)])
-        position, conic, opacity, absolutes, channels, detached = found
-        if ctx.absgrad:
-            means2d.absgrad = absolutes.view_as(means2d)
-        return position.view_as(means2d), conic, opacity, channels, detached, *[None] * 5
+        return found[0].view_as(means2d), *found[1:], *[None] * 4
 
 
 class _Gradients(NamedTuple):
@@ -117,7 +116,6 @@ class _Gradients(NamedTuple):
     position: Float[np.ndarray, "n 2"]
     conic: Float[np.ndarray, "n 3"]
     opacity: Float[np.ndarray, " n"]
-    absolutes: Float[np.ndarray, "n 2"]
     channels: Float[np.ndarray, "n c"]
     detached: Float[np.ndarray, "n d"]
 
@@ -146,8 +144,144 @@ def _collect(first, last, plan, conics, opacities, sums, found) -> None:
         # dx and dy point from the center to the pixel.
         found.position[g, 0], found.position[g, 1] = a * row[3] + b * row[4], b * row[3] + c * row[4]
         found.opacity[g] = row[5] / opacities[g]
-        found.absolutes[g, 0], found.absolutes[g, 1] = row[6] * (2 / LOG2_E), row[7] * (2 / LOG2_E)
         for k in range(found.channels.shape[1]):
             found.channels[g, k] = row[CHANNELS_FROM + k]
         for k in range(found.detached.shape[1]):
             found.detached[g, k] = row[CHANNELS_FROM + plan.attached + k]
+
+
+class Plan(NamedTuple):
+    """Visible Gaussians in depth order and, for each tile, those that may touch it."""
+
+    order: Int[np.ndarray, " v"]
+    """Indices of the Gaussians, front to back."""
+    splats: Float[np.ndarray, "v 6"]
+    table: Float[np.ndarray, "v c"]
+    """Channels with a gradient to the geometry, a one for alpha, and zeros up to a multiple of four; then the
+    detached channels, padded likewise."""
+    attached: int
+    """Number of columns of the table before the detached ones."""
+    starts: Int[np.ndarray, " tiles+1"]
+    """First row of each tile."""
+    ranks: Int[np.ndarray, " rows"]
+    """Positions in the depth order, ascending within a tile."""
+    width: int
+    height: int
+
+
+def make_plan(
+    means2d: Float[Tensor, "n 2"],
+    conics: Float[Tensor, "n 3"],
+    variances: Float[Tensor, "n 2"],
+    depths: Float[Tensor, " n"],
+    opacities: Float[Tensor, " n"],
+    channels: Float[Tensor, "n c"],
+    detached: Float[Tensor, "n d"],
+    width: int,
+    height: int,
+) -> Plan:
+    """Find the Gaussians that reach 1/255 in some pixel, and sort them by depth and into tiles."""
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    positions, form, spread, opacity, attached_channels, detached_channels = (
+        part.detach().contiguous().numpy()
+        for part in (means2d, conics, variances, opacities, channels, detached)
+    )
+    boxes = np.empty((len(opacities), 4), np.int32)
+    visible = np.empty(len(opacities), np.int64)
+    count = _find_visible(positions, spread, opacity, width, height, boxes, visible)
+    seen = torch.from_numpy(visible[:count])
+    order = seen.index_select(0, depth_order(depths.detach().index_select(0, seen))).numpy()
+
+    attached = _rounded_up(channels.shape[1] + 1)
+    splats = np.empty((count, SPLAT_COLUMNS), positions.dtype)
+    table = np.empty((count, attached + _rounded_up(detached.shape[1])), positions.dtype)
+    arrays = order, positions, form, spread, opacity, attached_channels, detached_channels, attached
+    in_threads(_pack, [(*part, *arrays, splats, table) for part in ranges(count, least=4096)])
+
+    sizes = np.zeros(columns * rows + 1, np.int64)
+    bands = ranges(rows)
+    in_threads(_count_rows, [(order, boxes, columns, *band, sizes) for band in bands])
+    starts = np.cumsum(sizes)
+    ranks = np.empty(starts[-1], np.int32)
+    in_threads(_fill_rows, [(order, boxes, columns, *band, starts, ranks) for band in bands])
+    return Plan(order, splats, table, attached, starts, ranks, width, height)
+
+
+def depth_order(depths: Float[Tensor, " v"]) -> Int[Tensor, " v"]:
+    """Return indices front to back. Positive floats sort like their bits, and integers have a radix sort."""
+    keys = depths.view(torch.int32) if depths.dtype == torch.float32 else depths
+    return torch.sort(keys, stable=True).indices
+
+
+def _rounded_up(count: int) -> int:
+    return -(-count // UNROLL) * UNROLL
+
+
+@kernel
+def _find_visible(means2d, variances, opacities, width, height, boxes, visible):
+    """List the Gaussians that reach some pixel, with their ranges of tiles, and return their number."""
+    count = 0
+    for g in range(len(opacities)):
+        opacity = opacities[g]
+        if not opacity * 255.0 >= 1.0:
+            continue
+        bound = 2 * math.log(255.0 * opacity)
+        reach_x = math.sqrt(bound * variances[g, 0]) + REACH_SLACK
+        reach_y = math.sqrt(bound * variances[g, 1]) + REACH_SLACK
+        x, y = means2d[g, 0] - 0.5, means2d[g, 1] - 0.5
+        left, right = max(x - reach_x, 0.0), min(x + reach_x, width - 1.0)
+        top, bottom = max(y - reach_y, 0.0), min(y + reach_y, height - 1.0)
+        # This test also fails for NaN.
+        if not (left <= right and top <= bottom):
+            continue
+        first_x, last_x = math.ceil(left), int(right)
+        first_y, last_y = math.ceil(top), int(bottom)
+        if first_x > last_x or first_y > last_y:
+            continue
+        boxes[g, 0], boxes[g, 1] = first_x // TILE, last_x // TILE
+        boxes[g, 2], boxes[g, 3] = first_y // TILE, last_y // TILE
+        visible[count] = g
+        count += 1
+    return count
+
+
+@kernel
+def _pack(
+    first, last, order, means2d, conics, variances, opacities, channels, detached, attached, splats, table
+) -> None:
+    """Gather the compositing data of a range of Gaussians, contiguous and in depth order."""
+    for rank in range(first, last):
+        g = order[rank]
+        splats[rank, 0], splats[rank, 1] = means2d[g, 0], means2d[g, 1]
+        splats[rank, 2] = conics[g, 1] / conics[g, 0]
+        splats[rank, 3] = conics[g, 0] * (LOG2_E / 2)
+        splats[rank, 4] = (LOG2_E / 2) / variances[g, 1]
+        splats[rank, 5] = math.log2(opacities[g])
+        for c in range(table.shape[1]):
+            table[rank, c] = 0
+        for c in range(channels.shape[1]):
+            table[rank, c] = channels[g, c]
+        table[rank, channels.shape[1]] = 1
+        for c in range(detached.shape[1]):
+            table[rank, attached + c] = detached[g, c]
+
+
+@kernel
+def _count_rows(order, boxes, columns, first, last, sizes) -> None:
+    """Add each tile's number of Gaussians, for a range of tile rows, to the entry after its own."""
+    for g in order:
+        for y in range(max(boxes[g, 2], first), min(boxes[g, 3] + 1, last)):
+            for x in range(boxes[g, 0], boxes[g, 1] + 1):
+                sizes[y * columns + x + 1] += 1
+
+
+@kernel
+def _fill_rows(order, boxes, columns, first, last, starts, ranks) -> None:
+    place = starts[first * columns : last * columns].copy()
+    for rank in range(len(order)):
+        g = order[rank]
+        for y in range(max(boxes[g, 2], first), min(boxes[g, 3] + 1, last)):
+            for x in range(boxes[g, 0], boxes[g, 1] + 1):
+                tile = (y - first) * columns + x
+                ranks[place[tile]] = rank
+                place[tile] += 1

@@ -2,7 +2,7 @@
 
 A tile of 16 × 16 pixels is divided into 16 blocks of 8 × 2, one vector each. Front to back, each Gaussian is
 composited into those blocks of its tile that it reaches and that have not stopped. Rows are pairs of tile and
-Gaussian (see `fused_plan.Plan`). They are processed in waves of 32.
+Gaussian (see `fused_compositing.Plan`). They are processed in waves of 32.
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lang3dxl_ns.common.jit import kernel
-from lang3dxl_ns.rendering.fused_plan import SPLAT_COLUMNS, TILE, UNROLL
 from lang3dxl_ns.rendering.gaussians import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from lang3dxl_ns.rendering.simd import (
     LANES,
-    absolute,
     bits,
     entry,
     exp2,
@@ -32,11 +30,19 @@ from lang3dxl_ns.rendering.simd import (
     where,
 )
 
+TILE = 16
+"""Side of a tile, pixels."""
+SPLAT_COLUMNS = 6
+"""Columns of a splat: x, y, shear, steepness, rise and log2 of opacity. At (dx, dy) from the center, log2 of
+alpha is log2 opacity − steepness·(dx + shear·dy)² − rise·dy², which stays accurate far from the center of a
+needle."""
+UNROLL = 4
+"""Channels composited at a time. Their number is rounded up to a multiple of this."""
 WAVE = 32
 PIXELS = TILE * TILE
-CHANNELS_FROM = 8
-"""First channel column of a row's gradients. The eight columns before it are the conic (xx, xy, yy), first
-moments (x, y), ln opacity, and sums of the absolute pixel gradients of the screen position (x, y)."""
+CHANNELS_FROM = 6
+"""First channel column of a row's gradients. The six columns before it are the conic (xx, xy, yy), first
+moments (x, y), and ln opacity."""
 _BLOCKS = PIXELS // LANES
 _BLOCK_WIDTH, _BLOCK_HEIGHT = 8, 2
 _REACH = math.log2(ALPHA_MIN) - 0.01  # with a margin for rounding
@@ -62,7 +68,7 @@ class Trace(NamedTuple):
 
 
 class _Splat(NamedTuple):
-    """A Gaussian on the screen, in pixels from the tile's corner (see `fused_plan.SPLAT_COLUMNS`)."""
+    """A Gaussian on the screen, in pixels from the tile's corner (see `SPLAT_COLUMNS`)."""
 
     x: float
     y: float
@@ -224,14 +230,11 @@ def composite_tiles(tiles, plan, maps, trace, keep):
 
 
 @kernel
-def backward_tiles(tiles, plan, maps, trace, absolutes, sums):
+def backward_tiles(tiles, plan, maps, trace, sums):
     """Sum the gradients of some tiles per visible Gaussian. `maps` has the gradients of the output maps.
-
     Waves are processed from the back. In each, alpha and weight are recomputed front to back, then used in
     reverse. With v = Σ channel × upstream, and B the same sum for everything behind, composited over black,
-    the gradient with respect to ln(alpha) is weight·(v − B), and B in front of the Gaussian is B + alpha·(v −
-    B).
-    """
+    the gradient with respect to ln(alpha) is weight·(v − B), and B in front is B + alpha·(v − B)."""
     channels, like = plan.table.shape[1], plan.splats
     sums[:] = 0
     upstream = _aligned(channels * PIXELS, like)
@@ -280,7 +283,7 @@ def backward_tiles(tiles, plan, maps, trace, absolutes, sums):
                     rank = plan.ranks[begin + k]
                     splat = _splat(plan.splats, rank, corner_x, corner_y)
                     _add_values(plan, upstream, rank, first, last, found)
-                    _add_shape(across, down, splat, first, last, found, behind, absolutes, zero, sums[rank])
+                    _add_shape(across, down, splat, first, last, found, behind, zero, sums[rank])
                     _add_channels(upstream, first, last, found, channels, zero, sums[rank])
 
 
@@ -318,9 +321,9 @@ def _add_values(plan, upstream, rank, first, last, found):
 
 
 @numba.njit(forceinline=True)
-def _add_shape(across, down, splat, first, last, found, behind, absolutes, zero, sums):
+def _add_shape(across, down, splat, first, last, found, behind, zero, sums):
     """Add the gradients of a row's conic, moments and opacity, and move `behind` in front of it."""
-    m, mx, my, mxx, mxy, myy, abs_x, abs_y = zero, zero, zero, zero, zero, zero, zero, zero
+    m, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
     for slot in range(first, last):
         at = entry(found.places, slot)
         dx, dy = load(across, at) - splat.x, load(down, at) - splat.y
@@ -335,19 +338,12 @@ def _add_shape(across, down, splat, first, last, found, behind, absolutes, zero,
         mxx += slope_x * dx
         mxy += slope_x * dy
         myy += slope_y * dy
-        if absolutes:
-            tilt = (dx + dy * splat.shear) * splat.steepness
-            abs_x += absolute(slope * tilt)
-            abs_y += absolute(slope * (tilt * splat.shear + dy * splat.rise))
     sums[0] += total(mxx)
     sums[1] += total(mxy)
     sums[2] += total(myy)
     sums[3] += total(mx)
     sums[4] += total(my)
     sums[5] += total(m)
-    if absolutes:
-        sums[6] += total(abs_x)
-        sums[7] += total(abs_y)
 
 
 @numba.njit(forceinline=True)

@@ -24,27 +24,19 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
+import torch
 from filelock import FileLock, Timeout
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 
-JOB_BYTES = 3.5e9
-"""Most memory that one compiler takes."""
-BUILD_BYTES = 0.5e9
-"""Disk space that a build takes."""
+JOB_BYTES, BUILD_BYTES = 3.5e9, 0.5e9
+"""Most memory that one compiler takes, and disk space that a build takes."""
 UNITS = 6
 """Number of translation units for the CUDA sources. Each one pays over a minute for torch's headers."""
+NAME = "gsplat_cuda"
 _COMPILE = "import json, sys; from torch.utils.cpp_extension import load; load(**json.loads(sys.argv[1]))"
-
-
-class Extension(NamedTuple):
-    """CUDA and C++ sources that become one Python module."""
-
-    name: str
-    sources: Sequence[Path]
-    include: Sequence[Path] = ()
 
 
 class Need(NamedTuple):
@@ -55,13 +47,6 @@ class Need(NamedTuple):
     remedy: str
 
 
-def gsplat_extension() -> Extension:
-    """Describe gsplat's kernels."""
-    source = _package("gsplat")[0] / "cuda" / "csrc"
-    sources = sorted([*source.glob("*.cu"), *source.glob("*.cpp")])
-    return Extension("gsplat_cuda", sources, [source, source / "third_party" / "glm"])
-
-
 def _package(name: str) -> list[Path]:
     found = importlib.util.find_spec(name)
     return [Path(folder) for folder in (found and found.submodule_search_locations) or ()]
@@ -70,7 +55,7 @@ def _package(name: str) -> list[Path]:
 def find_toolkit(cuda: str) -> Path | None:
     """Find a toolkit of the major version of torch's CUDA ("13.2")."""
     major = cuda.partition(".")[0]
-    for home in _toolkit_places(major):
+    for home in _toolkit_places(major) if major else ():
         with contextlib.suppress(OSError, subprocess.SubprocessError):
             nvcc = [str(home / "bin" / "nvcc"), "--version"]
             told = subprocess.run(nvcc, capture_output=True, text=True, timeout=30).stdout
@@ -97,11 +82,8 @@ def _headers(home: Path) -> list[Path]:
 
 def needs(folder: Path) -> list[Need]:
     """Return everything that a build in a folder needs, found or not."""
-    import torch
-
-    cuda = torch.version.cuda or ""
-    toolkit = find_toolkit(cuda) if cuda else None
-    header = Path(sysconfig.get_paths()["include"]) / "Python.h"
+    cuda, python = torch.version.cuda or "", "python{}.{}".format(*sys.version_info)
+    toolkit, header = find_toolkit(cuda), Path(sysconfig.get_paths()["include"]) / "Python.h"
     there = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     free, memory = shutil.disk_usage(there).free, machine_memory()
     trouble = "" if free > BUILD_BYTES and os.access(there, os.W_OK) else "full, or not writable"
@@ -110,65 +92,56 @@ def needs(folder: Path) -> list[Need]:
     nvcc = f"install the CUDA toolkit {cuda} and set CUDA_HOME to it, or torch's CUDA 13 build"
     if cuda.startswith("13."):
         nvcc = f"pip install 'lang3dxl-ns[cuda]' (or a system CUDA toolkit {cuda}, with CUDA_HOME at it)"
-    apt = f"apt install g++ python{sys.version_info.major}.{sys.version_info.minor}-dev"
-    compiler = shutil.which(os.environ.get("CXX", "g++"), path=search_path())
-    cub = f"nvcc and cub of CUDA {cuda.partition('.')[0] or '13'}"
+    apt, cub = f"apt install g++ {python}-dev", f"nvcc and cub of CUDA {cuda.partition('.')[0] or '13'}"
+    compiler, ninja = (shutil.which(x, path=_path()) for x in (os.environ.get("CXX", "g++"), "ninja"))
     disk = f"{trouble}: free half a gigabyte, or set TORCH_EXTENSIONS_DIR"
     return [
         Need("torch with CUDA", cuda or None, "https://pytorch.org/get-started/locally"),
         Need(cub, str(toolkit) if toolkit else None, nvcc),
         Need("C++ compiler", compiler, apt),
         Need("Python.h", str(header) if header.is_file() else None, apt),
-        Need("ninja", shutil.which("ninja", path=search_path()), "pip install ninja"),
+        Need("ninja", ninja, "pip install ninja"),
         Need("memory", f"{memory / 1e9:.1f} GB" if memory >= JOB_BYTES else None, "a build takes 3.5 GB"),
         Need(f"disk, {folder}", None if trouble else f"{free / 1e9:.1f} GB free", disk),
     ]
 
 
-def search_path(*first: Path) -> str:
+def _path(*first: Path) -> str:
     """Return PATH with the environment's programs first, whether it is activated or not."""
-    return os.pathsep.join(
-        [*map(str, first), str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)]
-    )
+    places = *first, Path(sys.executable).parent, os.environ.get("PATH", os.defpath)
+    return os.pathsep.join(map(str, places))
 
 
 def device_arch() -> str:
     """Return the compute capabilities of the visible GPUs, as nvcc and torch know them: "8.6", "7.5;8.6". A
     GPU that is too new for torch gets the newest one that torch knows, compiled by the driver (+PTX).
-    TORCH_CUDA_ARCH_LIST is used only if there is no GPU, because container images set it to five
-    architectures, which is five times the work."""
-    import torch
-
+    TORCH_CUDA_ARCH_LIST, which container images set to many, counts only without a GPU."""
     gpus = {torch.cuda.get_device_capability(index) for index in range(torch.cuda.device_count())}
     if not gpus:
         return os.environ.get("TORCH_CUDA_ARCH_LIST", "")
     known = [re.match(r"sm_(\d+)(\d)", name) for name in torch.cuda.get_arch_list()]
     newest = max(((int(sm[1]), int(sm[2])) for sm in known if sm), default=(99, 9))
-    names = {"{}.{}".format(*min(gpu, newest)) + "+PTX" * (gpu > newest) for gpu in gpus}
-    return ";".join(sorted(names))
+    return ";".join(sorted("{}.{}".format(*min(gpu, newest)) + "+PTX" * (gpu > newest) for gpu in gpus))
 
 
 def build_folder(arch: str) -> Path:
     """Return the folder of gsplat's build for these GPUs and the versions installed."""
-    import torch
-
     cache = Path(os.environ.get("TORCH_EXTENSIONS_DIR") or Path.home() / ".cache" / "lang3dxl").expanduser()
-    python = f"py{sys.version_info.major}{sys.version_info.minor}"
     cuda, sm = torch.version.cuda, re.sub(r"[^\w+]", "-", arch.replace(".", ""))
-    plain = torch.__version__.partition("+")[0]
-    return cache / f"gsplat-{version('gsplat')}-torch-{plain}-cuda-{cuda}-{python}-sm-{sm}"
+    versions = f"{version('gsplat')}-torch-{torch.__version__.partition('+')[0]}-cuda-{cuda}"
+    return cache / "gsplat-{}-py{}{}-sm-{}".format(versions, *sys.version_info[:2], sm)
 
 
-def built(folder: Path, name: str = "gsplat_cuda") -> Path | None:
+def built(folder: Path, name: str = NAME) -> Path | None:
     """Return the library if it was built completely."""
     library = folder / f"{name}.so"
     return library if (folder / "done").is_file() and library.is_file() else None
 
 
-def build(extension: Extension, folder: Path, arch: str) -> Path:
-    """Compile into a folder, with the output in build.log, and return the library. An interrupted build is
-    continued, and another process that builds there is waited for. Raises UserError if something is missing,
-    or the compiler failed."""
+def build(folder: Path, arch: str, sources: Sequence[Path] = (), name: str = NAME) -> Path:
+    """Compile gsplat's kernels (or other sources) into a folder, with the output in build.log, and return the
+    library. An interrupted build is continued, and another process that builds there is waited for. Raises
+    UserError if something is missing, or the compiler failed."""
     missing = [f"{need.what} is missing: {need.remedy}" for need in needs(folder) if need.found is None]
     if missing:
         raise UserError("gsplat's CUDA kernels can't be built here. " + ". ".join(missing))
@@ -180,37 +153,37 @@ def build(extension: Extension, folder: Path, arch: str) -> Path:
         except Timeout:
             say(f"Another process builds gsplat's CUDA kernels in {folder}: waiting for it")
             lock.acquire()
-        return built(folder, extension.name) or _compile(extension, folder, arch)
+        return built(folder, name) or _compile(folder, arch, sources, name)
     except OSError as error:
         raise UserError(f"gsplat's CUDA kernels can't be built in {folder} ({error})") from error
     finally:
         lock.release()
 
 
-def _compile(extension: Extension, folder: Path, arch: str) -> Path:
-    import torch
-
-    toolkit = find_toolkit(torch.version.cuda or "")
+def _compile(folder: Path, arch: str, sources: Sequence[Path], name: str) -> Path:
+    toolkit, own = find_toolkit(torch.version.cuda or ""), _package("gsplat")[0] / "cuda" / "csrc"
     assert toolkit is not None
-    jobs = max(1, min(os.cpu_count() or 1, int(machine_memory() / JOB_BYTES)))
-    environment = {"MAX_JOBS": str(jobs), **os.environ, "TORCH_CUDA_ARCH_LIST": arch}
-    environment |= {"CUDA_HOME": str(toolkit), "PATH": search_path(toolkit / "bin")}
+    sources = sources or sorted([*own.glob("*.cu"), *own.glob("*.cpp")])
+    jobs = str(max(1, min(os.cpu_count() or 1, int(machine_memory() / JOB_BYTES))))
+    jobs = os.environ.get("MAX_JOBS", jobs)
     libraries = str(_linkable(toolkit, folder / "lib")), os.environ.get("LIBRARY_PATH")
+    environment = {**os.environ, "MAX_JOBS": jobs, "TORCH_CUDA_ARCH_LIST": arch, "CUDA_HOME": str(toolkit)}
+    environment["PATH"] = _path(toolkit / "bin")
     environment["LIBRARY_PATH"] = os.pathsep.join(filter(None, libraries))
     arguments = {
-        "name": extension.name,
-        "sources": [str(path) for path in _united(extension.sources, folder)],
+        "name": name,
+        "sources": [str(path) for path in _united(sources, folder)],
         "extra_cflags": ["-O3"],
         "extra_cuda_cflags": ["-O3", "--use_fast_math"],
-        "extra_include_paths": [str(path) for path in (*extension.include, *_headers(toolkit))],
+        "extra_include_paths": [str(p) for p in (own, own / "third_party" / "glm", *_headers(toolkit))],
         "build_directory": str(folder),
         "verbose": True,
     }
     (folder / "lock").unlink(missing_ok=True)  # older versions of torch would wait forever for its holder
-    log, start, library = folder / "build.log", time.monotonic(), folder / f"{extension.name}.so"
+    log, start, library = folder / "build.log", time.monotonic(), folder / f"{name}.so"
     say(
-        f"Building {extension.name} for compute capability {arch} with {environment['MAX_JOBS']} jobs: once, "
-        f"for some minutes. Interrupted, it goes on next time. Log: {log}"
+        f"Building {name} for compute capability {arch} with {jobs} jobs: once, for some minutes. "
+        f"Interrupted, it goes on next time. Log: {log}"
     )
     command = [sys.executable, "-c", _COMPILE, json.dumps(arguments)]
     with log.open("w") as output:
@@ -221,9 +194,9 @@ def _compile(extension: Extension, folder: Path, arch: str) -> Path:
         reason = next(named, lines[-1])[:300]
         if status < 0:
             reason = f"signal {-status} stopped it, perhaps for lack of memory (MAX_JOBS=1 takes less)"
-        raise UserError(f"building {extension.name} failed: {reason} (the whole output: {log})")
+        raise UserError(f"building {name} failed: {reason} (the whole output: {log})")
     # This file also marks a complete build.
-    (folder / "done").write_text(f"{time.monotonic() - start:.0f} s with {environment['MAX_JOBS']} job(s)\n")
+    (folder / "done").write_text(f"{time.monotonic() - start:.0f} s with {jobs} job(s)\n")
     return library
 
 
@@ -248,9 +221,9 @@ def _united(sources: Sequence[Path], folder: Path) -> list[Path]:
     return [*units, *(path for path in sources if path.suffix != ".cu")]
 
 
-def load(library: Path, name: str = "gsplat_cuda") -> ModuleType:
+def load(library: Path) -> ModuleType:
     """Import a built library."""
-    spec = importlib.util.spec_from_file_location(name, library)
+    spec = importlib.util.spec_from_file_location(library.stem, library)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -261,7 +234,6 @@ def make_ready() -> None:
     """Load gsplat's kernels for this machine's GPUs, building them first if necessary. Raises UserError that
     says what is missing and how to get it."""
     import gsplat
-    import torch
 
     with contextlib.suppress(ImportError):
         from gsplat import csrc  # noqa: F401  in a wheel that has them, or loaded before
@@ -271,12 +243,12 @@ def make_ready() -> None:
         raise UserError("gsplat's kernels run on NVIDIA's GPUs, and this one is AMD's")
     arch = device_arch()
     folder = build_folder(arch)
-    library = built(folder) or build(gsplat_extension(), folder, arch)
+    library = built(folder) or build(folder, arch)
     try:
         kernels = load(library)
     except ImportError:  # the library is damaged
         library.unlink()
-        kernels = load(build(gsplat_extension(), folder, arch))
+        kernels = load(build(folder, arch))
     gsplat.csrc = sys.modules["gsplat.csrc"] = kernels
 
 

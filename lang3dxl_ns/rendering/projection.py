@@ -14,12 +14,10 @@ from lang3dxl_ns.scene.camera import Camera
 def project(
     gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool
 ) -> Ellipses:
-    """Project Gaussians to the screen (EWA splatting, Zwicker et al. 2001, with gsplat's conventions).
-
-    `near` is in world units. `eps2d` is the variance added to both screen axes, in pixels². `antialiased`
-    scales the opacity by the square root of the ratio of the determinants without and with `eps2d`
-    (Mip-Splatting, Yu et al. 2024).
-    """
+    """Project Gaussians to the screen (EWA splatting, Zwicker et al. 2001, with gsplat's conventions). `near`
+    is in world units. `eps2d` is the variance added to both screen axes, in pixels². `antialiased` scales the
+    opacity by the square root of the ratio of the determinants without and with `eps2d` (Mip-Splatting, Yu et
+    al. 2024)."""
     view = camera.view_matrix.to(gaussians.means)
     intrinsics = camera.intrinsics.to(gaussians.means)
     points = gaussians.means @ view[:3, :3].T + view[:3, 3]

@@ -11,15 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 import lang3dxl_ns.rendering.gsplat_build as gsplat_build
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.precision import in_full_precision
 from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Ellipses, Gaussians, Raster
-from lang3dxl_ns.rendering.gsplat_backend import composite_with_gsplat
 from lang3dxl_ns.rendering.projection import project
 from lang3dxl_ns.rendering.torch_rasterizer import Compositing
 from lang3dxl_ns.scene.camera import Camera
 
 Backend = Literal["auto", "torch", "numba", "gsplat"]
+_STRATEGY_KEYS = ("width", "height", "n_cameras", "radii", "gaussian_ids", "means2d")
 
 
 @in_full_precision
@@ -33,7 +34,6 @@ def rasterize(
     detach_features: bool = True,
     render_depth: bool = False,
     antialiased: bool = False,
-    absgrad: bool = False,
     near: float = 0.01,
     eps2d: float = 0.3,
     backend: Backend = "auto",
@@ -53,7 +53,6 @@ def rasterize(
         detach_features: the features' gradient reaches only `features`, not geometry or opacity.
         render_depth: also render the expected depth, world units.
         antialiased: dim small Gaussians by what the screen-space blur adds to their area.
-        absgrad: the backward pass sets `info["means2d"].absgrad` for gsplat's densification.
         near: Gaussians with centers nearer than this are left out, world units.
         eps2d: variance added on screen, pixels².
         backend: "auto" uses gsplat for tensors on a GPU, or torch if gsplat is not available. On the CPU it
@@ -77,7 +76,7 @@ def rasterize(
         gsplat_build.make_ready()
     # gsplat's kernels cannot be launched on empty input.
     by_gsplat = backend == "gsplat" and len(channels) > 0
-    composite = composite_with_gsplat if by_gsplat else partial(_composite, backend)
+    composite = _composite_with_gsplat if by_gsplat else partial(_composite, backend)
     if by_gsplat and not torch.is_grad_enabled():
         detach_features = False  # spares a second pass
     gaussians, channels, features = _without_broken(gaussians, channels, features)
@@ -90,7 +89,7 @@ def rasterize(
         sizes.append(features.shape[1])
     maps, detached_map, alpha, info = composite(
         gaussians.moved(-place), camera, attached, detached,
-        depth=render_depth, antialiased=antialiased, absgrad=absgrad, near=near, eps2d=eps2d,
+        depth=render_depth, antialiased=antialiased, near=near, eps2d=eps2d,
     )  # fmt: skip
     image, *others = maps.split([*sizes, 1] if render_depth else sizes, dim=2)
     depth = others.pop() / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None
@@ -127,16 +126,6 @@ def _without_broken(
     return Gaussians(*map(clean, vars(g).values())), clean(channels), features
 
 
-def _kernels(backend: Backend) -> tuple[Callable[..., Ellipses], type[torch.autograd.Function]]:
-    """Return the functions that project and composite."""
-    if backend == "numba":
-        from lang3dxl_ns.rendering.fused_compositing import FusedCompositing
-        from lang3dxl_ns.rendering.fused_projection import project as fused_project
-
-        return fused_project, FusedCompositing
-    return project, Compositing
-
-
 def _check_sizes(
     gaussians: Gaussians, channels: Tensor, background: Tensor | None, features: Tensor | None
 ) -> None:
@@ -157,28 +146,58 @@ def _composite(
     camera: Camera,
     attached: Float[Tensor, "n c"],
     detached: Float[Tensor, "n d"],
-    *,
     depth: bool,
     antialiased: bool,
-    absgrad: bool,
     near: float,
     eps2d: float,
 ) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
     """Composite channels over black: those with a gradient to the geometry (then the depth, if requested),
     those without, and alpha, [h, w, …] each. The last value is `Raster.info`."""
-    to_screen, compositing = _kernels(backend)
+    to_screen: Callable[..., Ellipses] = project
+    compositing: type[torch.autograd.Function] = Compositing
+    if backend == "numba":
+        from lang3dxl_ns.rendering.fused_compositing import FusedCompositing
+        from lang3dxl_ns.rendering.fused_projection import project as fused_project
+
+        to_screen, compositing = fused_project, FusedCompositing
     ellipses = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
     maps, detached_map, alpha = compositing.apply(
         ellipses.means2d, ellipses.conics, ellipses.opacities,
         torch.cat([attached, ellipses.depths[:, None]], dim=1) if depth else attached, detached,
-        ellipses.variances, ellipses.depths, camera.width, camera.height, absgrad,
+        ellipses.variances, ellipses.depths, camera.width, camera.height,
     )  # fmt: skip
-    info = {
-        "width": camera.width,
-        "height": camera.height,
-        "n_cameras": 1,
-        "radii": ellipses.radii,
-        "gaussian_ids": None,
-        "means2d": ellipses.means2d,
-    }
-    return maps, detached_map, alpha, info
+    info = {"width": camera.width, "height": camera.height, "n_cameras": 1, "gaussian_ids": None}
+    return maps, detached_map, alpha, {**info, "radii": ellipses.radii, "means2d": ellipses.means2d}
+
+
+def _composite_with_gsplat(
+    gaussians: Gaussians,
+    camera: Camera,
+    attached: Float[Tensor, "n c"],
+    detached: Float[Tensor, "n d"],
+    depth: bool,
+    antialiased: bool,
+    near: float,
+    eps2d: float,
+) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
+    """Composite like `_composite` by gsplat's CUDA kernels, in float32; the detached channels take a second
+    pass."""
+    from gsplat import rasterization
+
+    def render(g: Gaussians, camera: Camera, channels: Tensor, mode: str) -> tuple[Tensor, Tensor, dict]:
+        device = g.means.device
+        maps, alpha, info = rasterization(
+            means=g.means.float(), quats=g.quats.float(), scales=g.scales.float(),
+            opacities=g.opacities.float(), colors=channels.float(),
+            viewmats=to_device(camera.view_matrix, device).float()[None],
+            Ks=to_device(camera.intrinsics, device).float()[None], width=camera.width, height=camera.height,
+            packed=False, near_plane=near, eps2d=eps2d, render_mode=mode,
+            rasterize_mode="antialiased" if antialiased else "classic",
+        )  # fmt: skip
+        return maps[0], alpha[0], info
+
+    maps, alpha, info = render(gaussians, camera, attached, "RGB+D" if depth else "RGB")
+    detached_map = maps[..., :0]
+    if detached.shape[1]:
+        detached_map, _, _ = render(gaussians.detach(), camera.detach(), detached, "RGB")
+    return maps, detached_map, alpha, {key: info[key] for key in _STRATEGY_KEYS}

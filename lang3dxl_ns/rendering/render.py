@@ -37,11 +37,9 @@ def render(
     background: Float[Tensor, "3"] | None = None,
     backend: Backend = "auto",
 ) -> Rendering:
-    """Render Gaussians in their own colors, and composite further `channels`, one row per Gaussian.
-
-    The background is 0…1, by default black. This is safe to call from any thread. Raises ValueError like
-    `rasterize`.
-    """
+    """Render Gaussians in their own colors over a background (0…1, by default black), and composite further
+    `channels`, one row per Gaussian. This is safe to call from any thread. Raises ValueError like
+    `rasterize`."""
     raster = rasterize(
         splats.gaussians.seen_from(camera), camera, splats.colors(camera.position),
         None if background is None else background.to(splats.means), features=channels, render_depth=True,

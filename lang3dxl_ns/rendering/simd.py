@@ -7,6 +7,7 @@ vector type needs no such proof. The kernels are tuned for float32; float64 uses
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -56,8 +57,10 @@ def _spread(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
     return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), zeros)
 
 
-def _constant(like: ir.Value, value: float) -> ir.Value:
-    return ir.Constant(like.type, [value] * LANES)
+def _broadcast(*kinds: Any) -> tuple[VectorType, list[types.Type]]:
+    """Return the vector type among some operands, and all their types, numbers cast to the vector's."""
+    vector = next(kind for kind in kinds if isinstance(kind, VectorType))
+    return vector, [kind if isinstance(kind, VectorType) else vector.dtype for kind in kinds]
 
 
 def _call(builder: ir.IRBuilder, name: str, *arguments: ir.Value) -> ir.Value:
@@ -77,11 +80,9 @@ def _register(symbol: Any, comparison: bool, emit: Any) -> None:
         key = symbol
 
         def generic(self, args, kws):
-            vectors = [arg for arg in args if isinstance(arg, VectorType)]
-            if len(args) != 2 or not vectors:
+            if len(args) != 2 or not any(isinstance(arg, VectorType) for arg in args):
                 return None
-            kind = vectors[0]
-            operands = [arg if isinstance(arg, VectorType) else kind.dtype for arg in args]
+            kind, operands = _broadcast(*args)
             return signature(VectorType(types.boolean) if comparison else kind, *operands)
 
     infer_global(symbol)(Template)
@@ -154,20 +155,25 @@ def entry(typing_context, array, place):
     return array.dtype(array, types.intp), emit
 
 
+def _column(context: Any, builder: ir.IRBuilder, kind: Any, args: Any) -> Iterator[tuple[ir.Value, ir.Value]]:
+    """Yield each lane's number, and the pointer to its entry in a matrix, from a row and a column on."""
+    matrix = cgutils.create_struct_proxy(kind)(context, builder, value=args[0])
+    width = cgutils.unpack_tuple(builder, matrix.shape)[1]
+    place = builder.add(builder.mul(args[1], width), args[2])
+    for lane in range(LANES):
+        yield ir.Constant(ir.IntType(32), lane), builder.gep(matrix.data, [place])
+        place = builder.add(place, width)
+
+
 @intrinsic
 def load_column(typing_context, matrix, row, column):
     """Load `matrix[row : row + 16, column]` of a contiguous matrix."""
     kind = VectorType(matrix.dtype)
 
     def emit(context, builder, sig, args):
-        source = cgutils.create_struct_proxy(matrix)(context, builder, value=args[0])
-        width = cgutils.unpack_tuple(builder, source.shape)[1]
-        place = builder.add(builder.mul(args[1], width), args[2])
         found = ir.Constant(context.get_value_type(kind), ir.Undefined)
-        for lane in range(LANES):
-            entry = builder.load(builder.gep(source.data, [place]))
-            found = builder.insert_element(found, entry, ir.Constant(ir.IntType(32), lane))
-            place = builder.add(place, width)
+        for lane, pointer in _column(context, builder, matrix, args):
+            found = builder.insert_element(found, builder.load(pointer), lane)
         return found
 
     return kind(matrix, types.intp, types.intp), emit
@@ -178,13 +184,8 @@ def store_column(typing_context, matrix, row, column, value):
     """Store `matrix[row : row + 16, column] = value` in a contiguous matrix."""
 
     def emit(context, builder, sig, args):
-        target = cgutils.create_struct_proxy(matrix)(context, builder, value=args[0])
-        width = cgutils.unpack_tuple(builder, target.shape)[1]
-        place = builder.add(builder.mul(args[1], width), args[2])
-        for lane in range(LANES):
-            entry = builder.extract_element(args[3], ir.Constant(ir.IntType(32), lane))
-            builder.store(entry, builder.gep(target.data, [place]))
-            place = builder.add(place, width)
+        for lane, pointer in _column(context, builder, matrix, args):
+            builder.store(builder.extract_element(args[3], lane), pointer)
         return context.get_dummy_value()
 
     return types.void(matrix, types.intp, types.intp, value), emit
@@ -203,15 +204,13 @@ def _unary(name: str, doc: str) -> Any:
 
 
 sqrt = _unary("llvm.sqrt", "Square root of every lane.")
-absolute = _unary("llvm.fabs", "Absolute value of every lane.")
 ceil = _unary("llvm.ceil", "Every lane rounded up.")
 
 
 def _choice(sign: str, doc: str) -> Any:
     @intrinsic
     def function(typing_context, x, y):
-        kind = x if isinstance(x, VectorType) else y
-        operands = [arg if isinstance(arg, VectorType) else kind.dtype for arg in (x, y)]
+        kind, operands = _broadcast(x, y)
 
         def emit(context, builder, sig, args):
             first, second = (_spread(builder, arg) for arg in args)
@@ -230,8 +229,7 @@ maximum = _choice(">", "The larger of two, lane by lane; the second where one is
 @intrinsic
 def where(typing_context, condition, x, y):
     """Choose `x` in the lanes where the condition holds, else `y`. Scalars are broadcast."""
-    kind = x if isinstance(x, VectorType) else y
-    operands = [arg if isinstance(arg, VectorType) else kind.dtype for arg in (x, y)]
+    kind, operands = _broadcast(x, y)
 
     def emit(context, builder, sig, args):
         first, second = (_spread(builder, arg) for arg in args[1:])
@@ -249,7 +247,7 @@ def exp2(typing_context, x):
         exponent_at = 23 if bits == 32 else 52
         whole = _call(builder, "llvm.rint", args[0])
         rest = builder.fsub(args[0], whole)
-        *lower, value = (_constant(rest, coefficient) for coefficient in _EXP2[bits])
+        *lower, value = (ir.Constant(rest.type, [coefficient] * LANES) for coefficient in _EXP2[bits])
         for coefficient in reversed(lower):
             value = _call(builder, "llvm.fmuladd", value, rest, coefficient)
         integers = ir.VectorType(ir.IntType(bits), LANES)

@@ -56,12 +56,10 @@ def spherical_harmonics(
     directions: Float[Tensor, "n 3"],
     coefficients: Float[Tensor, "n k 3"],
 ) -> Float[Tensor, "n 3"]:
-    """Evaluate one color per Gaussian from its coefficients; the caller adds 0.5 and clamps.
-
-    Directions (camera center to Gaussian, world frame) may have any length. Bands above `degree` are ignored.
-    Signs and order are those of Kerbl et al. 2023 (3D Gaussian Splatting). Raises ValueError for a degree
-    that is not 0…3, or needs more coefficients than there are.
-    """
+    """Evaluate one color per Gaussian from its coefficients; the caller adds 0.5 and clamps. Directions
+    (camera center to Gaussian, world frame) may have any length. Bands above `degree` are ignored. Signs and
+    order are those of Kerbl et al. 2023 (3D Gaussian Splatting). Raises ValueError for a degree that is not
+    0…3, or needs more coefficients than there are."""
     count = (degree + 1) ** 2
     if not 0 <= degree <= 3 or count > coefficients.shape[1]:
         raise ValueError(

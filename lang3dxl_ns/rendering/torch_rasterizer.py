@@ -36,8 +36,7 @@ class Compositing(torch.autograd.Function):
 
     The maps are [h, w, …] each. The rules are gsplat's: alpha is at most 0.999 and skipped below 1/255, and a
     pixel stops before its transmittance reaches 1e-4. The gradient of the detached image reaches only
-    `detached`. With `absgrad`, the backward pass sets `means2d.absgrad`, the sums over pixels of the absolute
-    gradients (AbsGS, Ye et al. 2024).
+    `detached`.
     """
 
     @staticmethod
@@ -52,7 +51,6 @@ class Compositing(torch.autograd.Function):
         depths: Tensor,
         width: int,
         height: int,
-        absgrad: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
         parts = (means2d[0], conics[:, :2], variances[:, 1:], opacities[:, None], detached, channels)
         boxes, order = _visible(means2d[0], variances, depths, opacities, width, height)
@@ -66,13 +64,13 @@ class Compositing(torch.autograd.Function):
         passing = table.new_ones(tiles, TILE * TILE)
         chunks = []
         for chunk in _chunks(boxes, passing, columns):
-            found, behind, _ = _composite(table[chunk.ranks], chunk, columns, sizes[0])
+            found, behind = _composite(table[chunk.ranks], chunk, columns, sizes[0])
             maps[chunk.tiles] += found
             passing[chunk.tiles] = behind
             chunks.append(chunk)
         ctx.save_for_backward(means2d, table, order)
         ctx.set_materialize_grads(False)
-        ctx.chunks, ctx.columns, ctx.size, ctx.absgrad = chunks, columns, (height, width), absgrad
+        ctx.chunks, ctx.columns, ctx.size = chunks, columns, (height, width)
         ctx.sizes, ctx.widths = sizes, [part.shape[1] for part in parts]
         image = maps.view(-1, columns, TILE, TILE, sum(sizes)).transpose(1, 2).flatten(2, 3).flatten(0, 1)
         features, image, alpha = (part.contiguous() for part in image[:height, :width].split(sizes, dim=2))
@@ -83,33 +81,24 @@ class Compositing(torch.autograd.Function):
     def backward(ctx: Any, image: Tensor | None, features: Tensor | None, alpha: Tensor | None) -> Any:  # type: ignore[override]
         means2d, table, order = ctx.saved_tensors
         upstream = _in_tiles((features, image, alpha), ctx.sizes, table, ctx.columns, ctx.size)
-        g_table, absolute = torch.zeros_like(table), table.new_zeros(len(table), 2)
-        g_passing = table.new_zeros(upstream.shape[:2])
+        g_table, g_passing = torch.zeros_like(table), table.new_zeros(upstream.shape[:2])
         for chunk in reversed(ctx.chunks):
             rows = table[chunk.ranks].requires_grad_()
             chunk = chunk._replace(before=chunk.before.detach().requires_grad_())
             with torch.enable_grad():
-                found, behind, offsets = _composite(rows, chunk, ctx.columns, ctx.sizes[0])
-            g_rows, g_before, *g_offsets = torch.autograd.grad(
-                (found, behind),
-                (rows, chunk.before, *(offsets if ctx.absgrad else ())),
-                (upstream[chunk.tiles], g_passing[chunk.tiles]),
-            )
+                found = _composite(rows, chunk, ctx.columns, ctx.sizes[0])
+            slopes = upstream[chunk.tiles], g_passing[chunk.tiles]
+            g_rows, g_before = torch.autograd.grad(found, (rows, chunk.before), slopes)
             g_passing[chunk.tiles] = g_before
             g_table.index_add_(0, chunk.ranks.view(-1), g_rows.flatten(0, 1))
-            if ctx.absgrad:
-                sums = torch.stack([slope.abs().sum(2) for slope in g_offsets], dim=2)
-                absolute.index_add_(0, chunk.ranks.view(-1), sums.flatten(0, 1))
 
         def scattered(values: Tensor) -> Tensor:
             return values.new_zeros(means2d.shape[1], values.shape[1]).index_copy_(0, order, values[:-1])
 
-        if ctx.absgrad:
-            means2d.absgrad = scattered(absolute)[None]
         gradients = (scattered(part) for part in g_table[:, :-1].split(ctx.widths, dim=1))
         means, conics, variances, opacities, detached, channels = gradients
         conics, variances = F.pad(conics, (0, 1)), F.pad(variances, (1, 0))  # unused by `forward`
-        return means[None], conics, opacities[:, 0], channels, detached, variances, *[None] * 4
+        return means[None], conics, opacities[:, 0], channels, detached, variances, *[None] * 3
 
 
 class _Chunk(NamedTuple):
@@ -124,14 +113,10 @@ class _Chunk(NamedTuple):
 
 def _composite(
     rows: Float[Tensor, "b k columns"], chunk: _Chunk, columns: int, detached: int
-) -> tuple[Float[Tensor, "b pixels c"], Float[Tensor, "b pixels"], tuple[Tensor, Tensor]]:
-    """Composite a chunk onto its tiles' maps.
-
-    Returns what it adds, the transmittance behind it, and the pixels' offsets from the Gaussians, [b, k,
-    pixels] each. In the first `detached` maps, only the channels have a gradient. The quadratic form is
-    steepness·(dx + shear·dy)² + dy²/variance. Unlike the conic itself, it stays accurate in float32 far from
-    the center of a needle.
-    """
+) -> tuple[Float[Tensor, "b pixels c"], Float[Tensor, "b pixels"]]:
+    """Composite a chunk onto its tiles' maps, and return what it adds and the transmittance behind it. In the
+    first `detached` maps, only the channels have a gradient. The quadratic form is steepness·(dx + shear·dy)²
+    + dy²/variance. Unlike the conic itself, it stays accurate in float32 far from the center of a needle."""
     x, y, a, b, variance, opacity = rows[..., :6, None].unbind(2)
     pixel = torch.arange(TILE * TILE, device=rows.device)
     dx = (chunk.tiles % columns * TILE)[:, None, None] + pixel % TILE + 0.5 - x
@@ -145,7 +130,7 @@ def _composite(
     values = rows[..., 6:]
     maps = [weights.detach() @ values[..., :detached], weights @ values[..., detached:]]
     after = torch.where(after[:, -1] > TRANSMITTANCE_MIN, after[:, -1], 0.0)
-    return torch.cat(maps, dim=2), after, (dx, dy)
+    return torch.cat(maps, dim=2), after
 
 
 def _visible(

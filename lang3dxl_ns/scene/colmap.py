@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import signal
+import struct
+import threading
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
-import numpy as np
+import numpy as np  # before pycolmap: in the other order, Pillow's PNG writer aborts the process
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
 from lang3dxl_ns.common.checks import FARTHEST
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError, is_plain
+from lang3dxl_ns.common.files import open_file
 from lang3dxl_ns.scene.camera import HasLens, Lens, check_pose
-from lang3dxl_ns.scene.colmap_check import check_binary_model
-from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
 
 if TYPE_CHECKING:
     import pycolmap
@@ -61,6 +65,17 @@ class Reconstruction:
     colors: UInt8[Array, "m 3"]
 
 
+def load_pycolmap() -> ModuleType:
+    """Import pycolmap, and restore the Python SIGTERM handler that its import replaces. pycolmap's handler
+    prints a stack trace and kills the process."""
+    handler = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    if threading.current_thread() is threading.main_thread():  # only the main thread may handle signals
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if handler is None else handler)
+    return pycolmap
+
+
 def read_reconstruction(model_dir: Path) -> Reconstruction:
     """Read a COLMAP model (.bin or .txt) with its tracks. Raises UserError for a missing, damaged or empty
     one, and for a camera model that OpenCV can't undistort."""
@@ -87,17 +102,17 @@ def read_reconstruction(model_dir: Path) -> Reconstruction:
 
 def _name(number: int, image: pycolmap.Image) -> str | None:
     """Return a photo's name; if it can't be used, log the reason and return None."""
+    left_out = "of the COLMAP model is left out: its name"
     try:
         if is_plain(image.name):
             return image.name
-        say(f"photo {image.name} of the COLMAP model is left out: its name has control characters; rename it")
-        return None
+        say(f"photo {image.name} {left_out} has control characters; rename it")
     except UnicodeDecodeError:
         say(
-            f"photo {number} of the COLMAP model is left out: its name is not UTF-8; rename its file (convmv "
-            "-f latin1 -t utf8 --notest images/*) and make the model again"
+            f"photo {number} {left_out} is not UTF-8; rename its file (convmv -f latin1 -t utf8 --notest "
+            "images/*) and make the model again"
         )
-        return None
+    return None
 
 
 def photos_in_model(model_dir: Path) -> int:
@@ -166,3 +181,79 @@ def _distortion(name: str, camera: pycolmap.Camera) -> tuple[tuple[float, ...], 
         f"photo {name} has a {model} camera, which can't be undistorted here: "
         "run colmap image_undistorter and use its images and model"
     )
+
+
+# ── binary files ────────────────────────────────────────────────────────────────────────────────────────────
+# pycolmap trusts every length in them, so that a damaged one can make it allocate all memory or read for
+# hours. The layout follows COLMAP's documentation of its output format; numbers are little endian.
+
+_POSE, _KEYPOINT, _OBSERVATION, _SENSOR = 7 * 8, 3 * 8, 2 * 4, 2 * 4
+
+
+def check_binary_model(folder: Path) -> None:
+    """Walk through the records of the binary files present. Raises UserError if a file ends early or
+    continues after its last record."""
+    for name, step in _STEPS.items():
+        path = folder / f"{name}.bin"
+        if not path.is_file():
+            continue
+        with open_file(path) as file:
+            content = file.read()
+        try:
+            count, place = _number("<Q", content, 0), 8
+            for _ in range(count):
+                place = step(content, place)
+                if place > len(content):
+                    break
+        except (struct.error, ValueError, RuntimeError):
+            place = -1
+        if place != len(content):
+            raise UserError(
+                f"the COLMAP model in {folder} is damaged, copy or make it again: the records of "
+                f"{path.name} do not fill its {len(content)} bytes"
+            )
+
+
+@lru_cache
+def _parameters(model: int) -> int:
+    """Return the number of parameters of a camera model."""
+    pycolmap = load_pycolmap()
+    return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 2, 2).params)
+
+
+def _camera(content: bytes, place: int) -> int:
+    return place + 24 + 8 * _parameters(_number("<i", content, place + 4))
+
+
+def _image(content: bytes, place: int) -> int:
+    end_of_name = content.index(b"\0", place + 4 + _POSE + 4)
+    return end_of_name + 1 + 8 + _KEYPOINT * _number("<Q", content, end_of_name + 1)
+
+
+def _point(content: bytes, place: int) -> int:
+    tracked = place + 8 + 3 * 8 + 3 + 8
+    return tracked + 8 + _OBSERVATION * _number("<Q", content, tracked)
+
+
+def _rig(content: bytes, place: int) -> int:
+    sensors, place = _number("<I", content, place + 4), place + 8
+    if sensors:
+        place += _SENSOR  # the reference sensor
+    for _ in range(sensors - 1):
+        if place > len(content):
+            break
+        has_pose = _number("<B", content, place + _SENSOR)
+        place += _SENSOR + 1 + _POSE * bool(has_pose)
+    return place
+
+
+def _frame(content: bytes, place: int) -> int:
+    numbers = place + 8 + _POSE
+    return numbers + 4 + (_SENSOR + 8) * _number("<I", content, numbers)
+
+
+def _number(form: str, content: bytes, place: int) -> int:
+    return struct.unpack_from(form, content, place)[0]
+
+
+_STEPS = {"cameras": _camera, "images": _image, "points3D": _point, "rigs": _rig, "frames": _frame}

@@ -14,12 +14,10 @@ _LONGEST_NAME = 255
 
 
 def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
-    """Return the path in `folder` of a file that a model or a list names; sub-folders are allowed.
-
-    Models come from other people, so a name must not lead out of the folder, be it through `..`, as an
-    absolute path, or by a symbolic link (unless `follow_links`). The folder itself may be a link. Raises
-    UserError for such a name, and for one that is too long.
-    """
+    """Return the path in `folder` of a file that a model or a list names; sub-folders are allowed. Models
+    come from other people, so a name must not lead out of the folder, be it through `..`, as an absolute
+    path, or by a symbolic link (unless `follow_links`). The folder itself may be a link. Raises UserError for
+    such a name, and for one that is too long."""
     path = folder / name
     if not name or "\0" in name or os.path.isabs(name) or ".." in Path(name).parts:
         raise UserError(f"{name!r} leads out of {folder}: names are relative to that folder, without ..")

@@ -22,10 +22,9 @@ Descriptors = Callable[[str], UInt8[Array, "n 128"]]
 
 
 def pairs_to_match(names: Sequence[str], descriptors: Descriptors) -> list[tuple[str, str]]:
-    """List the pairs of photos that may overlap: all of them for up to `EXHAUSTIVE` photos.
-
-    For more photos, the pairs are those of `similar_pairs`, and neighbors in name order, which is the order
-    of a video or a walk."""
+    """List the pairs of photos that may overlap: all of them for up to `EXHAUSTIVE` photos. For more photos,
+    the pairs are those of `similar_pairs`, and neighbors in name order, which is the order of a video or a
+    walk."""
     if len(names) <= EXHAUSTIVE:
         return list(combinations(names, 2))
     found = set(similar_pairs(names, descriptors, NEIGHBORS))

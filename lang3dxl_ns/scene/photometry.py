@@ -25,15 +25,9 @@ class Photometry:
 
     spread: float
     """Standard deviation of the photos' exposures and tints (per channel); 0 if they agree, 0.7 is a stop."""
-    residual: float
-    """Robust deviation of single observations after removing each photo's exposure and tint."""
     view_dependence: float
     """Share of the residuals' variance, 0…1, that a linear function of the viewing direction explains beyond
     chance. Highlights and sheen raise it."""
-    photos: int
-    """Number of photos used."""
-    points: int
-    """Number of points used."""
 
 
 def measure_photometry(
@@ -83,33 +77,28 @@ def _fit(
     """Alternate between the points' means and the photos' medians until both converge."""
     point, photo = (np.unique(numbers, return_inverse=True)[1] for numbers in (point, photo))
     count, groups = np.bincount(point).astype(float), _grouped(photo)
+
+    def means() -> Float[Array, "n 3"]:
+        values = color - offset[photo]
+        return np.stack([np.bincount(point, values[:, c]) / count for c in range(3)], axis=1)
+
     offset = np.zeros((len(groups), 3))
     for _ in range(50):
-        mean = _point_means(point, color - offset[photo], count)
+        mean = means()
         new = np.stack([np.median(color[group] - mean[point[group]], axis=0) for group in groups])
         new -= new.mean(axis=0)
         change = np.abs(new - offset).max()
         offset = new
         if change < 1e-4:
             break
-    residual = color - offset[photo] - _point_means(point, color - offset[photo], count)[point]
-    return Photometry(
-        spread=float(np.sqrt((offset**2).mean())),
-        residual=float(1.4826 * np.median(np.abs(residual))),
-        view_dependence=_explained_by_direction(point, residual, ray),
-        photos=len(groups),
-        points=len(count),
-    )
+    residual = color - offset[photo] - means()[point]
+    return Photometry(float(np.sqrt((offset**2).mean())), _explained_by_direction(point, residual, ray))
 
 
 def _grouped(numbers: Int[Array, " m"]) -> list[Int[Array, " k"]]:
     """Return, for every number from 0 on, the rows that hold it."""
     order = np.argsort(numbers, kind="stable")
     return np.split(order, np.cumsum(np.bincount(numbers))[:-1])
-
-
-def _point_means(point: Int[Array, " m"], values: Float[Array, "m 3"], count: Float[Array, " n"]) -> Array:
-    return np.stack([np.bincount(point, values[:, c]) / count for c in range(3)], axis=1)
 
 
 def _explained_by_direction(

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
-from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+from lang3dxl_ns.scene.colmap import load_pycolmap
 
 if TYPE_CHECKING:
     import pycolmap
@@ -45,15 +45,20 @@ def doubtful_placements(
     """Find photos that are doubtfully placed, with reasons; rotations: world → camera in the model. Either
     more matches contradict a photo's placement than support it, or only one other photo supports it."""
     reasons: dict[int, str] = {}
-    judged = [(pair, _apart(rotations, pair) > APART) for pair in pairs]
+
+    def contradicts(pair: MatchedPair) -> bool:
+        between = rotations[pair.first] @ rotations[pair.second].T @ pair.turn
+        return bool(np.degrees(Rotation.from_matrix(between).magnitude()) > APART)
+
+    judged = [(pair, contradicts(pair)) for pair in pairs]
     while True:  # the most contradicted first, since its pairs would accuse its neighbors
         supporting, contradicting, supporters = Counter[int](), Counter[int](), Counter[int]()
-        for pair, contradicts in judged:
+        for pair, contradicted in judged:
             if pair.first in reasons or pair.second in reasons:
                 continue
             for photo in (pair.first, pair.second):
-                (contradicting if contradicts else supporting)[photo] += pair.matches
-                supporters[photo] += not contradicts
+                (contradicting if contradicted else supporting)[photo] += pair.matches
+                supporters[photo] += not contradicted
         accused = contradicting - supporting
         if not accused:
             break
@@ -61,12 +66,6 @@ def doubtful_placements(
         reasons[worst] = "most of its matches are with photos that stand elsewhere"
     lonely = [p for p in rotations if p not in reasons and supporters[p] < 2 and len(rotations) > 3]
     return reasons | dict.fromkeys(lonely, "only one other photo supports it")
-
-
-def _apart(rotations: Mapping[int, Float[Array, "3 3"]], pair: MatchedPair) -> float:
-    """Compute the angle in degrees between the measured rotation of a pair and the model's."""
-    between = rotations[pair.first] @ rotations[pair.second].T @ pair.turn
-    return float(np.degrees(Rotation.from_matrix(between).magnitude()))
 
 
 def matched_pairs(database: pycolmap.Database, model: pycolmap.Reconstruction) -> list[MatchedPair]:

@@ -27,12 +27,18 @@ from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
-from lang3dxl_ns.scene.load_pycolmap import load_pycolmap
+from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
-from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.photo_folder import (
+    PhotoFolder,
+    extract_frames,
+    find_photos,
+    is_video,
+    readable,
+    shared_cameras,
+)
 from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruction import ReconstructionReport, ReconstructionSettings
-from lang3dxl_ns.scene.video import extract_frames, is_video
 
 if TYPE_CHECKING:
     import pycolmap
@@ -125,9 +131,8 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
             left_out[name] = "its name is not plain text: rename the file"
             continue
         content = hashlib.blake2b((photos.folder / name).read_bytes()).digest()
-        if content in first:
+        if first.setdefault(content, name) != name:
             left_out[name] = f"the same file as {first[content]}"
-        first.setdefault(content, name)
     if len(first) >= 2:
         return PhotoFolder(photos.folder, tuple(first.values())), left_out
     if not photos.names:
@@ -222,11 +227,8 @@ def _match(database: Path, names: Sequence[str]) -> None:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
         pairs = pairs_to_match(known, lambda name: db.read_descriptors(ids[name]).data)
-        missing = [
-            (a, b)
-            for a, b in pairs
-            if not (db.exists_matches(ids[a], ids[b]) and db.exists_two_view_geometry(ids[a], ids[b]))
-        ]
+        has = db.exists_matches, db.exists_two_view_geometry
+        missing = [(a, b) for a, b in pairs if not all(there(ids[a], ids[b]) for there in has)]
     options, listed = (
         pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8)),
         database.with_name("pairs.txt"),
@@ -281,13 +283,13 @@ def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:
 
 def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:
     """Count, for every photo, its features and the photos with which it has verified matches."""
-    with load_pycolmap().Database.open(database) as db:
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database) as db:
         images = {image.image_id: image.name for image in db.read_all_images()}
         features = {name: db.num_keypoints_for_image(number) for number, name in images.items()}
         pairs, inliers = db.read_two_view_geometry_num_inliers()
     matched = (pair for pair, count in zip(pairs, inliers, strict=True) if count >= LEAST_MATCHES)
-    to_images = load_pycolmap().pair_id_to_image_pair
-    return features, Counter(images[image] for pair in matched for image in to_images(pair))
+    return features, Counter(images[i] for pair in matched for i in pycolmap.pair_id_to_image_pair(pair))
 
 
 def _reasons(

@@ -6,6 +6,7 @@ import shutil
 import socket
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -143,14 +144,22 @@ def test_sizes_are_told_in_a_unit_that_shows_them():
 # ── a cluster that never answers ────────────────────────────────────────────────────────────────────────
 
 
-def test_a_job_that_never_ends_is_left_after_its_time():
-    forever = threading.Event()
-    with pytest.raises(TimeoutError, match="no answer within 0 s"):
-        workers._within(0.01, forever.wait)
+def test_an_attempt_to_connect_that_never_ends_is_left_after_its_time(monkeypatch):
+    forever, closed = threading.Event(), []
+    there = Workers(1, "ray", "there")
+
+    def ray(init):
+        return SimpleNamespace(init=init, shutdown=lambda: closed.append(init))
+
+    workers._connect(ray(lambda **_: None), there)
+    with pytest.raises(UserError, match=r"answers at there \('x'\): give --address"):
+        workers._connect(ray(lambda **_: {}["x"]), there)
+    assert len(closed) == 1
+    monkeypatch.setattr(workers, "PATIENCE_S", 0.01)
+    with pytest.raises(UserError, match="no answer within 0 s"):
+        workers._connect(ray(lambda **_: forever.wait()), there)
     forever.set()
-    with pytest.raises(KeyError):
-        workers._within(10, lambda: {}["x"])
-    workers._within(10, lambda: None)
+    assert len(closed) == 1
 
 
 def test_a_cluster_that_never_answers_is_one_line(monkeypatch, capsys):

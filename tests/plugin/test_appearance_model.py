@@ -9,7 +9,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.model import Lang3DXLModel
-from lang3dxl_ns.preparation.handover import SceneFacts
+from lang3dxl_ns.preparation.targets import SceneFacts
 
 USE = "pipeline__model__appearance__use"
 CODES = "pipeline__model__decoder__name"

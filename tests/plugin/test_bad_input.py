@@ -9,7 +9,7 @@ from PIL import Image
 from processes import Process
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.plain_errors import print_user_errors_plainly
+from lang3dxl_ns.plugin.pipeline import print_user_errors_plainly
 
 
 @pytest.fixture

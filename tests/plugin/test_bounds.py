@@ -5,7 +5,7 @@ import pytest
 import torch
 from conftest import make_trainer
 
-from lang3dxl_ns.components.bounds import FREE, LONGEST, NEEDLE, keep_in_bounds
+from lang3dxl_ns.components.initialization import FREE, LONGEST, NEEDLE, keep_in_bounds
 from lang3dxl_ns.query.read_splats import read_splats
 from lang3dxl_ns.query.splat_file import write_splats
 from lang3dxl_ns.rendering import Gaussians, rasterize

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from lang3dxl_ns.components.initialization import sphere_around
 from lang3dxl_ns.components.sky import OPACITY, Sky
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.rendering import Gaussians
-from lang3dxl_ns.scene.geometry import sphere_around
 
 COUNT = 200
 

@@ -182,8 +182,8 @@ def test_the_mask_bounds_every_semantic_loss_and_queries_can_read_it(train, scen
         scene, iterations=2, **{f"pipeline__datamanager__{name}": value for name, value in options.items()}
     )
     batch, model, outputs = first_batch(trainer)
-    datamanager = trainer.pipeline.datamanager
-    assert torch.equal(datamanager.foreground(batch["name"]), batch["mask"][..., 0])
+    photo = trainer.pipeline.datamanager.photos[batch["name"]]
+    assert torch.equal(photo.read_mask(), batch["mask"][..., 0])
     assert 0.4 < batch["mask"].float().mean() < 0.6
     before = model.get_loss_dict(outputs, batch)
     changes = {"dense_target": 100.0, "regions": 7}  # far from the border, which resizing blurs

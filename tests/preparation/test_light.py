@@ -8,8 +8,7 @@ import torch
 from PIL import Image
 
 from lang3dxl_ns.preparation import prepare as module
-from lang3dxl_ns.preparation.encoders import BUILTIN, load_image_text_encoder
-from lang3dxl_ns.preparation.light import in_known_light
+from lang3dxl_ns.preparation.encoders import BUILTIN, in_known_light, load_image_text_encoder
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore

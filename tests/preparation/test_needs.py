@@ -13,7 +13,7 @@ from lab.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.preparation.collection import plan_crops
-from lang3dxl_ns.preparation.needs import Sources, needs_table, read_needs, scene_needs, write_needs
+from lang3dxl_ns.preparation.needs import needs_table, read_needs, scene_needs, write_needs
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.photometry import measure_photometry
 
@@ -27,7 +27,7 @@ def collection(folder):
 def verdicts(folder, **settings):
     photos, reconstruction = collection(folder)
     crops = plan_crops(photos, reconstruction, PreparationConfig(**settings))
-    needs = scene_needs(photos, reconstruction, crops, Sources(dense=True, regions=False))
+    needs = scene_needs(photos, reconstruction, crops, dense=True, regions=False)
     return {need.component: need for need in needs}
 
 

@@ -16,8 +16,8 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import encoders
 from lang3dxl_ns.preparation.dense_map import nested_grids
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder, patch_reading
+from lang3dxl_ns.preparation.families import FILE, PatchHead, head_recipe
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
-from lang3dxl_ns.preparation.patch_head import FILE, PatchHead, head_recipe
 
 SIZES = 3
 

@@ -22,7 +22,7 @@ from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation import prepare as module
 from lang3dxl_ns.preparation.dense_map import build_dense_map, map_grids, nested_grids
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
-from lang3dxl_ns.preparation.patch_head import FILE, PatchHead
+from lang3dxl_ns.preparation.families import FILE, PatchHead
 from lang3dxl_ns.preparation.prepare import TargetReader, prepare
 from lang3dxl_ns.preparation.pyramid import build_clip_target
 from lang3dxl_ns.preparation.regions import FelzenszwalbRegions, FolderRegions, stored_labels

@@ -16,7 +16,7 @@ from lang3dxl_ns.preparation import segmentation
 from lang3dxl_ns.preparation.regions import (
     FelzenszwalbRegions,
     FolderRegions,
-    SamRegions,
+    MaskRegions,
     label_map,
     label_size,
     region_source,
@@ -107,8 +107,8 @@ def test_sam_labels_are_made_of_its_masks(sam, monkeypatch):
         monkeypatch.setitem(segmentation._AUTOMATIC, name, value)
     image = torch.rand(60, 90, 3, generator=torch.manual_seed(0))
     source = region_source(PreparationConfig(regions="sam", sam=sam), PHOTO.path, "cpu")
-    assert isinstance(source, SamRegions)
-    masks = torch.stack(source._sam.masks((image * 255).round().byte()))
+    assert isinstance(source, MaskRegions)
+    masks = torch.stack(source._masks((image * 255).round().byte()))
     assert torch.equal(source.labels(PHOTO, image), label_map(masks, "small"))
     assert source.labels(PHOTO, torch.rand(300, 512, 3)).shape == (150, 256)
     monkeypatch.setitem(segmentation._AUTOMATIC, "pred_iou_thresh", 1e9)

@@ -11,10 +11,9 @@ from tiny_models import make_tiny_clipseg
 from tiny_teachers import make_tiny_sam3
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation import sam3
-from lang3dxl_ns.preparation.regions import TextRegions, region_source
-from lang3dxl_ns.preparation.sam3 import Sam3
-from lang3dxl_ns.preparation.segmentation import find_text_segmenter, is_sam3, load_text_segmenter
+from lang3dxl_ns.preparation import segmentation
+from lang3dxl_ns.preparation.regions import MaskRegions, region_source
+from lang3dxl_ns.preparation.segmentation import Sam3, find_text_segmenter, is_sam3, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
 
 IMAGE = torch.randint(0, 256, (60, 90, 3), dtype=torch.uint8, generator=torch.manual_seed(0))
@@ -33,7 +32,7 @@ def segmenter(folder):
 @pytest.fixture
 def lenient(monkeypatch):
     """A random network's scores are all low."""
-    monkeypatch.setattr(sam3, "_LEAST_SCORE", 0.2)
+    monkeypatch.setattr(segmentation, "_LEAST_SCORE", 0.2)
 
 
 @torch.no_grad()
@@ -77,7 +76,7 @@ def test_prompts_share_a_picture_and_do_not_compete(segmenter, lenient):
 
 
 def test_nothing_found_is_an_empty_mask(segmenter, monkeypatch):
-    monkeypatch.setattr(sam3, "_LEAST_SCORE", 1.0)
+    monkeypatch.setattr(segmentation, "_LEAST_SCORE", 1.0)
     assert segmenter.segment(IMAGE, ["tower", "sky"]).shape == (60, 90)
     assert not segmenter.segment(IMAGE, ["tower"]).any()
 
@@ -85,7 +84,7 @@ def test_nothing_found_is_an_empty_mask(segmenter, monkeypatch):
 def test_regions_are_instances_of_what_the_prompts_name(folder, monkeypatch):
     config = PreparationConfig(regions="text", foreground_model=folder, region_prompts=("tower", "sky"))
     source = region_source(config, None, "cpu")
-    assert isinstance(source, TextRegions)
+    assert isinstance(source, MaskRegions)
     masks = torch.zeros(3, 60, 90, dtype=torch.bool)
     masks[0, :20], masks[1, 40:, :30], masks[2, 40:, 60:] = True, True, True
     found = {"sky": masks[:1], "tower": masks[1:]}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from splat_clouds import gradients, make_cloud, maps
 
-from lang3dxl_ns.rendering import fused_compositing, fused_plan, rasterize
+from lang3dxl_ns.rendering import fused_compositing, rasterize
 from lang3dxl_ns.rendering.simd import LANES, exp2, load, store
 
 
@@ -79,7 +79,7 @@ def test_any_number_of_channels_equals_the_torch_kernels(channels, features):
 
 
 def test_gaussians_close_to_the_camera_take_four_bytes_a_tile(monkeypatch):
-    make, plans = fused_plan.make_plan, []
+    make, plans = fused_compositing.make_plan, []
 
     def kept(*arguments):
         plans.append(make(*arguments))

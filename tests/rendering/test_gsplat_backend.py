@@ -22,7 +22,7 @@ def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, heigh
         Gaussians(means, quats, scales, opacities), Camera(viewmats[0], Ks[0], width, height), colors,
         near=settings.pop("near_plane"), eps2d=settings.pop("eps2d"),
         antialiased=settings.pop("rasterize_mode") == "antialiased", render_depth=depth,
-        absgrad=settings.pop("absgrad", False), backend="torch",
+        backend="torch",
     )  # fmt: skip
     assert not settings
     image = rendering.image
@@ -63,7 +63,7 @@ def test_both_backends_render_the_same_function(detach, antialiased):
     cloud = make_cloud(3000, 160, 120, size=0.03)
     cloud.tensors = {name: value.cuda() for name, value in cloud.tensors.items()}
     cloud.intrinsics = cloud.intrinsics.cuda()
-    settings = {"detach_features": detach, "antialiased": antialiased, "absgrad": True}
+    settings = {"detach_features": detach, "antialiased": antialiased}
     renderings, found = {}, {}
     for backend in ("torch", "gsplat"):
         leaves = cloud.leaves(torch.float32)

@@ -14,7 +14,7 @@ import torch
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.rendering import gsplat_build
-from lang3dxl_ns.rendering.gsplat_build import Extension, Need, build, find_toolkit
+from lang3dxl_ns.rendering.gsplat_build import Need, find_toolkit
 
 SOURCE = """
 #include <Python.h>
@@ -36,10 +36,11 @@ TOOLKIT = find_toolkit(torch.version.cuda or "0")
 
 
 @pytest.fixture
-def tiny(tmp_path) -> Extension:
+def build(tmp_path):
+    """Builds a small source into a folder."""
     source = tmp_path / "tiny.cu"
     source.write_text(SOURCE)
-    return Extension("tiny", [source])
+    return lambda folder: gsplat_build.build(folder, "8.6", [source], "tiny")
 
 
 @pytest.fixture
@@ -57,12 +58,12 @@ def fake_compiler(monkeypatch):
 
 @pytest.mark.nightly
 @pytest.mark.skipif(TOOLKIT is None, reason="needs pip install 'lang3dxl-ns[cuda]'")
-def test_cub_is_compiled_linked_and_loaded(tiny, tmp_path):
+def test_cub_is_compiled_linked_and_loaded(build, tmp_path):
     """About 20 seconds of processor time."""
-    library = build(tiny, tmp_path / "build", "8.6")
-    assert gsplat_build.load(library, "tiny").scratch(10_000) >= 0
+    library = build(tmp_path / "build")
+    assert gsplat_build.load(library).scratch(10_000) >= 0
     before = library.stat().st_mtime_ns
-    assert build(tiny, tmp_path / "build", "8.6").stat().st_mtime_ns == before
+    assert build(tmp_path / "build").stat().st_mtime_ns == before
 
 
 def test_the_environments_compiler_comes_before_the_systems(tmp_path, monkeypatch):
@@ -84,10 +85,10 @@ def test_the_environments_compiler_comes_before_the_systems(tmp_path, monkeypatc
     assert find_toolkit("13.2") is None
 
 
-def test_what_is_missing_is_named_with_its_remedy(tiny, tmp_path, monkeypatch):
+def test_what_is_missing_is_named_with_its_remedy(build, tmp_path, monkeypatch):
     monkeypatch.setattr(gsplat_build, "needs", lambda _: [Need("ninja", None, "pip install ninja")])
     with pytest.raises(UserError, match="ninja is missing: pip install ninja"):
-        build(tiny, tmp_path / "build", "8.6")
+        build(tmp_path / "build")
     assert not (tmp_path / "build").exists()
 
 
@@ -115,31 +116,31 @@ def test_a_folder_with_a_space_is_refused_before_the_compiler_trips_over_it(name
         ("import os; os.kill(os.getpid(), 9)", "signal 9 stopped it, perhaps for lack of memory"),
     ],
 )
-def test_a_failed_build_is_one_line_with_the_reason_and_the_log(code, reason, tiny, tmp_path, fake_compiler):
+def test_a_failed_build_is_one_line_with_the_reason_and_the_log(code, reason, build, tmp_path, fake_compiler):
     fake_compiler(code)
     with pytest.raises(UserError, match=reason) as error:
-        build(tiny, tmp_path / "build", "8.6")
+        build(tmp_path / "build")
     assert "\n" not in str(error.value) and str(tmp_path / "build" / "build.log") in str(error.value)
 
 
-def test_a_half_built_folder_is_completed(tiny, tmp_path, fake_compiler):
+def test_a_half_built_folder_is_completed(build, tmp_path, fake_compiler):
     """A library without the mark of completeness may be cut off."""
     folder = tmp_path / "build"
     fake_compiler("(f / 'one.o').touch(); (f / 'tiny.so').write_text('half'); sys.exit(1)")
     with pytest.raises(UserError, match="failed"):
-        build(tiny, folder, "8.6")
+        build(folder)
     assert gsplat_build.built(folder, "tiny") is None
     (folder / "lock").touch()  # of an older torch, which would wait for its holder
     fake_compiler(
         "assert (f / 'one.o').exists() and not (f / 'lock').exists(); (f / 'tiny.so').write_text('whole')"
     )
-    assert build(tiny, folder, "8.6").read_text() == "whole"
+    assert build(folder).read_text() == "whole"
     assert gsplat_build.built(folder, "tiny") is not None
 
 
-def test_two_builds_at_once_share_one(tiny, tmp_path, fake_compiler):
+def test_two_builds_at_once_share_one(build, tmp_path, fake_compiler):
     fake_compiler("import time; time.sleep(1); open(f / 'count', 'a').write('x'); (f / 'tiny.so').touch()")
-    threads = [threading.Thread(target=build, args=(tiny, tmp_path / "build", "8.6")) for _ in range(2)]
+    threads = [threading.Thread(target=build, args=(tmp_path / "build",)) for _ in range(2)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -147,7 +148,7 @@ def test_two_builds_at_once_share_one(tiny, tmp_path, fake_compiler):
     assert (tmp_path / "build" / "count").read_text() == "x"
 
 
-def test_ctrl_c_ends_the_compilers_too(tiny, tmp_path, fake_compiler, monkeypatch):
+def test_ctrl_c_ends_the_compilers_too(build, tmp_path, fake_compiler, monkeypatch):
     fake_compiler("import os, time; (f / 'pid').write_text(str(os.getpid())); time.sleep(60)")
 
     wait = subprocess.Popen.wait
@@ -161,15 +162,15 @@ def test_ctrl_c_ends_the_compilers_too(tiny, tmp_path, fake_compiler, monkeypatc
 
     monkeypatch.setattr(subprocess.Popen, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        build(tiny, tmp_path / "build", "8.6")
+        build(tmp_path / "build")
     with pytest.raises(ProcessLookupError):
         os.kill(int(pid.read_text()), 0)
 
 
-def test_a_folder_that_cannot_be_written_is_named(tiny, tmp_path, fake_compiler):
+def test_a_folder_that_cannot_be_written_is_named(build, tmp_path, fake_compiler):
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"can't be built in .*file"):
-        build(tiny, tmp_path / "file" / "build", "8.6")
+        build(tmp_path / "file" / "build")
 
 
 def test_without_gsplat_torch_renders_and_says_so(monkeypatch, capsys):

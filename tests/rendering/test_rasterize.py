@@ -176,25 +176,6 @@ def test_depth_is_that_of_the_one_gaussian_and_zero_beside_it():
     assert not rendering.depth[~covered].any()
 
 
-def test_absgrad_is_the_sum_over_pixels_of_absolute_gradients():
-    cloud = make_cloud(60, 20, 15, size=0.1)
-    leaves = cloud.leaves()
-    rendering = cloud.render(rasterize, leaves, absgrad=True)
-    means2d = rendering.info["means2d"]
-    upstream = torch.randn(rendering.image.shape, generator=torch.Generator().manual_seed(0)).double()
-    expected = torch.zeros_like(means2d)
-    # One backward per pixel of the same rendering: no pixel's gradient can cancel another's.
-    for y in range(cloud.height):
-        for x in range(cloud.width):
-            loss = (rendering.image[y, x] * upstream[y, x]).sum()
-            expected += torch.autograd.grad(loss, means2d, retain_graph=True)[0].abs()
-    means2d.retain_grad()
-    (rendering.image * upstream).sum().backward()
-    assert relative_error(means2d.absgrad, expected) < 1e-9
-    assert bool((means2d.absgrad + 1e-12 >= means2d.grad.abs()).all())
-    assert means2d.absgrad.sum() > 1.5 * means2d.grad.abs().sum()
-
-
 def test_the_gradient_of_screen_positions_is_that_of_shifting_the_principal_point():
     cloud = make_cloud(200, 40, 30)
     leaves = cloud.leaves()

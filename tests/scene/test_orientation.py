@@ -11,8 +11,7 @@ from PIL import Image, ImageOps
 from lang3dxl_ns.preparation.photo_collection import read_transforms
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import TrackedPhoto
-from lang3dxl_ns.scene.orientation import turned_lens, upright
-from lang3dxl_ns.scene.photo import Photo, stored_size, upright_in_model
+from lang3dxl_ns.scene.photo import Photo, stored_size, turned_lens, upright, upright_in_model
 
 LENS = Lens(60, 40, 70.0, 75.0, 28.0, 21.0, (-0.2, 0.05, 0.01, -0.015))
 STORED = {1: 6, 2: 3, 3: 8}
