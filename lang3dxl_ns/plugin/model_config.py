@@ -98,8 +98,6 @@ class ModelSettings(SplatfactoModelConfig):
     """Weight of 1 − SSIM relative to L1 in the color loss."""
     cull_alpha_thresh: float = 0.005
     """Opacity below which Gaussians are pruned."""
-    use_absgrad: bool = False
-    """Densify by absolute gradients. Off, as in the paper, which uses the norm of the mean gradient."""
     densify_grad_thresh: float | None = None  # type: ignore[assignment]
     """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-3 in
     short runs, which densify while gradients are still large, falling to 2e-4 (the paper's) in long ones."""
@@ -149,6 +147,5 @@ def make_strategy(config: ModelSettings) -> Densification:
         # The paper does not reset opacities in a run of 70,000 iterations.
         reset_every=10**9,
         pause_refine_after_reset=0,
-        absgrad=config.use_absgrad,
         verbose=False,
     )
