@@ -33,8 +33,7 @@ would reject absent things from its training more easily than the words that use
 DOUBTFUL = 0.1
 """Prompts above this are reported as doubtful. Nine in ten absent things are."""
 LEAST_PEAK = 0.012
-"""Prompts whose peak is below this are doubtful even if all unrelated words match less. Present things reach
-0.3 and more."""
+"""Prompts with a lower peak are doubtful whatever unrelated words reach. Present things reach 0.3 or more."""
 BEST = 0.005
 """Share of the Gaussians that a prompt's peak is the mean of."""
 _AT_A_TIME = 4

@@ -112,8 +112,7 @@ class PerGaussian:
 
 @dataclass(frozen=True)
 class PerPixel:
-    """Engine that composites codes, then decodes them pixel by pixel, as in Lang3D-XL. Its methods are those
-    of `PerGaussian`."""
+    """Engine that composites codes, then decodes each pixel (Lang3D-XL). Its methods are `PerGaussian`'s."""
 
     decode: Decode
     codes: Float[Tensor, "n d"]

@@ -1,5 +1,4 @@
-"""Negatives that prompts compete with: phrases that match anything, other contents of photos of buildings,
-and parts of buildings."""
+"""Negatives that prompts compete with: phrases that match anything, and what photos of buildings show."""
 
 from __future__ import annotations
 

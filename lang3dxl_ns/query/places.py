@@ -61,8 +61,7 @@ class Viewpoint:
     score: float
     """Mean relevancy of the most relevant thousandth of the view."""
     rank: float
-    """How well the view shows the match, 0…1: closeness of its peak to the scene's highest, times size, times
-    centering (`rank_views`)."""
+    """How well the view shows the match, 0…1: closeness to the scene's highest peak × size × centering."""
     shown: bool
     """Whether the match fills at least one pixel."""
 
@@ -94,8 +93,7 @@ def strongest_match(
 
 
 def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
-    """Group points (at least one, of weights above 0), each within `gap` world units of others of its group,
-    and return the groups' boxes."""
+    """Return the boxes of groups of points (one or more, weights above 0) that lie `gap` world units apart."""
     heaviest = weight.argsort(descending=True)[:_MOST_POINTS]
     points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
     from sklearn.cluster import DBSCAN  # imported here, since the import takes a second

@@ -51,7 +51,7 @@ class ScenePhoto:
     mask: str | bytes | None = None
     """Foreground mask of the photo: its file, or the bytes of a PNG with the undistorted mask."""
     size: tuple[int, int] | None = None
-    """Width and height of the file; None in runs of earlier versions, where the lens's size is used."""
+    """Width and height of the file; None: the lens's."""
 
     def __repr__(self) -> str:
         width, height = self.file_size

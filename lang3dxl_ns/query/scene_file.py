@@ -333,11 +333,8 @@ def _decoder(file: _File, described: dict[str, Any]) -> Decoder:
     stored = sum(prod(shape) for name, shape in file.shapes.items() if name.startswith("decoder."))
     needed = _parameters(settings, clip + dense)
     expect(needed <= 4 * stored + 10_000_000, "its decoder is larger than the file")
-    # The first versions called this decoder by the name of the method.
-    name: Any = "gathered" if described["name"] == "lang3dxl" else described["name"]
-    config = SemanticFieldConfig(preset="short", **settings)
-    decoder = make_decoder(DecoderConfig(name=name), config, clip, dense, torch.zeros(3), 1.0)
-    return file.loaded("decoder", decoder)
+    config, choice = SemanticFieldConfig(preset="short", **settings), DecoderConfig(name=described["name"])
+    return file.loaded("decoder", make_decoder(choice, config, clip, dense, torch.zeros(3), 1.0))
 
 
 def _parameters(settings: Mapping[str, Any], channels: int) -> int:

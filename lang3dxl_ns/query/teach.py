@@ -100,8 +100,7 @@ class Example:
 
 
 def run_lengths(mask: Bool[Array, "h w"]) -> list[int]:
-    """Return the lengths of a mask's alternating runs, column by column, beginning with the pixels outside,
-    as in COCO's uncompressed RLE."""
+    """Return a mask's alternating runs, column by column, outside first, as in COCO's uncompressed RLE."""
     flat = mask.ravel(order="F")
     ends = np.flatnonzero(np.diff(flat)) + 1
     lengths = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
