@@ -28,13 +28,11 @@ class Attach(AttachConfig):
     splat: tyro.conf.Positional[Path]
     """File of the splat, or the folder of its run."""
     data: Path | None = None
-    """Photos of the splat: a folder with a COLMAP model or a transforms.json, a folder of photos only, or a
-    video."""
+    """Photos of the splat, with a COLMAP model, with a transforms.json, or alone, or a video."""
     out: Path
     """Scene file to write, NAME.scene."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Texts to search for at the end ("windows; towers"). A picture of the best view of each is written
-    beside the scene."""
+    """Texts to search for at the end ("windows; towers"), with a picture of the best view of each."""
 
     def main(self) -> None:
         from lang3dxl_ns.attachment.attach import attach
@@ -58,10 +56,7 @@ def _show(scene, texts: list[str], out: Path) -> None:
     told = ["; ".join(prompt.text for prompt in prompts) for prompts in shown.values()]
     for (view, prompts), text, slug in zip(shown.items(), told, slugs(told), strict=True):
         matches, picture = scene.matches(scene.ask(prompts), view), out.with_name(f"{out.stem}.{slug}.png")
-        if len(matches) == 1:
-            matches[0].save(picture)
-        else:
-            save_picture(together(matches), picture)
+        save_picture(matches[0].overlay() if len(matches) == 1 else together(matches), picture)
         say(f"{text}, in the view of {view}: {picture}")
     for prompt, doubt in zip(question.prompts, question.doubts, strict=True):
         if advice := doubtful(prompt.text, doubt):

@@ -191,7 +191,7 @@ class Demo:
 
     def markdown(self, report: dict[str, Any]) -> str:
         """Write the report in markdown."""
-        from lang3dxl_ns.evaluation.report import scene_table
+        from lang3dxl_ns.evaluation.aggregate import scene_table
 
         splits = "\n".join(f"#{scene_table(*split)}" for split in report["splits"].items())
         seconds, memory = report["seconds"], report["peak_mb"]

@@ -12,9 +12,8 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, write_report
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.evaluation.aggregate import average, pool
+from lang3dxl_ns.evaluation.aggregate import average, pool, pooled_table, read_results, scene_table
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
-from lang3dxl_ns.evaluation.report import pooled_table, read_results, scene_table
 
 REPORT = "scores"
 """Name of the report's files, without suffix."""
@@ -101,8 +100,7 @@ class EvaluateRun(_Scored):
         write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
     def _score_scene(self, file: Path) -> None:
-        from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene
-        from lang3dxl_ns.evaluation.selections import score_selections
+        from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene, score_selections
         from lang3dxl_ns.open_scene import load_scene
 
         if self.ground_truth is None or self.split == "test":

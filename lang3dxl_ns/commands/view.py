@@ -10,7 +10,6 @@ import tyro
 
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.common.settings_help import showing
 
@@ -61,15 +60,10 @@ class Info:
     """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.open_scene import find_scene_file
+        from lang3dxl_ns.open_scene import existing_scene_file
         from lang3dxl_ns.query.scene_file import describe_scene_file
 
-        file = find_scene_file(self.scene)
-        if file is None:
-            raise UserError(
-                "the run has no scene file: `lang3dxl export RUN --scene-file NAME.scene` writes one"
-            )
-        told = describe_scene_file(file)
+        told = describe_scene_file(existing_scene_file(self.scene))
         decoder, count = told["decoder"], told["gaussians"]
         words = "none: colors alone" if decoder is None else f"CLIP {told['clip']}, decoder {decoder['name']}"
         lines = {name.replace("_", " "): value for name, value in vars(told["provenance"]).items()} | {

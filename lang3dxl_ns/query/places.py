@@ -93,7 +93,7 @@ def strongest_match(
 
 
 def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
-    """Return the boxes of groups of points (one or more, weights above 0) that lie `gap` world units apart."""
+    """Return boxes of groups of points (one or more, of weights above 0) that lie `gap` world units apart."""
     heaviest = weight.argsort(descending=True)[:_MOST_POINTS]
     points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
     from sklearn.cluster import DBSCAN  # imported here, since the import takes a second
