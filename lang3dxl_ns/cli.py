@@ -134,8 +134,7 @@ def _leave_output() -> None:
 
 
 def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
-    """Build tyro's type for a choice of subcommands. Only the called command is imported, because most need
-    torch; the others only appear in the help."""
+    """Build tyro's type for a choice of subcommands. Only the called one is imported: most need torch."""
     kinds = []
     for name, (place, summary) in commands.items():
         kind, described = make_dataclass("NotCalled", []), summary

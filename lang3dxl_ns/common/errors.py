@@ -13,16 +13,14 @@ DAMAGE = (
 
 
 class UserError(Exception):
-    """Error in the user's data or settings. The message names it and the remedy. Commands print only the
-    message, without a traceback."""
+    """Error in the user's data or settings. Commands print its message alone, which names the remedy."""
 
     def __str__(self) -> str:
         return printable(super().__str__())
 
 
 def printable(text: str) -> str:
-    """Escape control characters and lone surrogates, because a file's name may hold commands for the
-    terminal. Line breaks and tabs stay."""
+    """Escape lone surrogates, and control characters but line breaks and tabs: names may steer terminals."""
     return "".join(c if c in "\n\t" or not _commands(c) else repr(c)[1:-1] for c in text)
 
 

@@ -42,12 +42,20 @@ class Stages:
             self.end()
 
     def begin(self, name: str) -> None:
-        """End the present stage, if there is one, and announce another."""
+        """End the present stage, if there is one, and say which one begins and, from the second on, about how
+        long everything left will take."""
         self.end()
         self._current, self._start, self._tenths = name, time.perf_counter(), -1
         if self._path is not None:
             host_peak(reset=True)
-        self._announce(name)
+        order = list(self._shares)
+        place = order.index(name)
+        done = [stage for stage in order[:place] if stage in self._spent]
+        line = f"\n{place + 1} of {len(order)}: {name}"
+        if done and self._path is not None:
+            pace = sum(self._spent[s]["seconds"] for s in done) / sum(self._shares[s] for s in done)
+            line += f" ({roughly(pace * sum(self._shares[s] for s in order[place:]))} left)"
+        say(line)
 
     def end(self) -> None:
         """End the present stage, if there is one."""
@@ -84,17 +92,6 @@ class Stages:
             kind: {name: math.ceil(10 * spent[kind]) / 10 for name, spent in self._spent.items()}
             for kind in ("seconds", "peak_mb")
         }
-
-    def _announce(self, name: str) -> None:
-        """Say which stage begins and, from the second on, about how long everything left will take."""
-        order = list(self._shares)
-        place = order.index(name)
-        done = [stage for stage in order[:place] if stage in self._spent]
-        line = f"\n{place + 1} of {len(order)}: {name}"
-        if done and self._path is not None:
-            pace = sum(self._spent[s]["seconds"] for s in done) / sum(self._shares[s] for s in done)
-            line += f" ({roughly(pace * sum(self._shares[s] for s in order[place:]))} left)"
-        say(line)
 
 
 def _spent(path: Path) -> dict[str, dict[str, float]]:

@@ -92,8 +92,7 @@ def _read_labels(path: Path) -> dict[str, Outlines]:
 
 
 def _read_object(item: Any, height: int, width: int) -> tuple[str, tuple[Any, ...], tuple[float, ...]]:
-    """Read name, outline and box of an object. The name becomes part of a path and must stay in its
-    folder."""
+    """Read name (which becomes part of a path and must stay in its folder), outline and box of an object."""
     category = item["category"].strip()
     plain = category not in ("", ".", "..") and not set(category) & set("/\\\0")
     expect(plain, f"{category!r} is not a plain name")

@@ -87,7 +87,10 @@ def strongest_match(
     rows = (weights > 0).nonzero().squeeze(1)
     if not len(rows):
         return None
-    level = threshold + STRONG * (_high(scores[rows], mass[rows]) - threshold)
+    # The highest relevancy apart from stray Gaussians: 2 % of the matching mass exceed it.
+    order = rows[scores[rows].argsort(descending=True)]
+    beyond = (mass[order].cumsum(0) < _OUTLIERS * mass[order].sum()).sum()
+    level = threshold + STRONG * (scores[order[beyond.clamp_max(len(order) - 1)]] - threshold)
     strong = rows[scores[rows] >= level]
     return max(groups(means[strong], weights[strong], gap), key=lambda box: box.share)
 
@@ -108,13 +111,6 @@ def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float)
         low, high = map(tuple, ends.tolist())
         boxes.append(Box(low, high, total))
     return boxes
-
-
-def _high(scores: Float[Tensor, " n"], mass: Float[Tensor, " n"]) -> float:
-    """Return the relevancy that 2 % of the matching mass exceed: the highest, apart from stray Gaussians."""
-    order = scores.argsort(descending=True)
-    share = mass[order].cumsum(0) / mass.sum()
-    return float(scores[order][int((share < _OUTLIERS).sum().clamp_max(len(order) - 1))])
 
 
 def rank_views(

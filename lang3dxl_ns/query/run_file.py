@@ -34,6 +34,7 @@ SCENE_FILE = "lang3dxl_scene.json"
 _VERSION = 2
 OUTPUTS = Path("outputs")
 """Folder in which `ns-train` creates runs."""
+_REMEDY = "name a run's folder or config.yml, or train with ns-train lang3dxl --data FOLDER"
 _DEEPEST = 4
 """Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
 
@@ -122,10 +123,7 @@ class SceneFile:
     def read(cls, path: Path) -> SceneFile:
         """Read the file. Raises UserError if it is missing, damaged, or of another version."""
         if not path.is_file():
-            raise UserError(
-                f"{path.parent} has no {path.name}, which training writes when it starts: the run is from "
-                f"an earlier version, or its folder is incomplete"
-            )
+            raise UserError(f"{path.parent} has no {path.name}, which training writes: copy the whole folder")
         try:
             content: dict[str, Any] = read_json(path)
             if content.pop("version") != _VERSION:
@@ -232,14 +230,7 @@ def find_config(run: str | Path | None = None) -> Path:
         if ours:
             return max(ours, key=lambda path: path.stat().st_mtime)
         others = f" of this method ({len(configs)} of others)" if configs else ""
-        raise UserError(
-            f"{place} holds no run{others}: name the folder of one, or train with ns-train lang3dxl --data "
-            "FOLDER"
-        )
-    if run is None:
-        raise UserError(
-            "there is no outputs/ here: name a run's folder, or train with ns-train lang3dxl --data FOLDER"
-        )
+        raise UserError(f"{place} holds no run{others}: {_REMEDY}")
     if not place.is_file():
-        raise UserError(f"{place} is not a file or folder: pass a run's folder, or its config.yml")
+        raise UserError(f"there is no {place}{' here' if run is None else ''}: {_REMEDY}")
     return place

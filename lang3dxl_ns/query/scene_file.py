@@ -130,8 +130,7 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
 
 
 def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
-    """Replace the taught words in a scene file, atomically; nothing else in it changes. Raises UserError as
-    `read_scene` does."""
+    """Replace a scene file's taught words, and nothing else, atomically. Raises UserError as `read_scene`."""
     from safetensors.numpy import save
 
     with _opened(path) as file:
@@ -219,8 +218,7 @@ def read_scene(
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
     """Describe a scene file, without reading a tensor: `provenance`, `scene`, `gaussians`, `photos`, `clip`,
-    `decoder`, `looks`, `taught` (the words taught by example) and `bytes`. Raises UserError as `read_scene`
-    does."""
+    `decoder`, `looks`, `taught` (words) and `bytes`. Raises UserError as `read_scene` does."""
     path = expanded(path)
     with _opened(path) as file:
         return {

@@ -106,8 +106,7 @@ _COLOR = re.compile(rf"\b(?:{_COLORS})\b(?=\s+\S)", re.IGNORECASE)
 
 
 def searched(text: str) -> str:
-    """Remove the words by which a prompt selects one of several things, by place or size: *windows on the
-    left tower* becomes *windows*."""
+    """Remove words that select by place or size: *windows on the left tower* becomes *windows*."""
     return _WHERE.sub("", text).strip() or text
 
 

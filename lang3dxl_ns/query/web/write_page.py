@@ -202,8 +202,7 @@ class Page:
         return {"own": own, "near": near.tolist(), "against": against}
 
     def colors(self, photo: str) -> bytes:
-        """Compute red, green, blue and opacity of every Gaussian under a photo's lighting. Raises UserError
-        if there is no such look."""
+        """Compute every Gaussian's color and opacity in a photo's look. Raises UserError if there is none."""
         return pack_colors(self.scene.baked(photo), self._toward).tobytes()
 
 
