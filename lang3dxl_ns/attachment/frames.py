@@ -17,7 +17,6 @@ from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, regist
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes
-from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.rendering.rasterize import rasterize
 from lang3dxl_ns.rendering.render import render
 from lang3dxl_ns.rendering.splats import Splats
@@ -145,9 +144,10 @@ class _Compared:
 
 
 def _compared(collection: PhotoCollection, count: int, side: int) -> list[_Compared]:
-    """Read some photos, evenly spread over the collection, at a longer side of `side` pixels."""
-    found = []
-    for photo in spread(collection.photos, count):
+    """Read some photos, evenly spread from the first to the last, at a longer side of `side` pixels."""
+    found, last = [], len(collection.photos) - 1
+    for i in np.linspace(0, last, min(count, last + 1)).round().astype(int):
+        photo = collection.photos[i]
         scale = min(side / max(photo.width, photo.height), 1.0)
         gray, mask = photo.read(scale).mean(-1), photo.read_mask(scale)
         tracked = collection.reconstruction.photos[photo.name].resized(gray.shape[1], gray.shape[0])

@@ -151,7 +151,7 @@ class EvaluatePool:
 
 @dataclass(kw_only=True)
 class EvaluateSplit:
-    """Choose labeled photos to hold out of training, up to five per category, the same in every call.
+    """Choose labeled photos to hold out of training, up to five that show each category, always the same.
 
     Pass the list to `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`.
     """
@@ -160,13 +160,9 @@ class EvaluateSplit:
     """Folder of the scene's ground truth."""
     out: Path
     """Text file to write."""
-    per_category: int = 5
-    """Number of photos for each category. Photos that show several categories count for each."""
 
     def main(self) -> None:
-        if self.per_category < 1:
-            raise UserError(f"--per-category is {self.per_category}: give 1 or more")
-        names = held_out_photos(GroundTruth(self.ground_truth), self.per_category)
+        names = held_out_photos(GroundTruth(self.ground_truth))
         write_atomically(self.out, "\n".join(names) + "\n")
         print(f"Wrote {len(names)} names to {self.out}")
 

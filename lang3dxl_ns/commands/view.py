@@ -10,7 +10,6 @@ import tyro
 
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.common.settings_help import showing
 
 
@@ -27,8 +26,6 @@ class View:
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Prompt to start with. Repeat the flag, or separate prompts with `;`."""
-    vocabulary: Path | None = None
-    """File of words that may name a place, one per line, besides the shipped ones."""
     host: str = "127.0.0.1"
     """Address to serve at. 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
@@ -42,9 +39,8 @@ class View:
         from lang3dxl_ns.query.web.write_page import Page
 
         check_address(self.host, self.port)  # fail now rather than after the work
-        words = read_names(self.vocabulary, "words") if self.vocabulary else ()
         scene = load_scene(self.scene, clip=self.clip)
-        page = Page(scene, self.text, words, provenance=provenance_of(self.scene), live=True)
+        page = Page(scene, self.text, provenance=provenance_of(self.scene), live=True)
         server = PageServer(page, self.host, self.port)
         who = "anyone with this address" if server.access.needs_token else "this machine only"
         say(f"Open {server.access.address} ({who}). Ctrl-C ends it.")

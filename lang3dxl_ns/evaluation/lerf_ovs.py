@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
-from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth, check_shape
+from lang3dxl_ns.evaluation.annotations import Truth, check_shape
 
 _SLACK = 0.02
 """Share of a side by which hand-drawn outlines may exceed the photo. They are clipped to it."""
@@ -55,14 +55,14 @@ def is_lerf_ovs(folder: Path) -> bool:
     return any(folder.glob("*.json"))
 
 
-def read_lerf_ovs(folder: Path) -> Annotations:
+def read_lerf_ovs(folder: Path) -> dict[str, dict[str, Outlines]]:
     """Read the labels of a scene, `folder`/<photo>.json. Raises UserError that names an invalid file."""
     paths = sorted(folder.glob("*.json"))
     if not paths:
         deeper = next(folder.glob("**/*.json"), None)
         hint = f"; there are some in {deeper.parent}: pass that folder" if deeper else ""
         raise UserError(f"{folder} holds no labels <photo>.json{hint}")
-    found: dict[str, dict[str, Annotation]] = {}
+    found: dict[str, dict[str, Outlines]] = {}
     for path in paths:
         try:
             labels = _read_labels(path)

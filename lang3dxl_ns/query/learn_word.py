@@ -73,14 +73,6 @@ class Weights:
         parts = filled_parts(drawn, pixels.to(splats.means.device), len(splats))
         return cls(*parts.unbind(1))
 
-    def check(self, photo: str, word: str) -> None:
-        """Raise UserError if the marks show nothing, or everything."""
-        marked, everything = float(self.word.sum()), float(self.seen.sum())
-        if marked <= 1e-6 * max(everything, 1.0):
-            raise UserError(f"the marks of {word!r} in {photo} lie where the scene shows nothing")
-        if marked >= 0.98 * everything:
-            raise UserError(f"{word!r} is everything that {photo} shows: mark the word alone")
-
     @property
     def rest(self) -> Float[Tensor, " n"]:
         """Shares of what is not the word. Pixels marked as something else weigh as much as all others."""
@@ -90,11 +82,7 @@ class Weights:
 
 
 def learn(
-    name: str,
-    examples: Sequence[Example],
-    weights: Sequence[Weights],
-    engine: QueryEngine,
-    queries: Queries,
+    name: str, examples: Sequence[Example], weights: Sequence[Weights], engine: QueryEngine, queries: Queries
 ) -> TaughtWord:
     """Learn a word from examples, whose order doesn't matter, and from what the marks of each show.
 
@@ -104,7 +92,11 @@ def learn(
     if not examples:
         raise UserError(f"there is no example of {name!r}: mark it in a photo")
     for example, one in zip(examples, weights, strict=True):
-        one.check(example.photo, name)
+        marked, everything = float(one.word.sum()), float(one.seen.sum())
+        if marked <= 1e-6 * max(everything, 1.0):
+            raise UserError(f"the marks of {name!r} in {example.photo} lie where the scene shows nothing")
+        if marked >= 0.98 * everything:
+            raise UserError(f"{name!r} is everything that {example.photo} shows: mark the word alone")
     rows, photos = _sampled(examples, weights)
     sample = engine.features(rows).double()
     # Margin of the text: the cosine minus the best competitor's.
@@ -230,8 +222,7 @@ def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
 def _logistic(
     places: Float[Tensor, "m k"], word: Float[Tensor, " m"], rest: Float[Tensor, " m"], ridge: float
 ) -> tuple[Float[Tensor, " k"], float]:
-    """Fit slope and bias of a logistic regression in which both classes weigh the same:
-    minimize ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
+    """Minimize ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|², s = slope·x + bias."""
     from sklearn.linear_model import LogisticRegression
 
     labels, inputs, weights = _labeled(places, word / 2, rest / 2)

@@ -26,7 +26,6 @@ from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.learn_word import Weights, learn
 from lang3dxl_ns.query.match import Found, Match, View
-from lang3dxl_ns.query.negatives import CLEAR, NOTHING
 from lang3dxl_ns.query.places import Viewpoint, rank_views, strongest_match
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.question import Question, match_thresholds
@@ -36,7 +35,7 @@ from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched, texts_of
 from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
-from lang3dxl_ns.query.vocabulary import shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, shipped_vocabulary
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import Rendering, composite
@@ -513,10 +512,7 @@ class Scene:
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 
     def teach(
-        self,
-        word: str,
-        examples: Example | Sequence[Example],
-        selection: Bool[Tensor, " n"] | None = None,
+        self, word: str, examples: Example | Sequence[Example], selection: Bool[Tensor, " n"] | None = None
     ) -> Scene:
         """Return a scene that also knows a word from examples, as `scene.words[word]`; this one is unchanged.
 
