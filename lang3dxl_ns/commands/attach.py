@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.query.scene import Scene
 
 
 @showing(
@@ -44,20 +48,14 @@ class Attach(AttachConfig):
         say(f'Ask it: lang3dxl query {self.out} --text "windows" --out found')
 
 
-def _show(scene, texts: list[str], out: Path) -> None:
-    """Write a picture of each view that shows a prompt best, named after the prompts."""
+def _show(scene: Scene, texts: list[str], out: Path) -> None:
+    """Write a picture of the view that shows each text best, named after the text."""
     from lang3dxl_ns.common.files import slugs
     from lang3dxl_ns.query.doubt import doubtful
-    from lang3dxl_ns.query.match import save_picture, together
 
-    question, shown = scene.ask(texts), dict[str, list]()
-    for prompt, view in zip(question.prompts, scene.best_views(question), strict=True):
-        shown.setdefault(view, []).append(prompt)
-    told = ["; ".join(prompt.text for prompt in prompts) for prompts in shown.values()]
-    for (view, prompts), text, slug in zip(shown.items(), told, slugs(told), strict=True):
-        matches, picture = scene.matches(scene.ask(prompts), view), out.with_name(f"{out.stem}.{slug}.png")
-        save_picture(matches[0].overlay() if len(matches) == 1 else together(matches), picture)
-        say(f"{text}, in the view of {view}: {picture}")
-    for prompt, doubt in zip(question.prompts, question.doubts, strict=True):
-        if advice := doubtful(prompt.text, doubt):
+    matches = scene.query(texts)
+    for match, slug in zip(matches, slugs([match.prompt.text for match in matches]), strict=True):
+        picture = match.save(out.with_name(f"{out.stem}.{slug}.png"))
+        say(f"{match.prompt.text}, in the view of {match.view.name}: {picture}")
+        if advice := doubtful(match.prompt.text, match.doubt):
             say(f"  {advice}")

@@ -149,11 +149,8 @@ class CocoLabels:
 
     def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
         """Add a photo by name, with one mask per category, at the size of the photo's file."""
-        images, annotations, (height, width) = (
-            self.content["images"],
-            self.content["annotations"],
-            masks[0].shape,
-        )
+        images, annotations = self.content["images"], self.content["annotations"]
+        height, width = masks[0].shape
         images.append({"id": len(images) + 1, "file_name": photo, "width": width, "height": height})
         for category, mask in enumerate(masks, start=1):
             numbers, _ = label(mask)

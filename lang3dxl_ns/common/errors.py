@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import struct
 import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 DAMAGE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
@@ -17,6 +19,15 @@ class UserError(Exception):
 
     def __str__(self) -> str:
         return printable(super().__str__())
+
+
+@contextmanager
+def readable(problem: str, remedy: str) -> Iterator[None]:
+    """Turn errors of reading a damaged file into a UserError: problem (error): remedy."""
+    try:
+        yield
+    except DAMAGE as error:
+        raise UserError(f"{problem} ({in_a_line(error)}): {remedy}") from error
 
 
 def printable(text: str) -> str:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 
 _MOST_BYTES = 64 << 20
 """Largest file of settings, names or figures, bytes. Files of arrays have their own limits."""
@@ -139,10 +139,8 @@ def slugs(texts: Sequence[str]) -> list[str]:
 def read_names(path: Path, what: str = "photos") -> tuple[str, ...]:
     """Read names of photos, or other texts (`what` in messages), one per line of a file, each once. Blank
     lines and comments (#) are skipped. Raises UserError for a file that cannot be read or is empty."""
-    try:
+    with readable(f"the list of {what} {path} can't be read", "correct or replace it"):
         lines = read_text(expanded(path)).splitlines()
-    except (OSError, ValueError) as error:
-        raise UserError(f"the list of {what} {path} can't be read ({error})") from error
     names = tuple(dict.fromkeys(name for line in lines if (name := line.partition("#")[0].strip())))
     if not names:
         raise UserError(f"the list of {what} {path} is empty: write one per line")

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.reports import markdown_table
 
@@ -107,19 +107,15 @@ def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
 def read_results(path: Path) -> tuple[str, dict[str, Any]]:
     """Read scene and results of a report, also one in the form of `ns-eval`. Raises UserError for another
     file, and for figures that are not numbers."""
-    try:
+    if not path.exists():
+        raise UserError(f"there is no {path}: name the scores.json of a report")
+    with readable(f"{path} is not a report of `lang3dxl evaluate` or `ns-eval`", "make it again"):
         content = read_json(path)
         results = content["results"]
         for figures in results["photos"].values():
             expect(all(map(is_coordinate, figures.values())), "a photo has a figure that is not a number")
         expect(isinstance(results["protocol"], dict), "it does not say what was scored")
         return str(content.get("scene") or content["experiment_name"]), results
-    except FileNotFoundError as error:
-        raise UserError(f"there is no {path}: name the scores.json of a report") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path} is not a report of `lang3dxl evaluate` or `ns-eval` ({error!r}): make it again"
-        ) from error
 
 
 def scene_table(scene: str, results: Mapping[str, Any]) -> str:

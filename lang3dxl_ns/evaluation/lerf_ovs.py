@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.annotations import Truth, check_shape
 
@@ -64,10 +64,8 @@ def read_lerf_ovs(folder: Path) -> dict[str, dict[str, Outlines]]:
         raise UserError(f"{folder} holds no labels <photo>.json{hint}")
     found: dict[str, dict[str, Outlines]] = {}
     for path in paths:
-        try:
+        with readable(f"labels {path} can't be used", "fix or remove the file"):
             labels = _read_labels(path)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-            raise UserError(f"labels {path} can't be used ({error}): fix or remove the file") from error
         for category, outlines in labels.items():
             found.setdefault(category, {})[path.stem] = outlines
     if not found:

@@ -23,7 +23,7 @@ from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
@@ -124,13 +124,10 @@ class SceneFile:
         """Read the file. Raises UserError if it is missing, damaged, or of another version."""
         if not path.is_file():
             raise UserError(f"{path.parent} has no {path.name}, which training writes: copy the whole folder")
-        try:
+        with readable(f"{path} can't be read", "restore it, or train anew"):
             content: dict[str, Any] = read_json(path)
-            if content.pop("version") != _VERSION:
-                raise ValueError("another version wrote it")
+            expect(content.pop("version") == _VERSION, "another version wrote it")
             return scene_from_json(content)
-        except DAMAGE as error:
-            raise UserError(f"{path} can't be read ({error}): restore it, or train anew") from error
 
     def photo(self, name: str) -> ScenePhoto:
         """Find the photo with this name, or with this file name or stem if only one photo has it.
@@ -192,15 +189,11 @@ def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePh
 
 def read_camera_path(path: Path) -> Sequence[Camera]:
     """Read the cameras of a camera path saved by nerfstudio's viewer. Raises UserError for other files."""
-    try:
+    with readable(f"{path} is not a camera path", "save one in the viewer (Render tab, Save Path)"):
         content = read_json(path)
         width, height = int(content["render_width"]), int(content["render_height"])
         expect(content["camera_path"] != [], "it has no camera")
         return [_path_camera(frame, width, height) for frame in content["camera_path"]]
-    except DAMAGE as error:
-        raise UserError(
-            f"{path} is not a camera path ({error!r}): save one in the viewer (Render tab, Save Path)"
-        ) from error
 
 
 def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
