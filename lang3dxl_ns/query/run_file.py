@@ -225,5 +225,6 @@ def find_config(run: str | Path | None = None) -> Path:
         others = f" of this method ({len(configs)} of others)" if configs else ""
         raise UserError(f"{place} holds no run{others}: {_REMEDY}")
     if not place.is_file():
-        raise UserError(f"there is no {place}{' here' if run is None else ''}: {_REMEDY}")
+        what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
+        raise UserError(f"{what}: {_REMEDY}")
     return place
