@@ -15,21 +15,19 @@ from difflib import get_close_matches
 from functools import reduce
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from lang3dxl_ns.common.checkout import lab_module
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import asked_for_all
 
+LAB = Path(__file__).parents[1] / "lab"
 BENCHMARKS = {
-    "ablation": (
-        "lab.benchmarks.ablation:Ablation",
-        "The method, baselines, and ablations.",
-    ),
+    "ablation": ("lab.benchmarks.ablation:Ablation", "The method, baselines, and ablations."),
     "training": ("lab.benchmarks.training:TrainingBenchmark", "A training step by its parts."),
     "gpu": ("lab.benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time, memory, in one file to send."),
     "scale": ("lab.benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
@@ -40,28 +38,19 @@ BENCHMARKS = {
     "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),
 }
 COMMANDS = {
-    "demo": (
-        "commands.demo:Demo",
-        "The full workflow in minutes, on a generated landmark.",
-    ),
+    "demo": ("lab.landmark.demo:Demo", "The full workflow in minutes, on a generated landmark."),
     "reconstruct": ("commands.reconstruct:Reconstruct", "COLMAP model from photos, or a video."),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
     "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),
     "needs": ("commands.prepare:Needs", "Which optional components a scene needs, and why."),
     "query": ("commands.query:Query", "Search a trained scene for texts: heat maps, masks, relevancy maps."),
-    "export": (
-        "commands.query:Export",
-        "Write a scene, or what matches a text, as a splat or a web page.",
-    ),
+    "export": ("commands.query:Export", "Write a scene, or what matches a text, as a splat or a web page."),
     "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
     "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
     "info": ("commands.view:Info", "Tell what a scene file holds, and where it comes from."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
-    "demo-scene": (
-        "lab.landmark.demo_scene:DemoScene",
-        "Generate photos of a procedural landmark.",
-    ),
+    "demo-scene": ("lab.landmark.demo_scene:DemoScene", "Generate photos of a procedural landmark."),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),
     "preset": ("commands.preset:Preset", "Print the flags that train a benchmark's scene as in the paper."),
     "numerics": ("lab.numerics.command:Numerics", "Error and time of components on stiff cases."),
@@ -134,8 +123,7 @@ def _leave_output() -> None:
 
 
 def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
-    """Build tyro's type for a choice of subcommands. Only the called command is imported, because most need
-    torch; the others only appear in the help."""
+    """Build tyro's type for a choice of subcommands. Only the called one is imported: most need torch."""
     kinds = []
     for name, (place, summary) in commands.items():
         kind, described = make_dataclass("NotCalled", []), summary
@@ -151,8 +139,14 @@ def settings_of(place: str) -> Any:
     """Import a command's settings class from `module:class` of the package or of the lab beside it. Raises
     UserError if it belongs to the lab, which is not installed here."""
     module, _, name = place.partition(":")
-    found = lab_module(module) if module.startswith("lab.") else import_module(f"lang3dxl_ns.{module}")
-    return getattr(found, name)
+    if not module.startswith("lab."):
+        module = f"lang3dxl_ns.{module}"
+    elif not (LAB / "README.md").is_file():
+        raise UserError(
+            "this command comes with a checkout of the repository, not with the package: clone it, "
+            "and install the clone with pip install -e"
+        )
+    return getattr(import_module(module), name)
 
 
 @contextlib.contextmanager

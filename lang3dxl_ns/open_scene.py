@@ -65,6 +65,13 @@ def find_scene_file(path: str | Path | None = None) -> Path | None:
     return scenes[-1] if scenes else None
 
 
+def existing_scene_file(path: str | Path | None = None) -> Path:
+    """Find the scene file that a path names or holds. Raises UserError if there is none."""
+    if (file := find_scene_file(path)) is None:
+        raise UserError("this run has no scene file: write one with lang3dxl export --scene-file NAME.scene")
+    return file
+
+
 def provenance_of(path: str | Path | None = None) -> Provenance:
     """Read title, credit and license of the scene that `load_scene` opens; empty for a run without a file."""
     file = find_scene_file(path)

@@ -17,7 +17,7 @@ from lang3dxl_ns.preparation.physical_scale import (
     pixel_sizes,
     propose_scale_range,
 )
-from lang3dxl_ns.query.relevancy import relevancy
+from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.scene.camera import Camera, view_matrix
 from lang3dxl_ns.scene.colmap import read_reconstruction
@@ -58,7 +58,9 @@ def relevancies(scene: Scene, dtype: torch.dtype) -> torch.Tensor:
     with torch.no_grad():
         field.grid.table.mul_(300)  # as large as after training
         features = field.decode_clip(10 * render(scene, dtype) - 5)
-    return relevancy(features, *torch.randn(6, 32, generator=generator).to(dtype).split([2, 4]))
+    texts, canonical = torch.randn(6, 32, generator=generator).to(dtype).split([2, 4])
+    prompts = Queries.of(texts[:, None].unbind(), canonical)
+    return prompts.relevancy_of_cosines(prompts.cosines(features))
 
 
 @pytest.mark.parametrize(("scale", "offset"), WORLDS)

@@ -39,7 +39,7 @@ ORDER = (
     {"components", "rendering"},
     {"preparation"},
     {"baselines", "query", "evaluation"},
-    {"attachment", "demo"},
+    {"attachment"},
     {"plugin"},
     {"methods", "open_scene"},
     {"train_scene"},
@@ -83,7 +83,7 @@ def test_imports_run_down_and_nerfstudio_stays_in_the_plugin():
     ("source", "room"),
     [
         ("from lang3dxl_ns.plugin.model import Lang3DXLModel", "query"),
-        ("def late():\n    import lang3dxl_ns.commands.demo", "plugin"),
+        ("def late():\n    import lang3dxl_ns.commands.query", "plugin"),
         ("from nerfstudio.cameras.cameras import Cameras", "scene"),
     ],
 )

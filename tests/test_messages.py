@@ -50,7 +50,6 @@ COMMANDS = {
     "evaluate pool --out report --reports c.json": "no prompt was scored in c",
     "evaluate pool --out report --reports silent.json": "it does not say what was scored",
     "evaluate pool --out report --reports none.json": "there is no none.json",
-    "evaluate split --ground-truth label --out list --per-category 0": "--per-category is 0: give 1 or more",
     "export": "give one of --out FILE.ply, --web FOLDER",
     "export --out a.ply --text dome --text tower": "a splat file is of one --text",
     "doctor --build": "name a compute capability, such as --arch 8.6",

@@ -13,8 +13,9 @@ from lab.benchmarks.ablation_report import write_ablation
 from lab.benchmarks.ablation_rows import BOUNDS, FULL, IN_PICTURES, Row, choose_rows
 from lab.benchmarks.landmarks import Landmarks, landmark_scenes
 from lab.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
+from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import command_line, progress_bar
+from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.common.settings_help import showing
 
 Found = TypeVar("Found")

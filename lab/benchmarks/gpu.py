@@ -17,15 +17,11 @@ from PIL import Image
 from torch import Tensor
 
 from lab.benchmarks.interleaved import interleaved_times
+from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
-from lang3dxl_ns.common.reports import (
-    command_line,
-    describe_machine,
-    markdown_table,
-    write_report,
-)
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, centered_cosine
 from lang3dxl_ns.components.feature_decoder import Gathered

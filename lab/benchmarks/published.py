@@ -16,10 +16,11 @@ from lab.benchmarks.ablation import make_all
 from lab.benchmarks.ablation_rows import FULL, choose_rows
 from lab.benchmarks.kept_runs import KeptRuns
 from lab.benchmarks.scored_runs import Run, RunSettings
+from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.presets import scene_presets, train_flags
-from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import pool
 from lang3dxl_ns.evaluation.lerf_ovs import is_lerf_ovs

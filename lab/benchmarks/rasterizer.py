@@ -35,16 +35,11 @@ from lab.benchmarks.rasterizer_scenes import (
     Recipe,
     make_problem,
 )
+from lab.reports import command_line
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.kernels import takes_kernels
-from lang3dxl_ns.common.reports import (
-    command_line,
-    describe_machine,
-    markdown_table,
-    progress_bar,
-    write_report,
-)
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, progress_bar, write_report
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.rasterize import Backend
 

@@ -11,8 +11,9 @@ import tyro
 from lab.benchmarks.ablation import make_all
 from lab.benchmarks.ablation_rows import CHANCE, FULL, LIMIT, TEACHER, choose_rows
 from lab.benchmarks.scored_runs import Run, RunSettings, ScoredRuns
+from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 
 COLORS = {
     "half_psnr": "PSNR, half image",

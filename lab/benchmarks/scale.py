@@ -10,14 +10,8 @@ from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Literal
 
-from lab.reports import in_own_process
-from lang3dxl_ns.common.reports import (
-    command_line,
-    describe_machine,
-    host_peak,
-    markdown_table,
-    write_report,
-)
+from lab.reports import command_line, in_own_process
+from lang3dxl_ns.common.reports import describe_machine, host_peak, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 
 if TYPE_CHECKING:

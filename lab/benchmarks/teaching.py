@@ -17,13 +17,8 @@ from numpy import ndarray as Array
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from lang3dxl_ns.common.reports import (
-    command_line,
-    describe_machine,
-    markdown_table,
-    progress_bar,
-    write_report,
-)
+from lab.reports import command_line
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, progress_bar, write_report
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import average_precision, overlap

@@ -10,7 +10,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+from lab.reports import command_line
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 
 PARTS = ("data", "render", "appearance", "decode", "downsample", "losses", "backward", "optimizer")

@@ -11,8 +11,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 import tyro
 
+from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import command_line, markdown_table, write_report
+from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import labeled_photos, truths_of
 from lang3dxl_ns.evaluation.scores import overlap

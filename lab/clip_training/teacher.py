@@ -32,7 +32,7 @@ from lab.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, category_masks
 from lang3dxl_ns.evaluation.scores import average_precision
 from lang3dxl_ns.preparation.encoders import ImageTextEncoder, load_image_text_encoder
 from lang3dxl_ns.preparation.pyramid import build_clip_target
-from lang3dxl_ns.query.relevancy import CANONICAL, relevancy
+from lang3dxl_ns.query.relevancy import CANONICAL, Queries
 
 CROP_SIDES = (32, 48, 68)
 """Pixels of a 480×360 view; chosen on validation landmarks."""
@@ -75,7 +75,8 @@ def _relevancy_maps(
     )
     half = (view.shape[1] // 2, view.shape[2] // 2)
     features = F.interpolate(target.features.permute(2, 0, 1)[None], half, mode="bilinear")[0]
-    return relevancy(features.permute(1, 2, 0), queries, canonical).numpy()
+    prompts = Queries.of(queries[:, None].unbind(), canonical)
+    return prompts.relevancy_of_cosines(prompts.cosines(features.permute(1, 2, 0))).numpy()
 
 
 @dataclass

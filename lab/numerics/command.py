@@ -12,10 +12,10 @@ import torch
 from lab.numerics import optimization
 from lab.numerics.catalog import all_cases
 from lab.numerics.measure import Case, Row, measure
-from lab.reports import as_png
+from lab.reports import as_png, command_line
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, progress_bar
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, progress_bar
 
 HEADER = "component", "case", "mode", "output", "gradient", "bounds", "flipped", "ms", "verdict"
 SMALLEST = 1e-18

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
-from lang3dxl_ns.query.relevancy import relevancy
+from lang3dxl_ns.query.relevancy import Queries
 
 CHANNELS = 64
 BOUNDS = {"float32": Bounds(2e-6, 1e-6, 1e-5, 5e-6), "float64": EXACT}
@@ -86,8 +86,9 @@ def _problem(vectors: Callable[[], Maps], temperature: float = 10.0, outputs_onl
     leaves = vectors()
 
     def compute(given: Maps) -> Maps:
-        found = relevancy(given["features"], given["queries"], given["canonical"], temperature)
-        return {"relevancy": found}
+        prompts = Queries.of(given["queries"][:, None].unbind(), given["canonical"])
+        cosines = prompts.cosines(given["features"])
+        return {"relevancy": prompts.relevancy_of_cosines(cosines, temperature)}
 
     def reference(given: Maps) -> Maps:
         vectors = given["features"], given["queries"], given["canonical"]

@@ -106,8 +106,7 @@ def attach(
 
 
 def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path | None) -> Similarity:
-    """Find the similarity from the photos' frame to the splat's, and say what was found. Raises UserError if
-    no frame matches."""
+    """Find and report the similarity from the photos' frame to the splat's, or raise UserError."""
     if collection.left_out:
         say(f"{len(collection.left_out)} photos are left out: {some(list(collection.left_out.values()), 3)}")
     fit, shown = find_frame(splats, collection, path), ""
@@ -123,8 +122,6 @@ def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path 
         )
     say(f"the splat's frame is {fit.name}: renderings agree with their photos to {fit.score:.2f} (of 1)")
     if fit.lighting > _LIGHT:
-        say(
-            f"the photos' brightness varies by {100 * fit.lighting:.0f} % beside the splat's: words are "
-            "learned all the same; the scene keeps the splat's colors"
-        )
+        light = f"the photos' brightness varies by {100 * fit.lighting:.0f} % beside the splat's"
+        say(f"{light}: words are learned all the same; the scene keeps the splat's colors")
     return fit.similarity

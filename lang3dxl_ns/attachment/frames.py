@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +22,6 @@ from lang3dxl_ns.rendering.render import render
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.colmap import TrackedPhoto
-from lang3dxl_ns.scene.photo import Photo
 
 FITS = 0.5
 """Correlation of renderings with their photos above which a frame is right. Wrong ones reach 0.3."""
@@ -71,8 +70,7 @@ class Fit:
 
 
 def camera_in(similarity: Similarity | Float[Tensor, "4 4"], tracked: TrackedPhoto) -> Camera:
-    """Build a photo's camera in the splat's frame. The lens must have no distortion, or belong to the
-    undistorted photo."""
+    """Build a photo's camera in the splat's frame. The lens must be the undistorted photo's."""
     whole = torch.as_tensor(similarity, dtype=torch.float64)
     pose = torch.from_numpy(np.vstack([tracked.camera_from_world, [0, 0, 0, 1]])).double()
     view = pose @ whole.inverse()
@@ -87,14 +85,14 @@ def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
     scene's shape. The best of them are refined by descent on the correlation. The result may be wrong, which
     `Fit.fits` shows.
     """
-    small, large = _Comparison.of(collection, _FEW, _SMALL), _Comparison.of(collection, _MANY, _LARGE)
+    small, large = _compared(collection, _FEW, _SMALL), _compared(collection, _MANY, _LARGE)
     best = _best(splats, small, known_frames(collection.reconstruction, splat))
     if best[0].score < FITS:
         seen = splats.opacities > _SEES
         means = splats.means[seen].double().cpu().numpy()
         shaped = registered_frames(collection.reconstruction.points, means)
         best = sorted([*best, *_best(splats, small, shaped)], key=lambda fit: fit.score, reverse=True)
-    checked = [large.fit(splats, fit.name, fit.similarity) for fit in best[:_REFINED]]
+    checked = [_fit(splats, large, fit.name, fit.similarity) for fit in best[:_REFINED]]
     found = max(checked, key=lambda fit: fit.score)
     if found.score >= _CLOSE:
         return found
@@ -106,17 +104,17 @@ def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
         for fit in worth:
             refined = fit.similarity
             for side, steps in _ROUNDS:
-                refined = _Comparison.of(collection, _FEW, side).refined(thinned, refined, steps, advance)
-            again = large.fit(splats, f"{fit.name}, refined", refined)
+                refined = _refined(thinned, _compared(collection, _FEW, side), refined, steps, advance)
+            again = _fit(splats, large, f"{fit.name}, refined", refined)
             found = max(found, again, key=lambda fit: fit.score)
     return found
 
 
-def _best(splats: Splats, comparison: _Comparison, frames: Mapping[str, Similarity]) -> list[Fit]:
+def _best(splats: Splats, photos: Sequence[_Compared], frames: Mapping[str, Similarity]) -> list[Fit]:
     with progress("comparing with the photos", len(frames)) as advance:
         fits = []
         for name, frame in frames.items():
-            fits.append(comparison.fit(splats, name, frame))
+            fits.append(_fit(splats, photos, name, frame))
             advance()
             if fits[-1].score >= _CLOSE:
                 break
@@ -131,19 +129,11 @@ class _Compared:
     gray: Float[Tensor, "h w"]
     mask: Bool[Tensor, "h w"]
 
-    @classmethod
-    def of(cls, photo: Photo, tracked: TrackedPhoto, side: int) -> _Compared:
-        scale = min(side / max(photo.width, photo.height), 1.0)
-        gray, mask = photo.read(scale).mean(-1), photo.read_mask(scale)
-        own = tracked.resized(gray.shape[1], gray.shape[0])
-        return cls(own, gray, torch.ones_like(gray, dtype=torch.bool) if mask is None else mask)
-
     def beside(
         self, splats: Splats, similarity: Similarity | Float[Tensor, "4 4"]
     ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """Return a rendering at the photo's camera, the photo, and where the two can be compared. Pixels that
-        the splat does not cover are excluded, because it lacks the background, and so are its edges, where
-        the two mix."""
+        """Return a rendering at the photo's camera, the photo, and where the two can be compared: in what the
+        splat covers, without its edges, where the background that it lacks shows through."""
         camera = camera_in(similarity, self.tracked)
         colors = splats.colors(camera.position.detach()).mean(1, keepdim=True)
         gaussians = splats.gaussians.seen_from(camera)
@@ -153,51 +143,53 @@ class _Compared:
         return drawn, self.gray.to(drawn), self.mask.to(drawn.device) & covered
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """Photos to compare with, evenly spread over the collection, at one size."""
+def _compared(collection: PhotoCollection, count: int, side: int) -> list[_Compared]:
+    """Read some photos, evenly spread from the first to the last, at a longer side of `side` pixels."""
+    found, last = [], len(collection.photos) - 1
+    for i in np.linspace(0, last, min(count, last + 1)).round().astype(int):
+        photo = collection.photos[i]
+        scale = min(side / max(photo.width, photo.height), 1.0)
+        gray, mask = photo.read(scale).mean(-1), photo.read_mask(scale)
+        tracked = collection.reconstruction.photos[photo.name].resized(gray.shape[1], gray.shape[0])
+        found.append(
+            _Compared(tracked, gray, torch.ones_like(gray, dtype=torch.bool) if mask is None else mask)
+        )
+    return found
 
-    photos: Sequence[_Compared]
 
-    @classmethod
-    def of(cls, collection: PhotoCollection, count: int, side: int) -> _Comparison:
-        everything, tracked = collection.photos, collection.reconstruction.photos
-        chosen = {round(i) for i in np.linspace(0, len(everything) - 1, min(count, len(everything)))}
-        photos = [everything[i] for i in sorted(chosen)]
-        return cls([_Compared.of(photo, tracked[photo.name], side) for photo in photos])
+@torch.no_grad()
+def _fit(splats: Splats, photos: Sequence[_Compared], name: str, similarity: Similarity) -> Fit:
+    scores, gains = [], []
+    for photo in photos:
+        drawn, gray, mask = photo.beside(splats, similarity)
+        scores.append(float(_correlation(drawn, gray, mask)))
+        gains.append(float(gray[mask].mean() / drawn[mask].mean().clamp_min(1e-3)) if mask.any() else 1.0)
+    return Fit(name, similarity, float(np.mean(scores)), tuple(gains))
 
-    @torch.no_grad()
-    def fit(self, splats: Splats, name: str, similarity: Similarity) -> Fit:
-        scores, gains = [], []
-        for photo in self.photos:
-            drawn, gray, mask = photo.beside(splats, similarity)
-            scores.append(float(_correlation(drawn, gray, mask)))
-            gains.append(float(gray[mask].mean() / drawn[mask].mean().clamp_min(1e-3)) if mask.any() else 1.0)
-        return Fit(name, similarity, float(np.mean(scores)), tuple(gains))
 
-    def refined(self, splats: Splats, start: Similarity, steps: int, advance) -> Similarity:
-        """Refine the similarity by some steps of Adam on rotation, translation and scale."""
-        centers = np.array([photo.tracked.center for photo in self.photos])
-        middle = torch.from_numpy(start[:3, :3] @ np.median(centers, axis=0) + start[:3, 3])
-        seen = splats.means[splats.opacities > _SEES].double().cpu()
-        size = float((seen - seen.median(0).values).norm(dim=1).median()) if len(seen) else 1.0
-        values = torch.zeros(7, dtype=torch.float64, requires_grad=True)
-        optimizer = torch.optim.Adam([values], lr=_RATE)
-        best, lowest = start, np.inf
-        for _ in range(steps):
-            whole = _similarity(values, middle, size) @ torch.from_numpy(start)
-            with torch.enable_grad():
-                loss = torch.stack([self._loss(splats, whole, photo) for photo in self.photos]).mean()
-                optimizer.zero_grad()
-                loss.backward()
-            if float(loss.detach()) < lowest:
-                best, lowest = whole.detach().numpy(), float(loss.detach())
-            optimizer.step()
-            advance()
-        return best
-
-    def _loss(self, splats: Splats, similarity: Float[Tensor, "4 4"], photo: _Compared) -> Float[Tensor, ""]:
-        return 1 - _correlation(*photo.beside(splats, similarity))
+def _refined(
+    splats: Splats, photos: Sequence[_Compared], start: Similarity, steps: int, advance: Callable[[], None]
+) -> Similarity:
+    """Refine the similarity by some steps of Adam on rotation, translation and scale."""
+    centers = np.array([photo.tracked.center for photo in photos])
+    middle = torch.from_numpy(start[:3, :3] @ np.median(centers, axis=0) + start[:3, 3])
+    seen = splats.means[splats.opacities > _SEES].double().cpu()
+    size = float((seen - seen.median(0).values).norm(dim=1).median()) if len(seen) else 1.0
+    values = torch.zeros(7, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([values], lr=_RATE)
+    best, lowest = start, np.inf
+    for _ in range(steps):
+        whole = _similarity(values, middle, size) @ torch.from_numpy(start)
+        with torch.enable_grad():
+            losses = [1 - _correlation(*photo.beside(splats, whole)) for photo in photos]
+            loss = torch.stack(losses).mean()
+            optimizer.zero_grad()
+            loss.backward()
+        if float(loss.detach()) < lowest:
+            best, lowest = whole.detach().numpy(), float(loss.detach())
+        optimizer.step()
+        advance()
+    return best
 
 
 def _similarity(values: Float[Tensor, "7"], middle: Float[Tensor, "3"], size: float) -> Float[Tensor, "4 4"]:

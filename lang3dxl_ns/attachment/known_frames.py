@@ -22,24 +22,20 @@ _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Rotation from COLMAP's y down to nerfstudio's z up."""
 _OLD_Z_UP = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """Rotation from COLMAP's y down to z up in nerfstudio before 1.0."""
-_SIGNS = {"x": (1.0, -1, -1, 1), "y": (-1.0, 1, -1, 1), "z": (-1.0, -1, 1, 1)}
-_HALF_TURNS = {name: np.diag(signs) for name, signs in _SIGNS.items()}
+_HALF_TURNS = {"x": np.diag([1.0, -1, -1, 1]), "y": np.diag([-1.0, 1, -1, 1]), "z": np.diag([-1.0, -1, 1, 1])}
 _STEPS, _POINTS, _GAUSSIANS = 30, 2_000, 20_000
 
 
 def known_frames(reconstruction: Reconstruction, splat: Path) -> dict[str, Similarity]:
-    """List the possible frames of a splat, by the program that uses them. In a run of nerfstudio, a file
-    beside the splat gives the frame."""
+    """List a splat's possible frames by program. A file beside the splat gives that of a nerfstudio run."""
     cameras = [np.vstack([p.camera_from_world, [0, 0, 0, 1]]) for p in reconstruction.photos.values()]
     poses = np.linalg.inv(np.array(cameras, np.float64))
     frames = _of_run(splat)
     frames["the photos' own, as in 3D Gaussian splatting"] = np.eye(4)
-    for name, axes in {"": np.eye(4), "with z up": _Z_UP, "as before version 1.0": _OLD_Z_UP}.items():
+    for name, axes in {"": np.eye(4), ", with z up": _Z_UP, ", as before version 1.0": _OLD_Z_UP}.items():
         moved = axes @ poses
-        frames[f"nerfstudio's, {name}".rstrip(", ")] = (
-            _centered(moved, _turned(-moved[:, :3, 1], (0, 0, 1))) @ axes
-        )
-        frames[f"centered and scaled, {name}".rstrip(", ")] = _centered(moved, np.eye(4)) @ axes
+        frames[f"nerfstudio's{name}"] = _centered(moved, _turned(-moved[:, :3, 1], (0, 0, 1))) @ axes
+        frames[f"centered and scaled{name}"] = _centered(moved, np.eye(4)) @ axes
     frames |= _gsplat(poses, reconstruction.points)
     return frames | {f"the photos' own, turned about {name}": turn for name, turn in _HALF_TURNS.items()}
 
@@ -78,8 +74,7 @@ def _scaled(factor: float) -> Similarity:
 
 def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[str, Similarity]:
     """Compute the normalization of gsplat's examples: up is −y, the origin is where the cameras look, and the
-    median camera is at distance 1. With points, their principal axes follow, and the one of smallest variance
-    becomes z."""
+    median camera is at distance 1. Then the points' principal axes follow, the smallest variance at z."""
     turn = _turned(-poses[:, :3, 1], (0, -1, 0))
     turned = turn @ poses
     places, forward = turned[:, :3, 3], turned[:, :3, 2]
@@ -88,15 +83,15 @@ def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[s
     shift[:3, 3] = -np.median(nearest, axis=0)
     distance = np.median(np.linalg.norm(places + shift[:3, 3], axis=1))
     first = _scaled(1 / max(float(distance), 1e-12)) @ shift @ turn
+    frames = {"gsplat's, without points": first}
     if len(points) < 4:
-        return {"gsplat's, without points": first}
+        return frames
     middle, axes, _ = _principal(points @ first[:3, :3].T + first[:3, 3])
     principal = np.eye(4)
     principal[:3, :3], principal[:3, 3] = axes.T, -axes.T @ middle
+    frames["gsplat's"] = principal @ first
     # Versions differ in the signs of the axes.
-    turns = {"gsplat's": np.eye(4)} | {f"gsplat's, turned about {n}": turn for n, turn in _HALF_TURNS.items()}
-    frames = {"gsplat's, without points": first}
-    return frames | {name: turn @ principal @ first for name, turn in turns.items()}
+    return frames | {f"gsplat's, turned about {n}": t @ principal @ first for n, t in _HALF_TURNS.items()}
 
 
 def registered_frames(points: Float[Array, "m 3"], means: Float[Array, "n 3"]) -> dict[str, Similarity]:
@@ -123,8 +118,7 @@ def _typical(points: Float[Array, "m 3"]) -> Float[Array, "k 3"]:
 def _closest(
     source: Float[Array, "m 3"], target: Float[Array, "n 3"], tree: KDTree, turn: Float[Array, "3 3"]
 ) -> tuple[float, Similarity]:
-    """Run iterated closest points from principal axes and a rotation. Returns the mean distance in units of
-    the size, and the similarity."""
+    """Run iterated closest points from principal axes and a rotation. Returns mean distance / size, fit."""
     from skimage.transform import estimate_transform  # takes a second to import
 
     (a, from_axes, small), (b, to_axes, size) = map(_principal, (source, target))
@@ -141,8 +135,7 @@ def _closest(
 
 
 def _principal(points: Float[Array, "m 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"], float]:
-    """Return the middle of points, their principal axes as columns of a rotation, largest variance first, and
-    their mean distance from the middle."""
+    """Return points' middle, principal axes (columns, largest variance first) and mean distance to middle."""
     middle = np.median(points, axis=0)
     axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))[1][:, ::-1].copy()
     axes[:, 0] *= np.sign(np.linalg.det(axes))

@@ -46,8 +46,7 @@ _MOST_CLOSE = 0.1
 _COVERED = 0.35
 """Smallest share of a view that the splat must cover."""
 _BLURRED = 2.0
-"""Median size of the Gaussians in a view, relative to the median view, above which the view is blurred: it is
-closer than the splat's own photos were."""
+"""Median size of a view's Gaussians, relative to the median view's, above which it is taken too close."""
 _PROBES, _ROOFED = 64, 0.7
 """Number of places tried, and the share of them with matter above from which a scene is indoors."""
 _TILT = 0.4
@@ -82,13 +81,13 @@ class Extent:
     def of(cls, splats: Splats, up: Up) -> Extent:
         """Measure the extent. Raises UserError if there is no matter."""
         solid = solids(splats)
-        means = solid.means
-        center = means.median(0).values
-        radius = float((means - center).norm(dim=1).quantile(0.75))
-        direction = find_up(solid, center, radius) if up == "auto" else _axis(up).to(means)
-        heights = (means - center) @ direction
-        near = (means - center).norm(dim=1) < 1.5 * radius
-        return cls(center, radius, direction, float(heights[near].quantile(0.05)))
+        center = solid.means.median(0).values
+        places = solid.means - center
+        distance = places.norm(dim=1)
+        radius = float(distance.quantile(0.75))
+        direction = find_up(solid, center, radius) if up == "auto" else _axis(up).to(places)
+        near = places[distance < 1.5 * radius]
+        return cls(center, radius, direction, float((near @ direction).quantile(0.05)))
 
 
 def solids(splats: Splats) -> Splats:
@@ -100,8 +99,7 @@ def solids(splats: Splats) -> Splats:
 
 
 def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:
-    """Find the up direction, near one of the axes, from the ground: of all flat things at an end of the
-    scene, the ground is the largest."""
+    """Find up, near one of the axes: the ground is the largest of all flat things at an end of the scene."""
     solid = solid.select((solid.means - center).norm(dim=1) < 4 * radius)
     (normals, area), places = _normals(solid), solid.means - center
     best, direction = -math.inf, _axis("z").to(normals)
@@ -295,8 +293,7 @@ def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], 
 
 
 def _inside(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Draw a place over the ground within a radius, at a person's or a story's height, and a target
-    around."""
+    """Draw a place within a radius, a person's or a story's height above the ground, and a target around."""
     x, y, height, angle, tilt = torch.rand(5, generator=draw).tolist()
     side, front = _level(extent.up), _level(extent.up, 0.25)
     place = extent.center + extent.radius * ((2 * x - 1) * side + (2 * y - 1) * front)
@@ -314,8 +311,7 @@ def _level(up: Float[Tensor, "3"], turn: float = 0.0) -> Float[Tensor, "3"]:
 def looking(
     place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "4 4"]:
-    """Build the view matrix (world → camera, OpenCV axes) of an upright camera at a place, looking at a
-    target."""
+    """Build an upright camera's view matrix (world → camera, OpenCV axes) from its place and its target."""
     forward = F.normalize(target - place, dim=0)
     right = F.normalize(torch.linalg.cross(forward, up), dim=0)
     down = torch.linalg.cross(forward, right)

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.query.scene import Scene
 
 
 @showing(
@@ -28,13 +32,11 @@ class Attach(AttachConfig):
     splat: tyro.conf.Positional[Path]
     """File of the splat, or the folder of its run."""
     data: Path | None = None
-    """Photos of the splat: a folder with a COLMAP model or a transforms.json, a folder of photos only, or a
-    video."""
+    """Photos of the splat, with a COLMAP model, with a transforms.json, or alone, or a video."""
     out: Path
     """Scene file to write, NAME.scene."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Texts to search for at the end ("windows; towers"). A picture of the best view of each is written
-    beside the scene."""
+    """Texts to search for at the end ("windows; towers"), with a picture of the best view of each."""
 
     def main(self) -> None:
         from lang3dxl_ns.attachment.attach import attach
@@ -46,23 +48,14 @@ class Attach(AttachConfig):
         say(f'Ask it: lang3dxl query {self.out} --text "windows" --out found')
 
 
-def _show(scene, texts: list[str], out: Path) -> None:
-    """Write a picture of each view that shows a prompt best, named after the prompts."""
+def _show(scene: Scene, texts: list[str], out: Path) -> None:
+    """Write a picture of the view that shows each text best, named after the text."""
     from lang3dxl_ns.common.files import slugs
     from lang3dxl_ns.query.doubt import doubtful
-    from lang3dxl_ns.query.match import save_picture, together
 
-    question, shown = scene.ask(texts), dict[str, list]()
-    for prompt, view in zip(question.prompts, scene.best_views(question), strict=True):
-        shown.setdefault(view, []).append(prompt)
-    told = ["; ".join(prompt.text for prompt in prompts) for prompts in shown.values()]
-    for (view, prompts), text, slug in zip(shown.items(), told, slugs(told), strict=True):
-        matches, picture = scene.matches(scene.ask(prompts), view), out.with_name(f"{out.stem}.{slug}.png")
-        if len(matches) == 1:
-            matches[0].save(picture)
-        else:
-            save_picture(together(matches), picture)
-        say(f"{text}, in the view of {view}: {picture}")
-    for prompt, doubt in zip(question.prompts, question.doubts, strict=True):
-        if advice := doubtful(prompt.text, doubt):
+    matches = scene.query(texts)
+    for match, slug in zip(matches, slugs([match.prompt.text for match in matches]), strict=True):
+        picture = match.save(out.with_name(f"{out.stem}.{slug}.png"))
+        say(f"{match.prompt.text}, in the view of {match.view.name}: {picture}")
+        if advice := doubtful(match.prompt.text, match.doubt):
             say(f"  {advice}")

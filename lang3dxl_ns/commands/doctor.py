@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from glob import glob
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -16,8 +17,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 
 LEAST_MEMORY, LEAST_DISK = 4e9, 10e9
-"""Least memory and disk space without a note, bytes. The disk holds encoders of one or two gigabytes, targets
-of eight megabytes per photo, and a run."""
+"""Least memory and disk space without a note, bytes. Encoders take 1 to 2 GB, and targets 8 MB per photo."""
 
 
 @dataclass(frozen=True)
@@ -93,16 +93,17 @@ def versions() -> Iterator[Finding]:
     """Check Python and the required packages, pycolmap among them, against this package's requirements."""
     from packaging.requirements import Requirement
 
-    fine, remedy = (3, 10) <= sys.version_info[:2] < (3, 13), "nerfstudio needs 3.10, 3.11 or 3.12"
-    remedy = f"{remedy}: make an environment of it"
+    fine, remedy = (
+        (3, 10) <= sys.version_info[:2] < (3, 13),
+        "make an environment of 3.10, 3.11 or 3.12",
+    )
     yield Finding("Python", sys.version.split()[0], fine, remedy, "problem")
     for need in (Requirement(line) for line in requires("lang3dxl-ns") or []):
         if need.marker is not None:
             continue
-        try:
+        found = ""
+        with suppress(PackageNotFoundError):
             found = version(need.name)
-        except PackageNotFoundError:
-            found = ""
         good = found != "" and need.specifier.contains(found.partition("+")[0], prereleases=True)
         remedy = f"pip install '{need.name}{need.specifier}'"
         yield Finding(need.name, found or "not installed", good, remedy, "problem")

@@ -12,9 +12,8 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, write_report
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.evaluation.aggregate import average, pool
+from lang3dxl_ns.evaluation.aggregate import average, pool, pooled_table, read_results, scene_table
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
-from lang3dxl_ns.evaluation.report import pooled_table, read_results, scene_table
 
 REPORT = "scores"
 """Name of the report's files, without suffix."""
@@ -101,8 +100,7 @@ class EvaluateRun(_Scored):
         write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
     def _score_scene(self, file: Path) -> None:
-        from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene
-        from lang3dxl_ns.evaluation.selections import score_selections
+        from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene, score_selections
         from lang3dxl_ns.open_scene import load_scene
 
         if self.ground_truth is None or self.split == "test":
@@ -153,7 +151,7 @@ class EvaluatePool:
 
 @dataclass(kw_only=True)
 class EvaluateSplit:
-    """Choose labeled photos to hold out of training, up to five per category, the same in every call.
+    """Choose labeled photos to hold out of training, up to five that show each category, always the same.
 
     Pass the list to `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`.
     """
@@ -162,13 +160,9 @@ class EvaluateSplit:
     """Folder of the scene's ground truth."""
     out: Path
     """Text file to write."""
-    per_category: int = 5
-    """Number of photos for each category. Photos that show several categories count for each."""
 
     def main(self) -> None:
-        if self.per_category < 1:
-            raise UserError(f"--per-category is {self.per_category}: give 1 or more")
-        names = held_out_photos(GroundTruth(self.ground_truth), self.per_category)
+        names = held_out_photos(GroundTruth(self.ground_truth))
         write_atomically(self.out, "\n".join(names) + "\n")
         print(f"Wrote {len(names)} names to {self.out}")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -52,7 +51,7 @@ class Prepare(PreparationConfig):
             print(f"  {kind}: {files} files, {size / 1e6:.1f} MB")
 
 
-@showing("data", "json", "clip")
+@showing("data", "clip")
 @dataclass(kw_only=True)
 class Needs(PreparationConfig):
     """Measure a scene's needs without training: which optional components will be built, and why.
@@ -62,16 +61,14 @@ class Needs(PreparationConfig):
 
     data: Path
     """Folder with images/ and sparse/0/."""
-    json: bool = False
-    """Print JSON instead of a table."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.needs import as_data, needs_table
+        from lang3dxl_ns.preparation.needs import needs_table
 
         # Keep nerfstudio's start-up output out of the answer.
         with contextlib.redirect_stdout(sys.stderr):
-            needs = _open_datamanager(self, self.data, None).needs
-        print(json.dumps(as_data(needs), indent=2) if self.json else needs_table(needs))
+            table = needs_table(_open_datamanager(self, self.data, None).needs)
+        print(table)
 
 
 def _open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:

@@ -56,8 +56,7 @@ class Query:
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
-    """Text to search for. Repeat the flag, or separate texts with `;`. Negatives are written as '"windows"
-    not "arcades"'."""
+    """Text to search for, such as '"windows" not "arcades"'. Repeat the flag, or separate texts with `;`."""
     not_: _Not = field(default_factory=list)
     """Negative for all texts, such as arcades. Repeat the flag for more."""
     out: Path
@@ -97,7 +96,9 @@ class Query:
                 wanted = question if len(asked) == len(prompts) else scene.ask([prompts[i] for i in asked])
                 matches = scene.matches(wanted, place)
                 for i, match in zip(asked, matches, strict=True):
-                    _write_match(match, folders[i] / name)
+                    match.save(folders[i] / f"{name}.overlay.png")
+                    match.save(folders[i] / f"{name}.npy")
+                    save_picture(match.mask * np.uint8(255), folders[i] / f"{name}.mask.png")
                     where = f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
                     best[i] = max(best[i], (match.score, where), key=lambda found: found[0])
                 if self.coco is not None and isinstance(place, str):
@@ -121,56 +122,48 @@ class Query:
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
         """List file name (no suffix), camera or photo, and prompts of every requested view."""
-        everything = range(len(question.prompts))
+        everything: Sequence[int] = range(len(question.prompts))
         if self.camera_path is not None:
             return [(f"{i:05d}", c, everything) for i, c in enumerate(read_camera_path(self.camera_path))]
         if self.all:
-            photos = [photo.name for photo in scene.photos]
-            return [(n, p, everything) for n, p in zip(file_names(photos), photos, strict=True)]
-        if self.image is not None:
-            name = scene.file.photo(self.image).name
-            return [(file_names([name])[0], name, everything)]
-        best = scene.best_views(question)
-        photos = list(dict.fromkeys(best))
-        asked = [[i for i, b in enumerate(best) if b == photo] for photo in photos]
-        return list(zip(file_names(photos), photos, asked, strict=True))
+            asked = {photo.name: everything for photo in scene.photos}
+        elif self.image is not None:
+            asked = {scene.file.photo(self.image).name: everything}
+        else:
+            best = scene.best_views(question)
+            asked = {photo: [i for i in everything if best[i] == photo] for photo in best}
+        return list(zip(file_names(list(asked)), asked, asked.values(), strict=True))
 
 
 class CocoLabels:
     """A data set in COCO's format, with an annotation for each connected part of each mask."""
 
     def __init__(self, categories: Sequence[str]) -> None:
-        self._images: list[dict[str, Any]] = []
-        self._annotations: list[dict[str, Any]] = []
-        self._categories = [{"id": i, "name": name} for i, name in enumerate(categories, start=1)]
+        self.content: dict[str, Any] = {
+            "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
+            "images": [],
+            "annotations": [],
+            "categories": [{"id": i, "name": name} for i, name in enumerate(categories, start=1)],
+        }
+        """Content of the COCO file."""
 
     def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
         """Add a photo by name, with one mask per category, at the size of the photo's file."""
-        image, (height, width) = len(self._images) + 1, masks[0].shape
-        self._images.append({"id": image, "file_name": photo, "width": width, "height": height})
+        images, annotations = self.content["images"], self.content["annotations"]
+        height, width = masks[0].shape
+        images.append({"id": len(images) + 1, "file_name": photo, "width": width, "height": height})
         for category, mask in enumerate(masks, start=1):
             numbers, _ = label(mask)
             for number, place in enumerate(find_objects(numbers), start=1):
                 area = int(np.count_nonzero(numbers[place] == number))
                 if area < _LEAST_PART * mask.size:
                     continue
-                part = numbers == number
                 rows, columns = place
                 box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
-                outline = {"size": list(part.shape), "counts": run_lengths(part)}
-                labeled = {"id": len(self._annotations) + 1, "image_id": image, "category_id": category}
+                outline = {"size": [height, width], "counts": run_lengths(numbers == number)}
+                labeled = {"id": len(annotations) + 1, "image_id": len(images), "category_id": category}
                 found = {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
-                self._annotations.append({**labeled, **found})
-
-    @property
-    def content(self) -> dict[str, Any]:
-        """Content of the COCO file."""
-        return {
-            "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
-            "images": self._images,
-            "annotations": self._annotations,
-            "categories": self._categories,
-        }
+                annotations.append({**labeled, **found})
 
 
 def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:
@@ -190,13 +183,6 @@ def file_names(photos: list[str]) -> list[str]:
     names = [stem if stems.count(stem) == 1 else name for stem, name in zip(stems, whole, strict=True)]
     names = [name.encode()[:_LONGEST_NAME].decode("utf-8", "ignore") for name in names]
     return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
-
-
-def _write_match(match: Match, stem: Path) -> None:
-    """Write `stem`.overlay.png, .mask.png and .npy."""
-    match.save(stem.with_name(f"{stem.name}.overlay.png"))
-    save_picture(match.mask * np.uint8(255), stem.with_name(f"{stem.name}.mask.png"))
-    match.save(stem.with_name(f"{stem.name}.npy"))
 
 
 def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, folder: Path) -> dict:
@@ -225,8 +211,7 @@ def _view_report(name: str, matches: list[Match]) -> dict:
 class Export:
     """Write a scene in another form. --out writes a splat file of the Gaussians that match a text, in the
     model's frame, which ordinary viewers open. --web writes a web page that answers words by itself.
-    --scene-file writes the scene itself to one file to share, which can be queried without its run and its
-    photos."""
+    --scene-file writes the scene itself to one file, which can be queried without its run and photos."""
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
@@ -239,8 +224,7 @@ class Export:
     web: Path | None = None
     """Folder for a web page that any static server can serve."""
     vocabulary: Path | None = None
-    """File of words that may name a place on the page, one per line, besides the shipped ones and those of
-    the CLIP's tokenizer."""
+    """File of more words that may name a place on the page, one per line."""
     scene_file: Path | None = None
     """Scene file to write, NAME.scene."""
     title: str = ""

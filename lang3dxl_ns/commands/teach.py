@@ -44,14 +44,11 @@ class Teach:
         from lang3dxl_ns.query.scene_file import keep_words
         from lang3dxl_ns.query.teach import known_word
 
-        scene, file = opened(self.scene)
-        example = self._example()
-        before = scene.words.get(known_word(self.word))
-        examples = [*(before.examples if before else ()), example]
-        taught = scene.teach(self.word, examples)
-        word = taught.words[known_word(self.word)]
+        (scene, file), name = opened(self.scene), known_word(self.word)
+        before = scene.words[name].examples if name in scene.words else ()
+        taught = scene.teach(self.word, [*before, self._example()])
         keep_words(file, taught.words.values())
-        say(*described(word))
+        say(*described(taught.words[name]))
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
 
     def _example(self) -> Example:
@@ -106,20 +103,15 @@ class Words:
 
 def opened(path: Path | None) -> tuple[Scene, Path]:
     """Open a scene, and find the file that keeps its words. Raises UserError if there is none."""
-    from lang3dxl_ns.open_scene import find_scene_file
+    from lang3dxl_ns.open_scene import existing_scene_file
     from lang3dxl_ns.query.scene_file import read_scene
 
-    file = find_scene_file(path)
-    if file is None:
-        raise UserError(
-            "this run has no file to keep words in: write one with lang3dxl export --scene-file NAME.scene"
-        )
+    file = existing_scene_file(path)
     return read_scene(file), file
 
 
 def forgotten(scene: Scene, which: str) -> Scene:
-    """Return the scene without a word (doors), or without one of its examples (doors/2). Raises UserError if
-    it was not taught."""
+    """Return the scene without a word (doors) or an example of it (doors/2). Raises UserError without it."""
     from lang3dxl_ns.query.teach import known_word
 
     name, _, number = which.rpartition("/")
@@ -150,9 +142,8 @@ def described(word: TaughtWord) -> list[str]:
 
 def _marks(example: Example) -> str:
     counts = {"point": len(example.points), "point elsewhere": len(example.not_points)}
-    kinds = {"outline": example.mask is not None, "box": example.box is not None}
-    marked = [kind for kind, there in kinds.items() if there]
-    return ", ".join([*marked, *(f"{count} {what}" for what, count in counts.items() if count)])
+    marked = "outline" if example.mask is not None else "box" if example.box is not None else ""
+    return ", ".join(filter(None, [marked, *(f"{count} {what}" for what, count in counts.items() if count)]))
 
 
 def _numbers(text: str, count: int, usage: str) -> tuple[float, ...]:

@@ -10,8 +10,6 @@ import tyro
 
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.common.settings_help import showing
 
 
@@ -28,8 +26,6 @@ class View:
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Prompt to start with. Repeat the flag, or separate prompts with `;`."""
-    vocabulary: Path | None = None
-    """File of words that may name a place, one per line, besides the shipped ones."""
     host: str = "127.0.0.1"
     """Address to serve at. 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
@@ -43,9 +39,8 @@ class View:
         from lang3dxl_ns.query.web.write_page import Page
 
         check_address(self.host, self.port)  # fail now rather than after the work
-        words = read_names(self.vocabulary, "words") if self.vocabulary else ()
         scene = load_scene(self.scene, clip=self.clip)
-        page = Page(scene, self.text, words, provenance=provenance_of(self.scene), live=True)
+        page = Page(scene, self.text, provenance=provenance_of(self.scene), live=True)
         server = PageServer(page, self.host, self.port)
         who = "anyone with this address" if server.access.needs_token else "this machine only"
         say(f"Open {server.access.address} ({who}). Ctrl-C ends it.")
@@ -61,15 +56,10 @@ class Info:
     """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.open_scene import find_scene_file
+        from lang3dxl_ns.open_scene import existing_scene_file
         from lang3dxl_ns.query.scene_file import describe_scene_file
 
-        file = find_scene_file(self.scene)
-        if file is None:
-            raise UserError(
-                "the run has no scene file: `lang3dxl export RUN --scene-file NAME.scene` writes one"
-            )
-        told = describe_scene_file(file)
+        told = describe_scene_file(existing_scene_file(self.scene))
         decoder, count = told["decoder"], told["gaussians"]
         words = "none: colors alone" if decoder is None else f"CLIP {told['clip']}, decoder {decoder['name']}"
         lines = {name.replace("_", " "): value for name, value in vars(told["provenance"]).items()} | {

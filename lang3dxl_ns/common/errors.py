@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import struct
 import unicodedata
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 DAMAGE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
@@ -13,16 +15,23 @@ DAMAGE = (
 
 
 class UserError(Exception):
-    """Error in the user's data or settings. The message names it and the remedy. Commands print only the
-    message, without a traceback."""
+    """Error in the user's data or settings. Commands print its message alone, which names the remedy."""
 
     def __str__(self) -> str:
         return printable(super().__str__())
 
 
+@contextmanager
+def readable(problem: str, remedy: str) -> Iterator[None]:
+    """Turn errors of reading a damaged file into a UserError: problem (error): remedy."""
+    try:
+        yield
+    except DAMAGE as error:
+        raise UserError(f"{problem} ({in_a_line(error)}): {remedy}") from error
+
+
 def printable(text: str) -> str:
-    """Escape control characters and lone surrogates, because a file's name may hold commands for the
-    terminal. Line breaks and tabs stay."""
+    """Escape lone surrogates, and control characters but line breaks and tabs: names may steer terminals."""
     return "".join(c if c in "\n\t" or not _commands(c) else repr(c)[1:-1] for c in text)
 
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 
 _MOST_BYTES = 64 << 20
 """Largest file of settings, names or figures, bytes. Files of arrays have their own limits."""
@@ -37,8 +37,7 @@ def check_regular(path: Path) -> None:
 
 
 def read_text(path: Path, most: int = _MOST_BYTES) -> str:
-    """Read UTF-8 text from a regular file of at most `most` bytes. Raises OSError, or ValueError for a larger
-    file or invalid UTF-8."""
+    """Read UTF-8 text from a regular file. Raises OSError, or ValueError for more than `most` bytes."""
     with open_file(path) as file:
         content = file.read(most + 1)
     if len(content) > most:
@@ -138,13 +137,10 @@ def slugs(texts: Sequence[str]) -> list[str]:
 
 
 def read_names(path: Path, what: str = "photos") -> tuple[str, ...]:
-    """Read names of photos, or other texts, from a text file, one per line and each once. Blank lines and
-    comments (#) are skipped. `what` names the texts in messages. Raises UserError for a file that cannot be
-    read or is empty."""
-    try:
+    """Read names of photos, or other texts (`what` in messages), one per line of a file, each once. Blank
+    lines and comments (#) are skipped. Raises UserError for a file that cannot be read or is empty."""
+    with readable(f"the list of {what} {path} can't be read", "correct or replace it"):
         lines = read_text(expanded(path)).splitlines()
-    except (OSError, ValueError) as error:
-        raise UserError(f"the list of {what} {path} can't be read ({error})") from error
     names = tuple(dict.fromkeys(name for line in lines if (name := line.partition("#")[0].strip())))
     if not names:
         raise UserError(f"the list of {what} {path} is empty: write one per line")

@@ -17,8 +17,7 @@ from lang3dxl_ns.common.console import say
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function for each number type it is called with. It releases Python's lock. The machine code
-    is cached beside the source or in the user's numba folder. If neither is writable, it is compiled anew in
-    every process."""
+    is cached beside the source or in the user's numba folder, or else made anew in every process."""
     try:
         compiled = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
     except RuntimeError:  # numba raises this if there is no cache folder

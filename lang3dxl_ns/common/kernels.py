@@ -27,8 +27,7 @@ def takes_kernels(tensor: Tensor, wanted: str | None = None) -> bool:
 
 @functools.cache
 def numba_works() -> bool:
-    """Return whether numba is installed and compiles. A broken one is reported, such as one that does not
-    match numpy or LLVM."""
+    """Return whether numba is installed and compiles; report one that is broken, as by another numpy."""
     try:
         import numba  # noqa: F401
 

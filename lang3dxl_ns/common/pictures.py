@@ -11,8 +11,7 @@ from PIL import Image
 from lang3dxl_ns.common.errors import DAMAGE
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "AVIF")
-"""Accepted formats, whatever the file's name. Pillow knows forty more, some of which start other programs
-(EPS: Ghostscript)."""
+"""Accepted formats, whatever the file's name. Some of Pillow's others start programs (EPS: Ghostscript)."""
 
 
 class NoPictureError(Exception):
@@ -22,8 +21,7 @@ class NoPictureError(Exception):
 @contextmanager
 def open_picture(path: Path) -> Iterator[Image.Image]:
     """Open the picture in a file, and close it afterwards. Raises OSError for errors of the disk, and
-    NoPictureError for a damaged file or another format, even if the enclosed block is the first to read the
-    pixels."""
+    NoPictureError for a damaged file or another format, in the enclosed block too."""
     if path.exists() and not path.is_file():
         raise NoPictureError("not a file")  # reading a pipe would never end
     Image.init()  # otherwise Pillow knows only the most common formats

@@ -39,9 +39,8 @@ def scene_presets() -> list[str]:
 
 
 def train_flags(name: str) -> list[str]:
-    """Return the flags of `ns-train lang3dxl-paper`: a scene's crop range and how its schedule differs from
-    the method's, or everything that the authors' release does differently. Raises UserError for a preset that
-    is not for training."""
+    """Return flags of `ns-train lang3dxl-paper`: a scene's crop range and schedule, or what the authors'
+    release does differently. Raises UserError for a preset that is not for training."""
     settings = load_preset(name)
     if "train" not in settings:
         choices = ", ".join([OFFICIAL, *scene_presets()])

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import platform
-import shlex
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import date
@@ -42,30 +40,6 @@ def _processor_name() -> str:
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, "") or platform.processor() or platform.machine()
-
-
-def command_line(command: str, settings: Any) -> str:
-    """Return the command that repeats a run: `command`, and a flag for each of the `settings` not at its
-    default. `settings` is a dataclass instance whose fields tyro turned into flags."""
-    words = [command]
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        default = field.default_factory() if callable(field.default_factory) else field.default
-        name = field.name.replace("_", "-")
-        if value == default:
-            continue
-        if isinstance(value, bool):
-            words.append(f"--{name}" if value else f"--no-{name}")
-        elif isinstance(value, str) and value.startswith("-"):  # would be parsed as a flag
-            words.append(f"--{name}={shlex.quote(value)}")
-        else:
-            words += [f"--{name}", *_quoted(value)]
-    return " ".join(words)
-
-
-def _quoted(value: Any) -> list[str]:
-    nested = isinstance(value, tuple | list)
-    return [word for item in value for word in _quoted(item)] if nested else [shlex.quote(str(value))]
 
 
 def synchronize() -> None:

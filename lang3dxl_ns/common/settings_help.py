@@ -25,8 +25,7 @@ def without(*names: str) -> Callable[[Class], Class]:
 
 
 def showing(*names: str) -> Callable[[Class], Class]:
-    """Return a dataclass decorator that hides all but these settings from `--help`. Commands still accept the
-    others, and `--help-all` prints them too."""
+    """Return a dataclass decorator that hides all but these settings from `--help`, not from `--help-all`."""
 
     def hide(kind: Class) -> Class:
         if not {"-h", "--help"} & set(sys.argv[1:]):  # tyro would not accept what it does not print

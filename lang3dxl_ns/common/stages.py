@@ -1,18 +1,13 @@
-"""Stages of a long command: which one runs, the total time left, and seconds and memory of each."""
+"""Stages of a long command: which one runs, and the total time left."""
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import DAMAGE
-from lang3dxl_ns.common.files import read_json, write_atomically
-from lang3dxl_ns.common.reports import host_peak
 
 _FIRST_ESTIMATE_S = 20.0
 """Seconds of a stage before its pace is trusted."""
@@ -21,20 +16,17 @@ _FIRST_ESTIMATE_S = 20.0
 class Stages:
     """Announcements of a command's stages, with an estimate of the time left for all of them.
 
-    `shares` has the stages in order, with their usual shares of the time. The file `path` keeps their seconds
-    and peak memory, summed over interrupted commands. Without it, nothing is kept, and memory is not
-    measured, because that resets the process's peak.
+    `shares` has the stages in order, with their usual shares of the time.
     """
 
-    def __init__(self, shares: Mapping[str, float], path: Path | None = None) -> None:
-        self._shares, self._path = dict(shares), path
-        self._spent = {} if path is None else _spent(path)
+    def __init__(self, shares: Mapping[str, float]) -> None:
+        self._shares = dict(shares)
         self._current: str | None = None
         self._start, self._tenths = 0.0, -1
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Announce and measure a stage."""
+        """Announce a stage, and end it."""
         self.begin(name)
         try:
             yield
@@ -45,20 +37,15 @@ class Stages:
         """End the present stage, if there is one, and announce another."""
         self.end()
         self._current, self._start, self._tenths = name, time.perf_counter(), -1
-        if self._path is not None:
-            host_peak(reset=True)
-        self._announce(name)
+        say(self._announcement(name))
+
+    def _announcement(self, name: str) -> str:
+        order = list(self._shares)
+        return f"\n{order.index(name) + 1} of {len(order)}: {name}"
 
     def end(self) -> None:
         """End the present stage, if there is one."""
-        if self._current is None:
-            return
-        spent = self._spent.setdefault(self._current, {"seconds": 0.0, "peak_mb": 0.0})
-        spent["seconds"] += time.perf_counter() - self._start
         self._current = None
-        if self._path is not None:
-            spent["peak_mb"] = max(spent["peak_mb"], host_peak() / 2**20)
-            write_atomically(self._path, json.dumps(self._spent, indent=1))
 
     def progress(self, done: float) -> None:
         """Say about how long everything that is left takes, once the pace is known and at every tenth of the
@@ -77,33 +64,6 @@ class Stages:
         """Expect a stage to take `times` as long as another one."""
         if name in self._shares and other in self._shares:
             self._shares[name] = times * self._shares[other]
-
-    def figures(self) -> dict[str, dict[str, float]]:
-        """Return seconds and peak memory (MB) by stage."""
-        return {
-            kind: {name: math.ceil(10 * spent[kind]) / 10 for name, spent in self._spent.items()}
-            for kind in ("seconds", "peak_mb")
-        }
-
-    def _announce(self, name: str) -> None:
-        """Say which stage begins and, from the second on, about how long everything left will take."""
-        order = list(self._shares)
-        place = order.index(name)
-        done = [stage for stage in order[:place] if stage in self._spent]
-        line = f"\n{place + 1} of {len(order)}: {name}"
-        if done and self._path is not None:
-            pace = sum(self._spent[s]["seconds"] for s in done) / sum(self._shares[s] for s in done)
-            line += f" ({roughly(pace * sum(self._shares[s] for s in order[place:]))} left)"
-        say(line)
-
-
-def _spent(path: Path) -> dict[str, dict[str, float]]:
-    """Read the figures of an earlier command; none if damaged, because only an estimate needs them."""
-    try:
-        found = read_json(path)
-        return {n: {kind: float(f[kind]) for kind in ("seconds", "peak_mb")} for n, f in found.items()}
-    except DAMAGE:
-        return {}
 
 
 def roughly(seconds: float) -> str:

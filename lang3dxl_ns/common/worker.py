@@ -30,19 +30,13 @@ class Worker:
 
     def _run(self) -> None:
         while True:
-            job = self._next()
+            with self._changed:
+                while self._waiting is None or self._waiting[0] > time.monotonic():
+                    self._changed.wait(None if self._waiting is None else self._waiting[0] - time.monotonic())
+                job, self._waiting, self._busy = self._waiting[1], None, True
             try:
                 job()
             finally:
                 with self._changed:
                     self._busy = False
                     self._changed.notify_all()
-
-    def _next(self) -> Callable[[], None]:
-        with self._changed:
-            while True:
-                left = None if self._waiting is None else self._waiting[0] - time.monotonic()
-                if self._waiting is not None and left is not None and left <= 0:
-                    job, self._waiting, self._busy = self._waiting[1], None, True
-                    return job
-                self._changed.wait(left)

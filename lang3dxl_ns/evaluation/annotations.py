@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
@@ -26,20 +24,6 @@ class Truth:
     """True on the object."""
     boxes: Float[Array, "n 4"] | None = None
     """Left, top, right and bottom in pixels of the mask, edges included; None if the labels have no boxes."""
-
-
-class Annotation(Protocol):
-    """Label of a category in a photo, read on demand."""
-
-    def size(self) -> tuple[int, int]:
-        """Return height and width of the labeled photo."""
-
-    def truth(self, size: tuple[int, int]) -> Truth:
-        """Read the annotation at `size` (height, width). Raises UserError for another aspect ratio."""
-
-
-Annotations = Mapping[str, Mapping[str, Annotation]]
-"""Annotations by category, then by photo. A photo is named by its name without suffix, or the end of that."""
 
 
 def read_gray(path: Path, what: str = "ground truth") -> Image.Image:

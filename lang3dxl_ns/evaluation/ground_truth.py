@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
@@ -11,16 +11,17 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth
-from lang3dxl_ns.evaluation.lerf_ovs import is_lerf_ovs, read_lerf_ovs
-from lang3dxl_ns.evaluation.mask_folders import is_holyscenes, read_holyscenes, read_plain
+from lang3dxl_ns.evaluation.annotations import Truth
+from lang3dxl_ns.evaluation.lerf_ovs import Outlines, is_lerf_ovs, read_lerf_ovs
+from lang3dxl_ns.evaluation.mask_folders import MaskFile, is_holyscenes, read_holyscenes, read_plain
 
 Layout = Literal["holyscenes", "lerf_ovs", "plain"]
-_READERS: dict[str, Callable[[Path], Annotations]] = {
+_READERS: dict[str, Callable[[Path], Mapping[str, Mapping[str, MaskFile | Outlines]]]] = {
     "holyscenes": read_holyscenes,
     "lerf_ovs": read_lerf_ovs,
     "plain": read_plain,
 }
+"""Readers of annotations by category, then by photo (its name without suffix, or the end of that)."""
 
 
 class GroundTruth:
@@ -79,7 +80,7 @@ class GroundTruth:
         """Read only the masks of `truths`."""
         return {category: truth.mask for category, truth in self.truths(photo, size).items()}
 
-    def _of(self, photo: str) -> dict[str, Annotation]:
+    def _of(self, photo: str) -> dict[str, MaskFile | Outlines]:
         key = self.key(photo)
         return {c: photos[key] for c, photos in self._annotations.items() if key in photos} if key else {}
 

@@ -82,9 +82,8 @@ class HalfImageProtocol:
         mask: Bool[Tensor, "h w"] | None = None,
         steps: int = STEPS,
     ) -> Float[Tensor, " v"]:
-        """Fit the appearance vector to the leftmost columns of a photo, from the vector of an unseen view.
-        The loss is the color loss of training, on the mask's foreground. 0 steps return the initial
-        vector."""
+        """Fit the appearance vector to a photo's leftmost columns, by training's color loss on the mask's
+        foreground. It starts, and with 0 steps ends, at the vector of an unseen view."""
         camera = camera.to(self.splats.means.device)
         vector = self.field.of_view(camera).vector.clone().requires_grad_()
         view = Camera(camera.view_matrix, camera.intrinsics, left.shape[1], left.shape[0])

@@ -23,10 +23,7 @@ Masks = Mapping[str, Bool[Array, "h w"]]
 
 
 def label_limit(
-    splats: Splats,
-    views: Iterable[tuple[Camera, Masks]],
-    categories: list[str],
-    backend: Backend = "auto",
+    splats: Splats, views: Iterable[tuple[Camera, Masks]], categories: list[str], backend: Backend = "auto"
 ) -> Callable[[Camera], Maps]:
     """Return a function from a view to its maps by category, at the size of the rendering."""
     shares = lifted_labels(splats, views, categories, backend)
@@ -36,10 +33,7 @@ def label_limit(
 
 
 def lifted_labels(
-    splats: Splats,
-    views: Iterable[tuple[Camera, Masks]],
-    categories: list[str],
-    backend: Backend = "auto",
+    splats: Splats, views: Iterable[tuple[Camera, Masks]], categories: list[str], backend: Backend = "auto"
 ) -> Float[Tensor, "n categories"]:
     """Compute each Gaussian's mean label over the pixels that it contributes to, weighted by compositing
     weight, in all `views` that label the category. It is 0 for Gaussians that none of these views shows."""

@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
-from lang3dxl_ns.evaluation.annotations import Annotation, Annotations, Truth, check_shape
+from lang3dxl_ns.evaluation.annotations import Truth, check_shape
 
 _SLACK = 0.02
 """Share of a side by which hand-drawn outlines may exceed the photo. They are clipped to it."""
@@ -55,19 +55,17 @@ def is_lerf_ovs(folder: Path) -> bool:
     return any(folder.glob("*.json"))
 
 
-def read_lerf_ovs(folder: Path) -> Annotations:
+def read_lerf_ovs(folder: Path) -> dict[str, dict[str, Outlines]]:
     """Read the labels of a scene, `folder`/<photo>.json. Raises UserError that names an invalid file."""
     paths = sorted(folder.glob("*.json"))
     if not paths:
         deeper = next(folder.glob("**/*.json"), None)
         hint = f"; there are some in {deeper.parent}: pass that folder" if deeper else ""
         raise UserError(f"{folder} holds no labels <photo>.json{hint}")
-    found: dict[str, dict[str, Annotation]] = {}
+    found: dict[str, dict[str, Outlines]] = {}
     for path in paths:
-        try:
+        with readable(f"labels {path} can't be used", "fix or remove the file"):
             labels = _read_labels(path)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-            raise UserError(f"labels {path} can't be used ({error}): fix or remove the file") from error
         for category, outlines in labels.items():
             found.setdefault(category, {})[path.stem] = outlines
     if not found:
@@ -92,8 +90,7 @@ def _read_labels(path: Path) -> dict[str, Outlines]:
 
 
 def _read_object(item: Any, height: int, width: int) -> tuple[str, tuple[Any, ...], tuple[float, ...]]:
-    """Read name, outline and box of an object. The name becomes part of a path and must stay in its
-    folder."""
+    """Read name (which becomes part of a path and must stay in its folder), outline and box of an object."""
     category = item["category"].strip()
     plain = category not in ("", ".", "..") and not set(category) & set("/\\\0")
     expect(plain, f"{category!r} is not a plain name")

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.evaluation.annotations import PICTURES, Annotations, Truth, check_shape, read_gray
+from lang3dxl_ns.evaluation.annotations import PICTURES, Truth, check_shape, read_gray
 
 _MASK, _PHOTO = "-gt", "-img"
 
@@ -51,7 +51,7 @@ def is_holyscenes(folder: Path) -> bool:
     return any(path.stem.endswith(_MASK) for path in folder.glob("*/*"))
 
 
-def read_holyscenes(folder: Path) -> Annotations:
+def read_holyscenes(folder: Path) -> dict[str, dict[str, MaskFile]]:
     """Read the masks of a scene in HolyScenes' layout. Raises UserError for a folder without masks, also a
     category's, and for a photo without its mask."""
     if not is_holyscenes(folder):
@@ -72,7 +72,7 @@ def read_holyscenes(folder: Path) -> Annotations:
     return found
 
 
-def read_plain(folder: Path) -> Annotations:
+def read_plain(folder: Path) -> dict[str, dict[str, MaskFile]]:
     """Read the plain masks of a scene. Raises UserError for a folder without masks, also a prompt's."""
     found = {}
     for category, pictures in _categories(folder):

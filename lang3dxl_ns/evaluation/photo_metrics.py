@@ -51,9 +51,8 @@ def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) ->
 
 
 class Lpips:
-    """LPIPS (AlexNet), loaded at first use. It is skipped unless its weights are in torch's cache, because
-    nothing is downloaded without a request. It is not an nn.Module, so that AlexNet stays out of
-    checkpoints."""
+    """LPIPS (AlexNet), loaded at first use, or skipped if its weights are not in torch's cache: nothing is
+    downloaded without a request. It is not an nn.Module, so that AlexNet stays out of checkpoints."""
 
     @cached_property
     def _metric(self) -> nn.Module | None:
@@ -107,17 +106,10 @@ def feature_metrics(
     cells = target.new_ones(target.shape[:2], dtype=torch.bool) if weight is None else weight > 0
     if not cells.any():
         return {}
-    metrics = _agreement(predicted[cells], target[cells])
-    baseline = _agreement(mean.expand_as(target)[cells], target[cells])
-    return {f"{kind}_{name}": value for name, value in metrics.items()} | {
-        f"{kind}_{name}_of_mean": value for name, value in baseline.items()
-    }
-
-
-def _agreement(predicted: Float[Tensor, "n c"], target: Float[Tensor, "n c"]) -> dict[str, float]:
-    predicted, target = predicted.double(), target.double()
-    return {
-        "l1": float(F.l1_loss(predicted, target)),
-        "psnr": float(psnr(predicted, target)),
-        "cosine": float(F.cosine_similarity(predicted, target, dim=-1).mean()),
-    }
+    figures, wanted = {}, target[cells].double()
+    for whose, features in (("", predicted), ("_of_mean", mean.expand_as(target))):
+        found = features[cells].double()
+        figures[f"{kind}_l1{whose}"] = float(F.l1_loss(found, wanted))
+        figures[f"{kind}_psnr{whose}"] = float(psnr(found, wanted))
+        figures[f"{kind}_cosine{whose}"] = float(F.cosine_similarity(found, wanted, dim=-1).mean())
+    return figures

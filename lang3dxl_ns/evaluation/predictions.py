@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_array, slugs
 from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.evaluation.annotations import PICTURES, check_shape, read_gray
@@ -87,10 +87,8 @@ def _read_map(
 
 
 def _read_array(path: Path) -> Float[Array, "*levels h w"]:
-    try:
+    with readable(f"map {path} can't be read", "write it with numpy.save"):
         score = read_array(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"map {path} can't be read ({error}): write it with numpy.save") from error
     if score.ndim not in (2, 3) or 0 in score.shape:
         raise UserError(f"map {path} has shape {score.shape}, not [h, w] or [levels, h, w]")
     if score.dtype.kind not in "fiub":

@@ -30,9 +30,8 @@ _VOTERS = 7
 
 
 def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"]) -> float | None:
-    """Compute AP = Σ (R_n − R_{n−1}) P_n over all pixels as scikit-learn does; None without a positive. Equal
-    scores form one step, so the order of pixels does not matter. Raises ValueError on NaN or on shapes that
-    differ."""
+    """Compute AP = Σ (R_n − R_{n−1}) P_n over all pixels as scikit-learn does, with equal scores as one step;
+    None without a positive. Raises ValueError on NaN or on shapes that differ."""
     from sklearn.metrics import average_precision_score
 
     if score.shape != truth.shape:
@@ -60,9 +59,8 @@ def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) ->
 
 
 def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, float]:
-    """Compute intersection over union, F1, balanced accuracy, pixel accuracy (share of pixels classified
-    correctly) and precision (0 if there is no match) of a mask. The truth must have a positive. If it has no
-    negative, balanced accuracy is the recall."""
+    """Compute intersection over union, F1, balanced accuracy (the recall if the truth has no negative), pixel
+    accuracy and precision (0 if there is no match) of a mask. The truth must have a positive."""
     both, missed = np.count_nonzero(found & truth), np.count_nonzero(truth & ~found)
     extra = np.count_nonzero(found & ~truth)
     negatives = truth.size - both - missed
@@ -186,8 +184,8 @@ def bounds(labels: Maps, truths: Mapping[str, Truth]) -> dict[str, float]:
     for category, truth in truths.items():
         best = average_precision(labels[category].cpu().numpy(), truth.mask)
         if best is not None:
-            chance = float(truth.mask.mean())
-            found |= {f"chance_ap_{category}": chance, f"limit_ap_{category}": best}
+            found[f"chance_ap_{category}"] = float(truth.mask.mean())
+            found[f"limit_ap_{category}"] = best
     return found
 
 

@@ -23,6 +23,9 @@ from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 
+_LONGEST = 40
+"""Most characters of a prompt in the summary."""
+
 
 @dataclass(eq=False, repr=False)
 class Conversation:
@@ -71,8 +74,7 @@ class Conversation:
         return None if self._asked is None else self._asked[1]
 
     def ask(self, text: str) -> Question:
-        """Set the question to prompts as `parse_prompts` reads them. Raises UserError if there is none, or
-        the model cannot be queried."""
+        """Set the question to prompts as `parse_prompts` reads them. Raises UserError as `Scene.ask` does."""
         scene = self._scene_now()
         question = scene.ask(text)
         self._asked, self.found = (scene, question), None
@@ -159,7 +161,8 @@ class Conversation:
         """Describe what was found, in Markdown: a line for each prompt, and one for each warning about it."""
         lines = []
         for found in self.found or ():
-            count, text = len(found.views), shortened(found.prompt.text)
+            count, text = len(found.views), found.prompt.text
+            text = text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
             best = max((view.score for view in found.views), default=0.0)
             where = f"{count} good views, best {best:.2f}" if count else "nothing in the scene looks like it"
             lines.append(f"**{plain(text)}**: {where}")
@@ -178,8 +181,3 @@ class Conversation:
 def plain(text: str) -> str:
     """Escape a text for Markdown."""
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
-
-
-def shortened(text: str) -> str:
-    """Shorten a text to at most 40 characters, so that it fits on a button."""
-    return text if len(text) <= 40 else text[:39] + "…"

@@ -36,8 +36,7 @@ unrelated word may fit as well (docs/lab/words.md)."""
 DOUBTFUL_TAUGHT = 0.1
 """The same for words taught by example, whose doubt is measured in what was not marked."""
 LEAST_PEAK = 0.012
-"""Prompts whose peak is below this are doubtful even if all unrelated words match less. Present things reach
-0.3 and more."""
+"""Prompts with a lower peak are doubtful whatever unrelated words reach. Present things reach 0.3 or more."""
 BEST = 0.005
 """Share of the Gaussians that a prompt's peak is the mean of."""
 _AT_A_TIME = 4

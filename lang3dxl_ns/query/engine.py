@@ -16,14 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.query.relevancy import (
-    TEMPERATURE,
-    Decode,
-    Queries,
-    calibrated,
-    cosines_of_codes,
-    in_chunks,
-)
+from lang3dxl_ns.query.relevancy import TEMPERATURE, Decode, Queries, calibrated, cosines_of_codes, in_chunks
 
 _CHUNK_MB = 64
 _SAMPLE = 4096
@@ -112,8 +105,7 @@ class PerGaussian:
 
 @dataclass(frozen=True)
 class PerPixel:
-    """Engine that composites codes, then decodes them pixel by pixel, as in Lang3D-XL. Its methods are those
-    of `PerGaussian`."""
+    """Engine that composites codes, then decodes each pixel (Lang3D-XL). Its methods are `PerGaussian`'s."""
 
     decode: Decode
     codes: Float[Tensor, "n d"]

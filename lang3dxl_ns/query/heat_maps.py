@@ -88,10 +88,8 @@ def tinted(
     return torch.lerp(image, colors[which], strength[..., None].to(image))
 
 
-def with_legend(
-    picture: UInt8[Array, "h w 3"], labels: Sequence[str], colors: Sequence[tuple[int, int, int]]
-) -> UInt8[Array, "h+legend w 3"]:
-    """Add a line for each label below a picture, with a square of the label's color and its text."""
+def with_legend(picture: UInt8[Array, "h w 3"], labels: Sequence[str]) -> UInt8[Array, "h+legend w 3"]:
+    """Add a line for each prompt below a picture: a square of its color, and its label."""
     height, width = picture.shape[:2]
     size = max(width // _FONT_SHARE, 11)
     line = size + size // 2
@@ -100,6 +98,8 @@ def with_legend(
     pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(size)
     for i, label in enumerate(labels):
         top = height + i * line + (line - size) // 2
-        pen.rectangle((size // 2, top, size // 2 + size, top + size), fill=colors[i % len(colors)])
+        pen.rectangle(
+            (size // 2, top, size // 2 + size, top + size), fill=PROMPT_COLORS[i % len(PROMPT_COLORS)]
+        )
         pen.text((2 * size, top + size / 2), " ".join(label.split()), "black", font, anchor="lm")
     return np.asarray(canvas)

@@ -24,7 +24,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import ScenePhoto
-from lang3dxl_ns.query.teach import MASK_SIDE, Example, Point, TaughtWord
+from lang3dxl_ns.query.teach import MASK_SIDE, Example, TaughtWord
 from lang3dxl_ns.rendering.gathering import filled_parts
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import composite
@@ -55,8 +55,7 @@ _TRUST = 3
 
 @dataclass(frozen=True)
 class Weights:
-    """Pixels that each Gaussian fills in an example's photo: those marked as the word, as something else, and
-    all."""
+    """Pixels that each Gaussian fills in an example's photo: of the word, of what is marked as other, all."""
 
     word: Float[Tensor, " n"]
     other: Float[Tensor, " n"]
@@ -74,14 +73,6 @@ class Weights:
         parts = filled_parts(drawn, pixels.to(splats.means.device), len(splats))
         return cls(*parts.unbind(1))
 
-    def check(self, photo: str, word: str) -> None:
-        """Raise UserError if the marks show nothing, or everything."""
-        marked, everything = float(self.word.sum()), float(self.seen.sum())
-        if marked <= 1e-6 * max(everything, 1.0):
-            raise UserError(f"the marks of {word!r} in {photo} lie where the scene shows nothing")
-        if marked >= 0.98 * everything:
-            raise UserError(f"{word!r} is everything that {photo} shows: mark the word alone")
-
     @property
     def rest(self) -> Float[Tensor, " n"]:
         """Shares of what is not the word. Pixels marked as something else weigh as much as all others."""
@@ -91,11 +82,7 @@ class Weights:
 
 
 def learn(
-    name: str,
-    examples: Sequence[Example],
-    weights: Sequence[Weights],
-    engine: QueryEngine,
-    queries: Queries,
+    name: str, examples: Sequence[Example], weights: Sequence[Weights], engine: QueryEngine, queries: Queries
 ) -> TaughtWord:
     """Learn a word from examples, whose order doesn't matter, and from what the marks of each show.
 
@@ -105,7 +92,11 @@ def learn(
     if not examples:
         raise UserError(f"there is no example of {name!r}: mark it in a photo")
     for example, one in zip(examples, weights, strict=True):
-        one.check(example.photo, name)
+        marked, everything = float(one.word.sum()), float(one.seen.sum())
+        if marked <= 1e-6 * max(everything, 1.0):
+            raise UserError(f"the marks of {name!r} in {example.photo} lie where the scene shows nothing")
+        if marked >= 0.98 * everything:
+            raise UserError(f"{name!r} is everything that {example.photo} shows: mark the word alone")
     rows, photos = _sampled(examples, weights)
     sample = engine.features(rows).double()
     # Margin of the text: the cosine minus the best competitor's.
@@ -231,8 +222,7 @@ def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
 def _logistic(
     places: Float[Tensor, "m k"], word: Float[Tensor, " m"], rest: Float[Tensor, " m"], ridge: float
 ) -> tuple[Float[Tensor, " k"], float]:
-    """Fit slope and bias of a logistic regression in which both classes weigh the same:
-    minimize ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|²."""
+    """Minimize ½ Σ word · softplus(−s) + ½ Σ rest · softplus(s) + ½ ridge |slope|², s = slope·x + bias."""
     from sklearn.linear_model import LogisticRegression
 
     labels, inputs, weights = _labeled(places, word / 2, rest / 2)
@@ -261,8 +251,7 @@ def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
 
 def _marks(example: Example, photo: ScenePhoto, size: tuple[int, int]) -> Float[Tensor, "2 h w"]:
     """Compute the share of each pixel of a view (height, width) marked as the word, and as not the word.
-    Marks are drawn on the photo's file, while views are undistorted. Raises UserError if marks lie outside
-    the photo, or have other proportions."""
+    Marks are drawn on the photo's file, while views are undistorted."""
     width, height = photo.file_size
     labels = photo.photo().undistort_labels(_drawn(example, width, height))
     chosen = torch.stack([labels == 1, labels == 2]).float()
@@ -292,15 +281,12 @@ def _drawn(example: Example, width: int, height: int) -> Int[Tensor, "h w"]:
             raise UserError(f"the box {numbers} marks nothing in {place}: give left, top, right and bottom")
         across = slice(int(left * x), max(math.ceil(right * x), int(left * x) + 1))
         labels[int(top * y) : max(math.ceil(bottom * y), int(top * y) + 1), across] = 1
+    down, along = torch.meshgrid(*(torch.arange(side) + 0.5 for side in labels.shape), indexing="ij")
+    radius = max(_REACH * max(labels.shape), 0.8)
     for points, label in ((example.points, 1), (example.not_points, 2)):
         for column, row in points:
             if not (0 <= column <= width and 0 <= row <= height):
                 raise UserError(f"the point {column:g}, {row:g} lies outside {place}")
-            _draw_disk(labels, ((column + 0.5) * x, (row + 0.5) * y), label)
+            distance = torch.hypot(along - (column + 0.5) * x, down - (row + 0.5) * y)
+            labels[distance <= radius] = label
     return labels
-
-
-def _draw_disk(labels: Int[Tensor, "h w"], center: Point, label: int) -> None:
-    rows, columns = torch.meshgrid(*(torch.arange(side) + 0.5 for side in labels.shape), indexing="ij")
-    radius = max(_REACH * max(labels.shape), 0.8)
-    labels[(columns - center[0]) ** 2 + (rows - center[1]) ** 2 <= radius**2] = label

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.query.heat_maps import PROMPT_COLORS, overlay, tinted, with_legend
+from lang3dxl_ns.query.heat_maps import overlay, tinted, with_legend
 from lang3dxl_ns.query.places import Box, Viewpoint
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.rendering.render import Rendering
@@ -131,7 +131,7 @@ def together(matches: Sequence[Match]) -> UInt8[Array, "h+legend w 3"]:
     masks = torch.stack([torch.from_numpy(match.mask) for match in matches])
     lowest = min(match.threshold for match in matches)
     picture = as_bytes(tinted(matches[0].view.rendering.rgb.cpu(), maps, masks, lowest))
-    return with_legend(picture, [match.prompt.text for match in matches], PROMPT_COLORS)
+    return with_legend(picture, [match.prompt.text for match in matches])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -61,8 +61,7 @@ class Viewpoint:
     score: float
     """Mean relevancy of the most relevant thousandth of the view."""
     rank: float
-    """How well the view shows the match, 0…1: closeness of its peak to the scene's highest, times size, times
-    centering (`rank_views`)."""
+    """How well the view shows the match, 0…1: closeness to the scene's highest peak × size × centering."""
     shown: bool
     """Whether the match fills at least one pixel."""
 
@@ -88,14 +87,16 @@ def strongest_match(
     rows = (weights > 0).nonzero().squeeze(1)
     if not len(rows):
         return None
-    level = threshold + STRONG * (_high(scores[rows], mass[rows]) - threshold)
+    # The highest relevancy apart from stray Gaussians: 2 % of the matching mass exceed it.
+    order = rows[scores[rows].argsort(descending=True)]
+    beyond = (mass[order].cumsum(0) < _OUTLIERS * mass[order].sum()).sum()
+    level = threshold + STRONG * (scores[order[beyond.clamp_max(len(order) - 1)]] - threshold)
     strong = rows[scores[rows] >= level]
     return max(groups(means[strong], weights[strong], gap), key=lambda box: box.share)
 
 
 def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
-    """Group points (at least one, of weights above 0), each within `gap` world units of others of its group,
-    and return the groups' boxes."""
+    """Return boxes of groups of points (one or more, of weights above 0) that lie `gap` world units apart."""
     heaviest = weight.argsort(descending=True)[:_MOST_POINTS]
     points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
     from sklearn.cluster import DBSCAN  # imported here, since the import takes a second
@@ -110,13 +111,6 @@ def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float)
         low, high = map(tuple, ends.tolist())
         boxes.append(Box(low, high, total))
     return boxes
-
-
-def _high(scores: Float[Tensor, " n"], mass: Float[Tensor, " n"]) -> float:
-    """Return the relevancy that 2 % of the matching mass exceed: the highest, apart from stray Gaussians."""
-    order = scores.argsort(descending=True)
-    share = mass[order].cumsum(0) / mass.sum()
-    return float(scores[order][int((share < _OUTLIERS).sum().clamp_max(len(order) - 1))])
 
 
 def rank_views(

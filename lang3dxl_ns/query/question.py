@@ -75,8 +75,7 @@ class Question:
 
     @cached_property
     def channels(self) -> Float[Tensor, "n d"]:
-        """Values that Gaussians carry in a rendering that answers the question: the engine's channels, then a
-        1 for each prompt that they match."""
+        """Values that Gaussians carry in a rendering: the engine's, then 1 per prompt that they match."""
         own = self.engine.channels(self.queries)
         return torch.cat([own, self.gaussians.T.to(own)], dim=1)
 

@@ -39,8 +39,7 @@ _ALL_BANDS = 16
 
 
 def find_splats(path: str | Path) -> Path:
-    """Find the file of a splat: the path itself, or the latest file in a run's folder. Raises UserError if
-    there is none."""
+    """Find a splat: the path itself, or the latest file in a run's folder. Raises UserError without one."""
     path = expanded(path)
     if path.is_file():
         return path
@@ -74,18 +73,12 @@ def read_splats(path: str | Path) -> Splats:
         splats = reader(path)
     except ImportError as error:
         raise UserError(f"{path.suffix} files need gsply: pip install 'lang3dxl-ns[share]'") from error
-    except _OtherKindError as error:
-        raise UserError(f"{path} is not a splat: {error}") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     except DAMAGE as error:
         reason = in_a_line(error)
         raise UserError(f"{path} is damaged or incomplete ({reason}): copy or export it again") from error
     return _finite(splats, path)
-
-
-class _OtherKindError(Exception):
-    """Raised for an undamaged file that holds no Gaussians."""
 
 
 def _finite(splats: Splats, path: Path) -> Splats:
@@ -160,9 +153,7 @@ def _ply(path: Path) -> Splats:
         if "chunk" in tables and "packed_position" in columns:
             return _supersplat(path, tables)
         if missing := [name for name in _NEEDED if name not in columns]:
-            raise _OtherKindError(
-                f"its points have no {', '.join(missing[:3])}; a point cloud can't be attached to"
-            )
+            raise UserError(f"not a splat but a point cloud: its points have no {', '.join(missing[:3])}")
         expect(next(iter(tables)) == "vertex", "its points don't come first")
         _check_memory(count, 1 + sum(name.startswith("f_rest_") for name in columns) // 3)
         if form != "ascii":
@@ -271,8 +262,7 @@ def _splat(path: Path) -> Splats:
 
 
 class _NumPyScalar:
-    """Placeholder for NumPy's scalars in pickles, such as a trainer's learning rates, which are never needed.
-    It takes every argument and does nothing."""
+    """Placeholder for NumPy's scalars in pickles, such as a trainer's learning rates; it takes anything."""
 
     def __init__(self, *_: Any) -> None: ...
 
@@ -297,7 +287,7 @@ def _checkpoint(path: Path) -> Splats:
         return _splatfacto(parts["pipeline"], path)
     if isinstance(parts.get("splats"), dict):
         return _gsplat(parts["splats"])
-    raise _OtherKindError("it is a checkpoint of another program than gsplat and nerfstudio")
+    raise UserError("it is a checkpoint of another program than gsplat and nerfstudio")
 
 
 def _gsplat(parts: Mapping[str, Any]) -> Splats:
@@ -329,7 +319,7 @@ def _splatfacto(pipeline: Mapping[str, Any], path: Path) -> Splats:
 def _check_parts(parts: Mapping[str, Any], names: tuple[str, ...]) -> None:
     missing = [name for name in names if not isinstance(parts.get(name), Tensor)]
     if missing:
-        raise _OtherKindError(f"it has no {', '.join(missing)}")
+        raise UserError(f"it is not a splat: it has no {', '.join(missing)}")
     count = len(parts["means"])
     for name, value in parts.items():
         expect(name not in names or len(value) == count, f"{name} are not as many as means")

@@ -24,8 +24,7 @@ _LEAST_SPREAD = 1e-4
 Decode = Callable[[Float[Tensor, "n code"]], Float[Tensor, "n c"]]
 """Function from codes to raw CLIP features, such as `SemanticField.decode_clip`."""
 _CPU_MB, _GPU_MB = 48, 256
-"""Megabytes of the features that are decoded at a time. On a CPU, small parts stay in its cache and take half
-the time."""
+"""Megabytes of features decoded at a time. On a CPU, small parts stay in its cache and take half the time."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +106,7 @@ class Queries:
 
 def spread(cosines: Float[Tensor, "n w"]) -> float:
     """Measure how widely a feature's cosines with a fixed set of words vary: their standard deviation, as
-    root mean square over the features. Features without a direction, whose cosines are all 0 or not finite,
-    are ignored; 0 if none is left."""
+    root mean square over the features with a direction (finite cosines, not all 0); 0 without any."""
     known = (cosines.isfinite() & (cosines != 0)).any(1)
     return float(cosines[known].var(1, correction=0).mean().sqrt()) if known.any() else 0.0
 
@@ -130,18 +128,6 @@ def _largest(cosines: Float[Tensor, "... v"], rows: tuple[int, ...]) -> Float[Te
     for row in rows[1:]:
         largest = torch.maximum(largest, cosines[..., row])
     return largest
-
-
-def relevancy(
-    features: Float[Tensor, "... c"],
-    queries: Float[Tensor, "q c"],
-    canonical: Float[Tensor, "p c"],
-    temperature: float = TEMPERATURE,
-) -> Float[Tensor, "q ..."]:
-    """Compute min_c exp(τ s_q) / (exp(τ s_q) + exp(τ s_c)) = sigmoid(τ (s_q − max_c s_c)), s = cosine (LERF,
-    Kerr et al. 2023). A zero feature gives 0.5. Vectors need not have unit length."""
-    prompts = Queries.of(queries[:, None].unbind(), canonical)
-    return prompts.relevancy_of_cosines(prompts.cosines(features), temperature)
 
 
 def in_chunks(

@@ -23,7 +23,7 @@ from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
@@ -34,6 +34,7 @@ SCENE_FILE = "lang3dxl_scene.json"
 _VERSION = 2
 OUTPUTS = Path("outputs")
 """Folder in which `ns-train` creates runs."""
+_REMEDY = "name a run's folder or config.yml, or train with ns-train lang3dxl --data FOLDER"
 _DEEPEST = 4
 """Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
 
@@ -51,7 +52,7 @@ class ScenePhoto:
     mask: str | bytes | None = None
     """Foreground mask of the photo: its file, or the bytes of a PNG with the undistorted mask."""
     size: tuple[int, int] | None = None
-    """Width and height of the file; None in runs of earlier versions, where the lens's size is used."""
+    """Width and height of the file; None: the lens's."""
 
     def __repr__(self) -> str:
         width, height = self.file_size
@@ -122,17 +123,11 @@ class SceneFile:
     def read(cls, path: Path) -> SceneFile:
         """Read the file. Raises UserError if it is missing, damaged, or of another version."""
         if not path.is_file():
-            raise UserError(
-                f"{path.parent} has no {path.name}, which training writes when it starts: the run is from "
-                f"an earlier version, or its folder is incomplete"
-            )
-        try:
+            raise UserError(f"{path.parent} has no {path.name}, which training writes: copy the whole folder")
+        with readable(f"{path} can't be read", "restore it, or train anew"):
             content: dict[str, Any] = read_json(path)
-            if content.pop("version") != _VERSION:
-                raise ValueError("another version wrote it")
+            expect(content.pop("version") == _VERSION, "another version wrote it")
             return scene_from_json(content)
-        except DAMAGE as error:
-            raise UserError(f"{path} can't be read ({error}): restore it, or train anew") from error
 
     def photo(self, name: str) -> ScenePhoto:
         """Find the photo with this name, or with this file name or stem if only one photo has it.
@@ -194,15 +189,11 @@ def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePh
 
 def read_camera_path(path: Path) -> Sequence[Camera]:
     """Read the cameras of a camera path saved by nerfstudio's viewer. Raises UserError for other files."""
-    try:
+    with readable(f"{path} is not a camera path", "save one in the viewer (Render tab, Save Path)"):
         content = read_json(path)
         width, height = int(content["render_width"]), int(content["render_height"])
         expect(content["camera_path"] != [], "it has no camera")
         return [_path_camera(frame, width, height) for frame in content["camera_path"]]
-    except DAMAGE as error:
-        raise UserError(
-            f"{path} is not a camera path ({error!r}): save one in the viewer (Render tab, Save Path)"
-        ) from error
 
 
 def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
@@ -232,14 +223,8 @@ def find_config(run: str | Path | None = None) -> Path:
         if ours:
             return max(ours, key=lambda path: path.stat().st_mtime)
         others = f" of this method ({len(configs)} of others)" if configs else ""
-        raise UserError(
-            f"{place} holds no run{others}: name the folder of one, or train with ns-train lang3dxl --data "
-            "FOLDER"
-        )
-    if run is None:
-        raise UserError(
-            "there is no outputs/ here: name a run's folder, or train with ns-train lang3dxl --data FOLDER"
-        )
+        raise UserError(f"{place} holds no run{others}: {_REMEDY}")
     if not place.is_file():
-        raise UserError(f"{place} is not a file or folder: pass a run's folder, or its config.yml")
+        what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
+        raise UserError(f"{what}: {_REMEDY}")
     return place

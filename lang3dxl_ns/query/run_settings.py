@@ -21,13 +21,6 @@ from lang3dxl_ns.common.files import read_text
 
 TRUST_VARIABLE = "LANG3DXL_TRUST_CONFIG"
 _PACKAGES = ("lang3dxl_ns", "nerfstudio", "torch.optim", "pathlib")
-_MOVED = {
-    f"lang3dxl_ns.plugin.{module}_config.{name}": f"lang3dxl_ns.plugin.{module}.{name}"
-    for module, name in (("datamanager", "Lang3DXLDataManagerConfig"), ("model", "Lang3DXLModelConfig"))
-}
-"""New module paths of settings classes that earlier versions kept elsewhere."""
-_REMOVED = {"DecoderConfig": ("start",)}
-"""Settings of earlier versions, by class, that only training read; a finished run opens without them."""
 _OURS = re.compile(r"lang3dxl(_|%5f)ns\.|method_name\W+lang3dxl", re.IGNORECASE)
 """Pattern that marks a config.yml as this package's: one of its classes, or a method's name."""
 _DAMAGED = (LookupError, TypeError, AttributeError, ValueError, RecursionError, ImportError)
@@ -186,25 +179,17 @@ class _SettingsLoader(yaml.UnsafeLoader):
 
     def find_python_name(self, name: str, mark: Any) -> Any:  # type: ignore[override]
         """Find a class in the packages that define settings."""
-        name = _MOVED.get(name, name)
         if not name.startswith(tuple(f"{package}." for package in _PACKAGES)):
             raise yaml.constructor.ConstructorError(None, None, f"it asks for {name}", mark)
         found = super().find_python_name(name, mark)
         if not isinstance(found, type) or found.__name__ in _UNSAFE:
-            raise yaml.constructor.ConstructorError(
-                None, None, f"it asks for {name}, which is no class of settings", mark
-            )
+            why = f"it asks for {name}, which is no class of settings"
+            raise yaml.constructor.ConstructorError(None, None, why, mark)
         return found
 
     def find_python_module(self, name: str, mark: Any) -> Any:  # type: ignore[override]
         """Reject modules, which settings never contain."""
         raise yaml.constructor.ConstructorError(None, None, f"it asks for the module {name}", mark)
-
-    def set_python_instance_state(self, instance: Any, state: Any) -> None:
-        """Set the settings as they were saved, except for those that no longer exist."""
-        for name in _REMOVED.get(type(instance).__name__, ()):
-            state.pop(name, None)
-        super().set_python_instance_state(instance, state)
 
     def make_python_instance(
         self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False

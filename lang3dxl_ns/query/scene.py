@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import cached_property
+from dataclasses import KW_ONLY, asdict, dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,40 +18,53 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import watched
+from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.learn_word import Weights, learn
-from lang3dxl_ns.query.match import Found, Match
-from lang3dxl_ns.query.negatives import CLEAR, NOTHING
+from lang3dxl_ns.query.match import Found, Match, View
 from lang3dxl_ns.query.places import Viewpoint, rank_views, strongest_match
+from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.question import Question, match_thresholds
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.run_file import SceneFile
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, overview
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched, texts_of
-from lang3dxl_ns.query.viewed_scene import Place, ViewedScene
-from lang3dxl_ns.query.vocabulary import shipped_vocabulary
-from lang3dxl_ns.rendering.render import composite
-from lang3dxl_ns.scene.camera import Camera, resized
+from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
+from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, shipped_vocabulary
+from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering.render import Rendering, composite
+from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 
 _ROWS = 65_536
 """Number of Gaussians decoded at a time."""
+LARGEST = 1920
+"""Longer side of pictures in pixels if no size is requested."""
 NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
 Text: TypeAlias = str | Prompt | Float[Tensor, " c"] | Float[Array, " c"]
 """A text as `parse_prompts` reads it, or a vector in the space of the scene's CLIP."""
+Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
+"""A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
 
 
 @dataclass(eq=False, repr=False)
-class Scene(ViewedScene):
+class Scene:
     """A scene: Gaussians, what they mean, and the photos they were made from.
 
     The scene never changes. Results that are computed from it once (decoded features, the Gaussians that each
     photo shows) are kept. Any number of threads may use one scene.
     """
 
+    splats: Splats
+    """The Gaussians, in the model's frame."""
+    file: SceneFile
+    """Photos, cameras, and the CLIP that the features come from."""
     decoder: Decoder | None = None
     """Turns codes into features; None for a scene with colors only."""
     codes: Float[Tensor, "n d"] | None = None
@@ -64,6 +77,18 @@ class Scene(ViewedScene):
     """Unit vectors of common words, which need no CLIP."""
     words: Mapping[str, TaughtWord] = field(default_factory=dict)
     """Words taught by example, by their names in lower case; see `with_words`."""
+    looks: AppearanceField | None = None
+    """Lighting of the photos; None if all share one."""
+    background: Float[Tensor, "3"] | None = None
+    """Color behind the scene, 0…1; None for black."""
+    config: QueryConfig = field(default_factory=QueryConfig)
+    """Defaults of queries, sizes of pictures, and of the views that `visible` measures."""
+    cache: Path | None = None
+    """File that keeps which Gaussians the photos show; if None, every process measures them."""
+    backend: Backend = "auto"
+    """The rasterizer, see `rasterize`."""
+    watch: Callable[[str], None] | None = None
+    """Called with a short description of slow work; if None, a progress bar is shown."""
     _doubt_alone: dict[str, float] = field(default_factory=dict, init=False)
     """Doubt about texts without their synonyms, by text."""
 
@@ -74,6 +99,101 @@ class Scene(ViewedScene):
             f"Scene({len(self.splats):,} Gaussians, {len(self.photos)} photos ({held_out} held out) "
             f"of {self.file.data}, {words})"
         )
+
+    @property
+    def device(self) -> torch.device:
+        """Device that holds the Gaussians."""
+        return self.splats.means.device
+
+    @property
+    def photos(self) -> list[ScenePhoto]:
+        """Training photos, then held-out ones, each with its name, camera and pose."""
+        return self.file.photos
+
+    @cached_property
+    def overview(self) -> ScenePhoto:
+        """The photo that shows the scene as a whole."""
+        return overview(self.photos, tuple(self.splats.means.median(0).values.tolist()))
+
+    def camera(self, place: Place, size: int | None = None, fov: float | None = None) -> Camera:
+        """Build a camera of the scene.
+
+        Args:
+            place: a camera; a photo by name; or a pose, which gets the first photo's lens.
+            size: longer side in pixels; by default a camera keeps its size, and a photo has its file's, at
+                most 1920.
+            fov: vertical field of view in degrees; by default the lens's.
+
+        Raises:
+            UserError: no photo has this name, or the size or field of view is impossible.
+        """
+        size = self.config.size if size is None else size
+        if isinstance(place, Camera):
+            camera = place if size is None else with_longer_side(place, size)
+        else:
+            photo = self.file.photo(place) if isinstance(place, str) else self.photos[0]
+            camera = photo.full_camera
+            if not isinstance(place, str):
+                camera = posed(_pose(place), camera)
+            camera = resized(camera, LARGEST) if size is None else with_longer_side(camera, size)
+        return camera if fov is None else with_field_of_view(camera, fov)
+
+    def render(
+        self, place: Place, size: int | None = None, fov: float | None = None, look: str | None = None
+    ) -> View:
+        """Render the scene from a photo's viewpoint, a camera or a pose.
+
+        Args:
+            place, size, fov: see `camera`.
+            look: training photo whose lighting is used; by default the scene's rule chooses for this view.
+
+        Raises:
+            UserError: see `camera`; or there is no look of this photo.
+        """
+        return self._view(self.camera(place, size, fov), self._name(place), look)
+
+    def draw(
+        self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
+    ) -> Rendering:
+        """Render a camera, and further values of the Gaussians, as tensors on the scene's device. Without a
+        look, the scene's rule chooses the lighting for this view."""
+        if look is None and self.looks is not None:
+            look = self.looks.of_view(camera)
+        return render_in_look(
+            self.splats, camera, look, channels, background=self.background, backend=self.backend
+        )
+
+    def _view(
+        self,
+        camera: Camera,
+        name: str | None,
+        look: str | None = None,
+        channels: Float[Tensor, "n d"] | None = None,
+    ) -> View:
+        start = time.perf_counter()
+        rendering = self.draw(camera, channels, self._look(look))
+        return View(rendering, name, time.perf_counter() - start)
+
+    def _look(self, photo: str | None) -> Look | None:
+        if photo is None:
+            return None
+        if self.looks is None:
+            raise UserError("all photos of this scene share one lighting: there is no look to choose")
+        return self.looks.of_photo(photo)
+
+    def _name(self, place: Place) -> str | None:
+        return self.file.photo(place).name if isinstance(place, str) else None
+
+    def baked(self, look: str | None = None) -> Splats:
+        """Return the Gaussians with a training photo's look in their colors, for viewers that know no looks.
+
+        look: the photo; by default the overview photo. Raises UserError if there is no look of this photo.
+        """
+        chosen = self._look(look)
+        if self.looks is None:
+            return self.splats
+        camera = self.overview.camera
+        return (chosen or self.looks.of_view(camera)).apply(self.splats, camera)
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
@@ -214,13 +334,12 @@ class Scene(ViewedScene):
         found = []
         for row, prompt in enumerate(question.prompts):
             scores, threshold = question.relevancy[row], question.thresholds[row]
-            views, closest = self._views(question, row)
-            box = None
-            if views:
+            closest, box = self._ranked(question, row), None
+            if views := [view for view in closest if view.shown][:most]:
                 box = strongest_match(self.splats.means, scores, self.mass, threshold, self.gap)
             relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
-            shown = (views[:most], box, relevancy, matching)
-            found.append(Found(prompt, *shown, question.doubts[row], threshold, closest[:most]))
+            answer = (views, box, relevancy, matching, question.doubts[row], threshold, closest[:most])
+            found.append(Found(prompt, *answer))
         return found
 
     def best_views(self, question: Question) -> list[str]:
@@ -228,7 +347,7 @@ class Scene(ViewedScene):
         Raises UserError if the scene has no training photos."""
         if not self.visible:
             raise UserError("this scene has no training photos to choose from: name a photo or a camera")
-        return [self._views(question, row)[1][0].name for row in range(len(question.prompts))]
+        return [self._ranked(question, row)[0].name for row in range(len(question.prompts))]
 
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Compute the relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
@@ -277,6 +396,59 @@ class Scene(ViewedScene):
         if index is not None:
             write_index(Path(index), keep)
         return write_splats(Path(path), splats, relevancy)
+
+    # ── what the photos show ────────────────────────────────────────────────────────────────────────
+
+    @cached_property
+    def visible(self) -> Mapping[str, VisibleGaussians]:
+        """The Gaussians visible in each training view. They are measured once, with a progress bar."""
+        count, side = self.config.views, self.config.view_side
+        chosen = spread([photo for photo in self.photos if photo.split == "train"], count)
+        cameras = {photo.name: resized(photo.camera, side) for photo in chosen}
+        key = ""
+        if self.cache is not None:
+            key = fingerprint(vars(self.splats.gaussians), [asdict(self.file), count, side])
+            if (kept := load_visible(self.cache, key, cameras, self.device)) is not None:
+                return kept
+        shown = watched(cameras.items(), "measuring which Gaussians the photos show, once", self.watch)
+        views = {name: self._visible(name, camera) for name, camera in shown}
+        if self.cache is not None:
+            save_visible(self.cache, views, key)
+        return views
+
+    def _visible(self, name: str, camera: Camera) -> VisibleGaussians:
+        mask = self.file.photo(name).foreground((camera.height, camera.width))
+        weight = torch.ones(camera.height, camera.width) if mask is None else mask.float()
+        return VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
+
+    def _fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
+        drawn = partial(composite, self.splats, camera, backend=self.backend)
+        return filled_pixels(drawn, weight, len(self.splats))
+
+    @cached_property
+    def mass(self) -> Float[Tensor, " n"]:
+        """Pixels that every Gaussian fills, summed over all views."""
+        mass = self.splats.means.new_zeros(len(self.splats))
+        for view in self.visible.values():
+            mass[view.rows.long()] += view.pixels.float()
+        return mass
+
+    @cached_property
+    def trained_side(self) -> int:
+        """Median of the training photos' longer sides in pixels."""
+        sides = sorted(max(p.camera.width, p.camera.height) for p in self.photos if p.split == "train")
+        return sides[len(sides) // 2] if sides else LARGEST
+
+    @cached_property
+    def gap(self) -> float:
+        """Distance in world units below which matches are connected: 3 % of the median distance at which the
+        scene is seen, about eight pixels of a small view; 0 if no training photo shows anything."""
+        distances = []
+        for view in self.visible.values():
+            pose, means = view.camera.view_matrix.to(self.splats.means), self.splats.means[view.rows]
+            if len(means):
+                distances.append(float((means @ pose[2, :3] + pose[2, 3]).median()))
+        return 0.03 * float(torch.tensor(distances).nanmedian()) if distances else 0.0
 
     # ── features ────────────────────────────────────────────────────────────────────────────────────
 
@@ -340,10 +512,7 @@ class Scene(ViewedScene):
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 
     def teach(
-        self,
-        word: str,
-        examples: Example | Sequence[Example],
-        selection: Bool[Tensor, " n"] | None = None,
+        self, word: str, examples: Example | Sequence[Example], selection: Bool[Tensor, " n"] | None = None
     ) -> Scene:
         """Return a scene that also knows a word from examples, as `scene.words[word]`; this one is unchanged.
 
@@ -408,8 +577,7 @@ class Scene(ViewedScene):
         listed: Sequence[Any] = texts if isinstance(texts, list | tuple) else [texts]
         for text in listed:
             if isinstance(text, Tensor | Array):
-                prompts.append(Prompt("vector", vector=self._vector(text)))
-                continue
+                text = Prompt("vector", vector=self._vector(text))
             for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text):
                 word = None if prompt.vector is not None else self.words.get(known_word(prompt.text))
                 prompts.append(prompt if word is None else replace(prompt, taught=word))
@@ -448,12 +616,11 @@ class Scene(ViewedScene):
             raise UserError(f"{text!r} are {len(question.prompts)} prompts: ask for one at a time")
         return question
 
-    def _views(self, question: Question, row: int) -> tuple[list[Viewpoint], list[Viewpoint]]:
-        """Return the training views that show a prompt, and all training views, both best first."""
+    def _ranked(self, question: Question, row: int) -> list[Viewpoint]:
+        """Return all training views, those that show a prompt first, best first."""
         scores, threshold = question.relevancy[row], question.thresholds[row]
         ranks = rank_views(self.visible, self.splats.means, scores, threshold)
-        everything = [replace(view, camera=self.file.photo(view.name).camera) for view in ranks]
-        return [view for view in everything if view.shown], everything
+        return [replace(view, camera=self.file.photo(view.name).camera) for view in ranks]
 
     # ── computed once ───────────────────────────────────────────────────────────────────────────────
 
@@ -495,6 +662,13 @@ def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
             f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
         )
     return encoder.encode_texts
+
+
+def _pose(place: Any) -> Float[Tensor, "rows 4"]:
+    try:
+        return torch.as_tensor(place, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"a place is a photo's name, a camera or a pose, not {place!r:.40}") from error
 
 
 def _several(texts: Any, found: Sequence[Any]) -> bool:

@@ -130,8 +130,7 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
 
 
 def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
-    """Replace the taught words in a scene file, atomically; nothing else in it changes. Raises UserError as
-    `read_scene` does."""
+    """Replace a scene file's taught words, and nothing else, atomically. Raises UserError as `read_scene`."""
     from safetensors.numpy import save
 
     with _opened(path) as file:
@@ -219,8 +218,7 @@ def read_scene(
 
 def describe_scene_file(path: str | Path) -> dict[str, Any]:
     """Describe a scene file, without reading a tensor: `provenance`, `scene`, `gaussians`, `photos`, `clip`,
-    `decoder`, `looks`, `taught` (the words taught by example) and `bytes`. Raises UserError as `read_scene`
-    does."""
+    `decoder`, `looks`, `taught` (words) and `bytes`. Raises UserError as `read_scene` does."""
     path = expanded(path)
     with _opened(path) as file:
         return {
@@ -333,11 +331,8 @@ def _decoder(file: _File, described: dict[str, Any]) -> Decoder:
     stored = sum(prod(shape) for name, shape in file.shapes.items() if name.startswith("decoder."))
     needed = _parameters(settings, clip + dense)
     expect(needed <= 4 * stored + 10_000_000, "its decoder is larger than the file")
-    # The first versions called this decoder by the name of the method.
-    name: Any = "gathered" if described["name"] == "lang3dxl" else described["name"]
-    config = SemanticFieldConfig(preset="short", **settings)
-    decoder = make_decoder(DecoderConfig(name=name), config, clip, dense, torch.zeros(3), 1.0)
-    return file.loaded("decoder", decoder)
+    config, choice = SemanticFieldConfig(preset="short", **settings), DecoderConfig(name=described["name"])
+    return file.loaded("decoder", make_decoder(choice, config, clip, dense, torch.zeros(3), 1.0))
 
 
 def _parameters(settings: Mapping[str, Any], channels: int) -> int:

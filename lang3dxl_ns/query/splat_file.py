@@ -38,8 +38,7 @@ def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | No
 
 
 def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
-    """Write the numbers of the selected Gaussians, from 0, as an array (.npy) or one per line (.txt). Raises
-    UserError for another ending."""
+    """Write the selected Gaussians' numbers, from 0, as .npy or .txt. Raises UserError for other endings."""
     writers: dict[str, Callable] = {".npy": np.save, ".txt": partial(np.savetxt, fmt="%d")}
     if (kind := path.suffix.lower()) not in writers:
         raise UserError(f"{path.name} names no kind of list: end it in .npy or .txt")

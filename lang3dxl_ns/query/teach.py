@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.scene.camera import MOST_PIXELS
 
@@ -100,8 +100,7 @@ class Example:
 
 
 def run_lengths(mask: Bool[Array, "h w"]) -> list[int]:
-    """Return the lengths of a mask's alternating runs, column by column, beginning with the pixels outside,
-    as in COCO's uncompressed RLE."""
+    """Return a mask's alternating runs, column by column, outside first, as in COCO's uncompressed RLE."""
     flat = mask.ravel(order="F")
     ends = np.flatnonzero(np.diff(flat)) + 1
     lengths = np.diff(np.concatenate([[0], ends, [flat.size]])).tolist()
@@ -193,10 +192,8 @@ def save_words(path: Path, words: Sequence[TaughtWord]) -> None:
 
 def load_words(path: Path) -> list[TaughtWord]:
     """Load words from a file. Raises UserError if it is missing or damaged, or a newer version wrote it."""
-    try:
+    with readable(f"{path} is not a file of taught words", "save it again"):
         content = read_json(expanded(path))
         if content["version"] != _VERSION:
             raise UserError(f"{path} has format {content['version']}: update lang3dxl-ns to read it")
         return list(map(TaughtWord.from_json, content["words"]))
-    except DAMAGE as error:
-        raise UserError(f"{path} is not a file of taught words ({error}): save it again") from error

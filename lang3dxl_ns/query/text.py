@@ -6,7 +6,7 @@ import re
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -16,11 +16,10 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.query.doubt import UNRELATED
-from lang3dxl_ns.query.negatives import NEGATIVES, competitors, singulars
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.teach import TaughtWord, known_word
+from lang3dxl_ns.query.teach import TaughtWord
+from lang3dxl_ns.query.vocabulary import NEGATIVES, competitors, synonyms_of
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
@@ -107,8 +106,7 @@ _NO_NAME = re.compile(r"an?|the|and|or|of|in|on|at|to|it|is|are|this|that|these|
 
 
 def searched(text: str) -> str:
-    """Remove the words by which a prompt selects one of several things, by place or size: *windows on the
-    left tower* becomes *windows*."""
+    """Remove words that select by place or size: *windows on the left tower* becomes *windows*."""
     return _WHERE.sub("", text).strip() or text
 
 
@@ -124,7 +122,7 @@ def caution(text: str) -> str | None:
     return None
 
 
-# ── synonyms ────────────────────────────────────────────────────────────────────────────────────────────
+# ── settings ────────────────────────────────────────────────────────────────────────────────────────────
 
 
 @dataclass
@@ -144,18 +142,6 @@ class TextConfig:
         """Raise UserError if there are no negatives, since every prompt would then match everywhere."""
         if not any(phrase.strip() for phrase in self.negatives):
             raise UserError("--negatives is empty: give at least one phrase, such as object")
-
-
-@cache
-def synonym_table() -> dict[str, list[str]]:
-    """Load the built-in table of architectural terms: common synonyms of each, most common first."""
-    return load_preset("synonyms/architecture")
-
-
-def synonyms_of(text: str) -> list[str]:
-    """Return synonyms of a term in singular or plural, with or without an article; none for other texts."""
-    words, table = re.sub(r"^(an?|the)\s+", "", known_word(text)), synonym_table()
-    return next((table[form] for form in singulars(words) if form in table), [])
 
 
 # ── vectors ─────────────────────────────────────────────────────────────────────────────────────────────

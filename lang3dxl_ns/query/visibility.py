@@ -82,8 +82,7 @@ def save_visible(path: Path, views: Mapping[str, VisibleGaussians], key: str) ->
 def load_visible(
     path: Path, key: str, cameras: Mapping[str, Camera], device: torch.device | str
 ) -> dict[str, VisibleGaussians] | None:
-    """Load the views cached under this key, which covers names and cameras; None if there are none, or the
-    file is damaged."""
+    """Load views cached under this key, which covers names and cameras; None without a sound file of it."""
     from safetensors import SafetensorError, safe_open
 
     try:

@@ -1,18 +1,98 @@
-"""Words that a scene can be searched for, or that name the thing seen at a place."""
+"""Words: negatives that prompts compete with, synonyms, and what a scene can be searched for."""
 
 from __future__ import annotations
 
 import json
 import re
-from functools import lru_cache
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.doubt import UNRELATED
-from lang3dxl_ns.query.negatives import NEGATIVES
 from lang3dxl_ns.query.relevancy import CANONICAL
-from lang3dxl_ns.query.text import synonym_table
+from lang3dxl_ns.query.teach import known_word
+
+_SURROUNDINGS: dict[str, tuple[str, ...]] = {
+    "sky": ("cloud",),
+    "ground": ("floor", "pavement", "paving", "square", "earth"),
+    "wall": ("facade", "masonry"),
+    "roof": ("roofing", "tile"),
+    "tree": ("plant", "bush", "forest", "foliage", "leaf", "leaves"),
+    "person": ("people", "man", "men", "woman", "women", "crowd", "tourist", "visitor", "pedestrian"),
+    "car": ("vehicle", "bus", "truck", "van", "traffic"),
+    "house": ("building", "home"),
+    "street": ("road", "path"),
+    "grass": ("lawn", "meadow", "garden"),
+    "water": ("river", "lake", "sea", "pond", "canal", "fountain"),
+    "road": ("street", "path"),
+    "fence": ("railing", "gate"),
+    "bridge": ("viaduct", "aqueduct"),
+}  # fmt: skip
+"""Phrases with synonyms. A prompt that uses a synonym does not compete with the phrase."""
+_PARTS: dict[str, tuple[str, ...]] = {
+    "window": ("glass", "pane", "oculus", "lancet", "dormer", "tracery"),
+    "door": ("portal", "doorway", "entrance", "entry", "gate", "gateway", "archway"),
+    "tower": (
+        "belfry", "steeple", "campanile", "minaret", "turret",
+        "window", "pane", "oculus", "lancet",
+        "door", "portal", "doorway", "entrance", "entry", "gate", "gateway",
+    ),
+    "spire": ("steeple", "fleche", "pinnacle", "finial"),
+    "dome": ("cupola",),
+}  # fmt: skip
+"""Parts of buildings with synonyms. A part does not compete with its whole either: prompts for windows and
+doors do not compete with "tower"."""
+_NAMED = {
+    phrase: frozenset((*_SURROUNDINGS.get(phrase, ()), *_PARTS.get(phrase, ())))
+    for phrase in (*_SURROUNDINGS, *_PARTS)
+}
+NEGATIVES = (*CANONICAL, *_NAMED)
+"""Default negatives of a scene."""
+NOTHING = ("sky", *CANONICAL)
+"""Phrases that match best at places with nothing to name."""
+CLEAR = 0.6
+"""Relevancy above which a word still names a place where one of `NOTHING` is the closest negative."""
+
+
+def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:
+    """Return the indices of the phrases that a prompt competes with: those that it does not name.
+
+    words: the prompt and its synonyms. A phrase is named by any of its words or their synonyms, singular or
+    plural. If all phrases are named, all compete.
+    """
+    named = {form for text in words for word in text.lower().split() for form in singulars(word)}
+    chosen = [i for i, phrase in enumerate(phrases) if not named & _meanings(phrase)]
+    return chosen or list(range(len(phrases)))
+
+
+def _meanings(phrase: str) -> set[str]:
+    own = [form for word in phrase.lower().split() for form in singulars(word)]
+    return {*own, *(word for form in own for word in _NAMED.get(form, ()))}
+
+
+def singulars(words: str) -> list[str]:
+    """Return a word or term without punctuation, and those that it may be the plural of."""
+    endings = (("s", ""), ("es", ""), ("ies", "y"), ("ves", "f"), ("es", "is"), ("ia", "ion"), ("a", "um"))
+    irregular = {"oculi": "oculus", "abaci": "abacus"}
+    words = words.strip(".,;:!?'\"()")
+    forms = [words.removesuffix(plural) + one for plural, one in endings if words.endswith(plural)]
+    return [words, *forms, irregular.get(words, words)]
+
+
+@cache
+def synonym_table() -> dict[str, list[str]]:
+    """Load the built-in table of architectural terms: common synonyms of each, most common first."""
+    return load_preset("synonyms/architecture")
+
+
+def synonyms_of(text: str) -> list[str]:
+    """Return synonyms of a term in singular or plural, with or without an article; none for other texts."""
+    words, table = re.sub(r"^(an?|the)\s+", "", known_word(text)), synonym_table()
+    return next((table[form] for form in singulars(words) if form in table), [])
+
 
 _COMMON = (
     "wall", "window", "door", "roof", "tower", "dome", "sky", "tree", "grass", "street", "people", "car",
@@ -23,7 +103,7 @@ _WHOLE = re.compile(r"(?P<end>[a-z]{3,})</w>|[▁Ġ](?P<start>[a-z]{3,})")
 """Pattern of tokens that are whole words: CLIP's tables mark their end, others mark their start."""
 
 
-@lru_cache(maxsize=1)
+@cache
 def shipped_vocabulary() -> tuple[str, ...]:
     """Return words and terms of architecture and its surroundings, in the singular, without repetition."""
     terms = synonym_table()

@@ -83,13 +83,13 @@ def test_a_frame_that_is_close_is_refined(collection, tmp_path):
 
 def test_of_many_gaussians_some_are_enough_to_refine_a_frame(collection, tmp_path, monkeypatch):
     monkeypatch.setattr(frames, "_MOST", len(box_splat()) // 2)
-    counted, loss = set(), frames._Comparison._loss
+    counted, refined = set(), frames._refined
 
-    def watched(comparison, splats, *rest):
+    def watched(splats, *rest):
         counted.add(len(splats))
-        return loss(comparison, splats, *rest)
+        return refined(splats, *rest)
 
-    monkeypatch.setattr(frames._Comparison, "_loss", watched)
+    monkeypatch.setattr(frames, "_refined", watched)
     wanted = similarity((0.02, -0.03, 0.02), 1.02, (0.05, -0.04, 0.03))
     fit = find_frame(moved(wanted), collection, tmp_path / "a.ply")
     assert max(counted) <= len(box_splat()) // 2 + 1

@@ -14,7 +14,6 @@ from lab.benchmarks.published import HolyScenes, published_figures
 from lab.benchmarks.scale import ScaleBenchmark, Stage, markdown
 from lab.benchmarks.teaching import ways
 from lang3dxl_ns import cli
-from lang3dxl_ns.common import checkout
 from lang3dxl_ns.methods import run_config
 
 OF_LAB = ["numerics", "demo-scene", *(f"benchmark {name}" for name in cli.BENCHMARKS)]
@@ -22,13 +21,13 @@ OF_LAB = ["numerics", "demo-scene", *(f"benchmark {name}" for name in cli.BENCHM
 
 @pytest.mark.parametrize("name", OF_LAB)
 def test_without_a_checkout_the_remedy_is_told(name, monkeypatch):
-    monkeypatch.setattr(checkout, "LAB", Path("/site-packages/lab"))
+    monkeypatch.setattr(cli, "LAB", Path("/site-packages/lab"))
     with pytest.raises(SystemExit, match="this command comes with a checkout of the repository"):
         cli.main([*name.split(), "--help"])
 
 
 def test_without_a_checkout_the_demo_writes_nothing_and_tells_the_remedy(tmp_path, monkeypatch):
-    monkeypatch.setattr(checkout, "LAB", Path("/site-packages/lab"))
+    monkeypatch.setattr(cli, "LAB", Path("/site-packages/lab"))
     with pytest.raises(SystemExit, match="this command comes with a checkout of the repository"):
         cli.main(["demo", "--out", str(tmp_path / "demo")])
     assert not list(tmp_path.iterdir())

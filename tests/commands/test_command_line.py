@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
+from lab.landmark.demo import Demo
 from lang3dxl_ns import cli
-from lang3dxl_ns.commands.demo import Demo
 from lang3dxl_ns.commands.query import file_names, parse_texts
 from lang3dxl_ns.common.console import accept_any_console
 from lang3dxl_ns.common.errors import UserError

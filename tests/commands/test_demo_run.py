@@ -5,8 +5,7 @@ import signal
 
 import pytest
 
-from lang3dxl_ns.commands.demo import Demo
-from lang3dxl_ns.common import checkout
+from lab.landmark.demo import Demo
 from lang3dxl_ns.common.errors import UserError
 
 pytestmark = pytest.mark.slow
@@ -65,8 +64,8 @@ def test_another_scene_in_the_same_folder_is_refused(demo):
         Demo(out=demo.out, seed=3, **SCENE).main()
 
 
-def test_flags_of_training_reach_it_and_a_scene_that_exists_needs_no_generator(demo, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkout, "LAB", tmp_path / "lab")
+def test_flags_of_training_reach_it_and_a_scene_that_exists_is_not_made_again(demo, tmp_path, monkeypatch):
+    monkeypatch.setattr("lab.landmark.scene_writer.write_scene", lambda _: pytest.fail("another scene"))
     (tmp_path / "scene").symlink_to(demo.out / "scene")
     settings = Demo(out=tmp_path, steps=2, clip="none", dense="none", **SCENE)
     settings.ns_train = "--pipeline.model.sky-gaussians 0"

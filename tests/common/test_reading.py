@@ -6,9 +6,9 @@ import struct
 import numpy as np
 import pytest
 
+from lab.stages import MeasuredStages
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, open_file, read_array, read_json, read_names, read_text
-from lang3dxl_ns.common.stages import Stages
 
 
 def test_what_was_written_is_read(tmp_path):
@@ -66,4 +66,7 @@ def test_the_home_of_nobody_is_one_sentence():
 @pytest.mark.parametrize("content", ["", "[]", '{"train": 3}', '{"train": {"seconds": "a"}}', "[" * 9999])
 def test_damaged_figures_of_earlier_stages_are_forgotten(tmp_path, content):
     (tmp_path / "stages.json").write_text(content)
-    assert Stages({"train": 1.0}, tmp_path / "stages.json").figures() == {"seconds": {}, "peak_mb": {}}
+    assert MeasuredStages({"train": 1.0}, tmp_path / "stages.json").figures() == {
+        "seconds": {},
+        "peak_mb": {},
+    }

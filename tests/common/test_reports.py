@@ -9,12 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from lang3dxl_ns.common.reports import (
-    command_line,
-    describe_machine,
-    markdown_table,
-    write_report,
-)
+from lab.reports import command_line
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 
 
 @dataclass

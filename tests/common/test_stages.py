@@ -6,6 +6,7 @@ from contextlib import suppress
 
 import pytest
 
+from lab.stages import MeasuredStages
 from lang3dxl_ns.common import stages as module
 from lang3dxl_ns.common.stages import Stages
 
@@ -21,7 +22,7 @@ def clock(monkeypatch):
 
 
 def test_stages_say_where_they_are_and_what_is_left(tmp_path, capsys, clock):
-    stages = Stages(SHARES, tmp_path / "stages.json")
+    stages = MeasuredStages(SHARES, tmp_path / "stages.json")
     for name, share in SHARES.items():
         with stages.stage(name):
             clock[0] += 6000 * share
@@ -61,15 +62,15 @@ def test_a_short_stage_is_silent(capsys, clock):
 
 def test_seconds_add_up_over_interrupted_commands(tmp_path, clock):
     for _ in range(3):
-        stages = Stages(SHARES, tmp_path / "stages.json")
+        stages = MeasuredStages(SHARES, tmp_path / "stages.json")
         with suppress(KeyboardInterrupt), stages.stage("cook"):
             clock[0] += 7
             raise KeyboardInterrupt
     assert json.loads((tmp_path / "stages.json").read_text())["cook"]["seconds"] == 21
 
 
-def test_a_stage_that_begins_ends_the_one_before(clock):
-    stages = Stages(SHARES)
+def test_a_stage_that_begins_ends_the_one_before(tmp_path, clock):
+    stages = MeasuredStages(SHARES, tmp_path / "stages.json")
     for name, seconds in itertools.chain(SHARES.items(), SHARES.items()):
         stages.begin(name)
         clock[0] += seconds

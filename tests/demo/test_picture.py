@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lang3dxl_ns.demo.picture import PictureRow, draw_picture, most_telling
+from lab.landmark.picture import PictureRow, draw_picture, most_telling
 
 
 def match(score, threshold=0.4):

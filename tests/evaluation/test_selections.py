@@ -10,7 +10,7 @@ from painted_scene import DOME, WINDOWS, painted_scene, painted_splats
 from PIL import Image
 
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.evaluation.selections import box_iou, score_selections
+from lang3dxl_ns.evaluation.score_scene import box_iou, score_selections
 from lang3dxl_ns.query.places import Box
 
 NAMES = ("dome", "window")

@@ -4,7 +4,12 @@ import pytest
 import torch
 
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
-from lang3dxl_ns.query.relevancy import Queries, cosines_of_codes, relevancy
+from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries, cosines_of_codes
+
+
+def relevancy(features, queries, canonical, temperature=TEMPERATURE):
+    prompts = Queries.of(queries[:, None].unbind(), canonical)
+    return prompts.relevancy_of_cosines(prompts.cosines(features), temperature)
 
 
 @pytest.fixture

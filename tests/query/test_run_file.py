@@ -23,7 +23,7 @@ def test_it_reads_what_it_wrote(file, tmp_path):
 
 
 def test_a_missing_file_is_explained(tmp_path):
-    with pytest.raises(UserError, match="an earlier version"):
+    with pytest.raises(UserError, match="copy the whole folder"):
         SceneFile.read(tmp_path / "scene.json")
 
 

@@ -258,10 +258,3 @@ def test_other_names_are_refused(tmp_path):
         write_scene(tmp_path / "a.ply", painted_scene())
     with pytest.raises(UserError, match="not a file"):
         read_scene(tmp_path / "none.scene")
-
-
-def test_a_file_that_calls_the_default_by_its_former_name_opens(written):
-    scene, path = written
-    rewritten(path, lambda told, header: set_at(told, "lang3dxl", "decoder", "name"))
-    found = read_scene(path, "cpu", encode_texts=encode_texts)
-    np.testing.assert_allclose(found.relevancy("dome"), scene.relevancy("dome"), atol=ATOL)

@@ -11,9 +11,8 @@ from lang3dxl_ns.query.text import (
     caution,
     parse_prompts,
     searched,
-    synonym_table,
-    synonyms_of,
 )
+from lang3dxl_ns.query.vocabulary import synonym_table, synonyms_of
 
 
 @pytest.mark.parametrize(

@@ -101,8 +101,7 @@ class PackedMeaning:
 
 
 def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
-    """Pack codes and a small field or, for wide decoders, decoded rows. Raises UserError if these are too
-    large for a page."""
+    """Pack codes and a small field or, for wide decoders, decoded rows. Raises UserError if too large."""
     decoded = PerGaussian.of(decoder, codes)
     rows = decoded.rows.cpu()
     width = rows.shape[1]
@@ -122,8 +121,7 @@ def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning
 
 
 def _is_small(field: SemanticField) -> bool:
-    """Return whether the page can decode this field: bounded codes, one pass through the grid, small
-    layers."""
+    """Return whether the page can decode this field: bounded codes, one pass through a grid, small layers."""
     settings = field.settings
     products = sum(layer.weight.numel() for layer in field.layers if isinstance(layer, torch.nn.Linear))
     return settings.bounding == "sigmoid" and not settings.indexed and products <= _MOST_PRODUCTS

@@ -19,14 +19,13 @@ from lang3dxl_ns.common.files import make_folder, write_atomically
 from lang3dxl_ns.common.reports import watched
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.question import EVEN, SHARE
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.scene_file import Provenance
 from lang3dxl_ns.query.teach import known_word
 from lang3dxl_ns.query.text import Prompt, tidy
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, common_words, competitors, shipped_vocabulary
 from lang3dxl_ns.query.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
@@ -202,8 +201,7 @@ class Page:
         return {"own": own, "near": near.tolist(), "against": against}
 
     def colors(self, photo: str) -> bytes:
-        """Compute red, green, blue and opacity of every Gaussian under a photo's lighting. Raises UserError
-        if there is no such look."""
+        """Compute every Gaussian's color and opacity in a photo's look. Raises UserError if there is none."""
         return pack_colors(self.scene.baked(photo), self._toward).tobytes()
 
 

@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich import get_console
 from rich.markdown import Markdown
 
-from lang3dxl_ns.common.checkout import lab_module
+from lab.reports import command_line
+from lab.stages import MeasuredStages
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, read_json
-from lang3dxl_ns.common.reports import command_line, describe_machine, markdown_table, write_report
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.common.stages import Stages
 
 if TYPE_CHECKING:
-    from lang3dxl_ns.demo.picture import PictureRow
+    from lab.landmark.picture import PictureRow
     from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
@@ -77,15 +77,15 @@ class Demo:
             sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
-        scene, stages = out / "scene", Stages(_SHARES, out / "stages.json")
+        scene, stages = out / "scene", MeasuredStages(_SHARES, out / "stages.json")
         if kept := (scene / "scene.json").exists():
             say("scene: kept from an earlier command")
-        else:
-            generator = lab_module("lab.landmark.scene_writer")
         with stages.stage("scene"):
             if not kept:
+                from lab.landmark.scene_writer import DemoScene, write_scene
+
                 settings = {"family": self.family, **self._wanted}
-                generator.write_scene(generator.DemoScene(out=scene, **settings))
+                write_scene(DemoScene(out=scene, **settings))
         config = self._config(scene, out)
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
         trainer.stages = stages
@@ -106,7 +106,7 @@ class Demo:
         matches = trainer.pipeline.scored_matches([photo.name for photo in photos])
         drawn = (_picture_row(photo, trainer, matches[photo.name]) for photo in photos)
         if rows := [row for row in drawn if row.truth]:
-            from lang3dxl_ns.demo.picture import draw_picture, most_telling
+            from lab.landmark.picture import draw_picture, most_telling
 
             draw_picture(most_telling(rows, 3), folder / "report.png")
         get_console().print(Markdown(self.markdown(report)))
@@ -191,7 +191,7 @@ class Demo:
 
     def markdown(self, report: dict[str, Any]) -> str:
         """Write the report in markdown."""
-        from lang3dxl_ns.evaluation.report import scene_table
+        from lang3dxl_ns.evaluation.aggregate import scene_table
 
         splits = "\n".join(f"#{scene_table(*split)}" for split in report["splits"].items())
         seconds, memory = report["seconds"], report["peak_mb"]
@@ -223,7 +223,7 @@ _SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evalua
 
 
 def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, matches: dict[str, Match]) -> PictureRow:
-    from lang3dxl_ns.demo.picture import PictureRow
+    from lab.landmark.picture import PictureRow
 
     real, rendered = photo.images["img"].cpu().chunk(2, dim=1)
     scorer, truth = trainer.pipeline.evaluation.scorer, {}
