@@ -69,9 +69,12 @@ class PerGaussian:
         """Which Gaussians have a feature; the others are visible in no photo."""
         return (self.rows != 0).any(1)
 
-    def channels(self, queries: Queries) -> Float[Tensor, "n q"]:
-        """Return the values that Gaussians carry in a rendering that answers these prompts."""
-        return self.of_gaussians(queries).T.contiguous()
+    def channels(
+        self, queries: Queries, relevancy: Float[Tensor, "q n"] | None = None
+    ) -> Float[Tensor, "n q"]:
+        """Return the values that Gaussians carry in a rendering that answers these prompts. relevancy: theirs
+        (`of_gaussians`), where it is known."""
+        return (self.of_gaussians(queries) if relevancy is None else relevancy).T.contiguous()
 
     def maps(self, rendered: Float[Tensor, "h w q"], queries: Queries) -> Float[Tensor, "q h w"]:
         """Compute the relevancy of every pixel, 0…1, from these channels composited over black."""
@@ -112,7 +115,9 @@ class PerPixel:
     temperature: float = TEMPERATURE
     head = None
 
-    def channels(self, queries: Queries) -> Float[Tensor, "n d"]:
+    def channels(
+        self, queries: Queries, relevancy: Float[Tensor, "q n"] | None = None
+    ) -> Float[Tensor, "n d"]:
         return self.codes
 
     def maps(self, rendered: Float[Tensor, "h w d"], queries: Queries) -> Float[Tensor, "q h w"]:

@@ -61,6 +61,8 @@ class Question:
     prompts: tuple[Prompt, ...]
     queries: Queries
     """Vectors of the prompts, followed by those of the foreground prompts, if any."""
+    everywhere: Float[Tensor, "all n"]
+    """Relevancy of every Gaussian to all of these."""
     doubts: tuple[float, ...] = ()
     """Share of unrelated words that match the scene as well, one per prompt."""
     thresholds: tuple[float, ...] = ()
@@ -76,13 +78,13 @@ class Question:
     @cached_property
     def channels(self) -> Float[Tensor, "n d"]:
         """Values that Gaussians carry in a rendering: the engine's, then 1 per prompt that they match."""
-        own = self.engine.channels(self.queries)
+        own = self.engine.channels(self.queries, self.everywhere)
         return torch.cat([own, self.gaussians.T.to(own)], dim=1)
 
     @cached_property
     def relevancy(self) -> Float[Tensor, "q n"]:
         """Relevancy of every Gaussian to every prompt, 0…1; 0 outside the foreground."""
-        return self._confined(self.engine.of_gaussians(self.queries))
+        return self._confined(self.everywhere)
 
     @cached_property
     def gaussians(self) -> Bool[Tensor, "q n"]:

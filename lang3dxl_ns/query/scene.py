@@ -237,6 +237,7 @@ class Scene:
             self.engine,
             tuple(prompts),
             queries,
+            relevancy,
             tuple(doubts[:count]),
             levels[:count] if requested is None else (requested,) * count,
             levels[count:],
