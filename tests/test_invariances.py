@@ -132,7 +132,6 @@ def parse(folder, offset=None):
     """Cameras and seed points as the trainer gets them, of the model or of a copy moved by an offset."""
     parser = PhotoCollectionDataParserConfig(data=folder, load_3D_points=True).setup()
     if offset is not None:
-        parser._read_collection()
         model = parser.reconstruction
         photos = {
             name: replace(

@@ -193,9 +193,8 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
     data.foreground, data.camera_res_scale_factor = settings.foreground, settings.scale
     if settings.flags:
         # As ns-train reads them: switches take True or False.
-        config = tyro.cli(
-            tyro.conf.FlagConversionOff[type(config)], args=shlex.split(settings.flags), default=config
-        )
+        switches = (tyro.conf.FlagConversionOff,)
+        config = tyro.cli(type(config), args=shlex.split(settings.flags), default=config, config=switches)
         data = config.pipeline.datamanager
     if run.row.own_targets:
         # With a shared cache, rows would overwrite each other's targets. The run makes its own, and is timed.

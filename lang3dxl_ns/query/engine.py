@@ -115,9 +115,7 @@ class PerPixel:
     temperature: float = TEMPERATURE
     head = None
 
-    def channels(
-        self, queries: Queries, relevancy: Float[Tensor, "q n"] | None = None
-    ) -> Float[Tensor, "n d"]:
+    def channels(self, queries: Queries, relevancy: Tensor | None = None) -> Float[Tensor, "n d"]:
         return self.codes
 
     def maps(self, rendered: Float[Tensor, "h w d"], queries: Queries) -> Float[Tensor, "q h w"]:

@@ -31,9 +31,11 @@ from lab.benchmarks.scored_runs import (
     ScoredRuns,
     _beside,
     apply_changes,
+    run_configuration,
     scene_labels,
 )
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.presets import train_flags
 
 BY_NAME = {row.name: row for row in ROWS}
 
@@ -152,6 +154,14 @@ def test_rows_change_one_setting_each_of_those_that_a_run_has():
         assert config.pipeline.model.semantic_field.resolved()
     with pytest.raises(AttributeError):
         apply_changes(deepcopy(lang3dxl.config), {"pipeline.model.no_such_setting": 1})
+
+
+def test_flags_of_all_rows_are_read_as_ns_train_reads_them(tmp_path):
+    """Switches take True or False, as `lang3dxl preset official` prints them."""
+    flags = replace(settings(), flags=" ".join(train_flags("official")))
+    config = run_configuration(runs_of("lang3dxl-paper")[0], flags, tmp_path)
+    assert config.pipeline.model.appearance.opacity_shift is False
+    assert config.pipeline.model.semantic_field.preset == "official"
 
 
 def test_rows_that_are_the_full_method_are_left_out_unless_asked_for():
