@@ -159,7 +159,8 @@ def test_rows_change_one_setting_each_of_those_that_a_run_has():
 def test_flags_of_all_rows_are_read_as_ns_train_reads_them(tmp_path):
     """Switches take True or False, as `lang3dxl preset official` prints them."""
     flags = replace(settings(), flags=" ".join(train_flags("official")))
-    config = run_configuration(runs_of("lang3dxl-paper")[0], flags, tmp_path)
+    run = Run(BY_NAME["lang3dxl-paper"], tmp_path, "here", 0)
+    config = run_configuration(run, flags, tmp_path / "work")
     assert config.pipeline.model.appearance.opacity_shift is False
     assert config.pipeline.model.semantic_field.preset == "official"
 
