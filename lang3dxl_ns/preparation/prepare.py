@@ -22,7 +22,14 @@ from torch import Tensor
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.stages import roughly
-from lang3dxl_ns.preparation.dense_map import RULE, Grid, build_dense_map, map_grids, nested_grids
+from lang3dxl_ns.preparation.dense_map import (
+    RULE,
+    Grid,
+    build_dense_map,
+    map_grids,
+    nested_grids,
+    window_starts,
+)
 from lang3dxl_ns.preparation.encoders import (
     DenseEncoder,
     ImageTextEncoder,
@@ -92,6 +99,12 @@ class _Task:
     def clip(self) -> str | None:
         """Kind of CLIP target to make; None if it is complete."""
         return next((kind for kind in (CLIP, FINE) if kind in self.missing), None)
+
+    def encoded(self, tokens: int) -> int:
+        """Count the pictures to encode: crops, or windows of `tokens` patches per side."""
+        if not self.grids:
+            return self.crops.count(self.photo.height, self.photo.width)
+        return sum(math.prod(len(window_starts(side, tokens)) for side in grid) for grid in self.grids)
 
     def bytes(self, clip: ImageTextEncoder | None, dense: DenseEncoder | None) -> int:
         """Compute the size of the entries to make, at two bytes per number."""
@@ -325,10 +338,11 @@ class _Maker:
     def _announce_duration(
         self, clip: ImageTextEncoder, dense: DenseEncoder | None, device: torch.device
     ) -> None:
-        """Log how many crops will be encoded and an estimate of the duration, measured with noise."""
-        config, tasks = self._config, [task for task in self._tasks if task.clip and not task.grids]
-        crops = sum(task.crops.count(task.photo.height, task.photo.width) for task in tasks)
-        if crops < _ANNOUNCED_CROPS:
+        """Log how many crops, or windows of a map, will be encoded, and an estimate of the duration, measured
+        with noise."""
+        config, tasks = self._config, [task for task in self._tasks if task.clip]
+        encoded = [task.encoded(clip.crop_size // clip.patch_size) for task in tasks]
+        if sum(encoded) < _ANNOUNCED_CROPS:
             return
         noise, rest = torch.rand(3, clip.crop_size, clip.crop_size, device=device), 0.0
         of_crop = _seconds_each(
@@ -337,11 +351,11 @@ class _Maker:
         if dense is not None:
             of_photo = _seconds_each(lambda _: dense.encode(noise.permute(1, 2, 0)), 1)
             rest = of_photo * sum(DENSE in task.missing for task in tasks)
-        fast = sum(task.fast for task in tasks)
-        takes, faster = ((n * of_crop + rest) / config.workers for n in (crops, fast))
+        least = (number if task.grids else task.fast for task, number in zip(tasks, encoded, strict=True))
+        takes, faster = ((n * of_crop + rest) / config.workers for n in (sum(encoded), sum(least)))
         quality = spoken("--pipeline.datamanager.quality")
         hint = "" if faster > 0.9 * takes else f"; {quality} fast: {roughly(faster)}"
-        say(f"{len(tasks):,} photos, {crops:,} crops with {config.clip}: {roughly(takes)}{hint}")
+        say(f"{len(tasks):,} photos, {sum(encoded):,} crops with {config.clip}: {roughly(takes)}{hint}")
         if device.type == "cpu" and takes > _LONG_S:
             remedies = ["a GPU (some hundred times)", *([f"{quality} fast"] if hint else [])]
             if config.clip != BUILTIN:

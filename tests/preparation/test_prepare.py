@@ -268,6 +268,16 @@ def test_an_announced_duration_is_that_of_large_batches_and_names_remedies_that_
     assert "quality fast" not in told
 
 
+def test_as_many_windows_are_announced_as_are_encoded(photos, config, store, capsys, monkeypatch):
+    encoded, encode = [], ImageTextEncoder.encode_patches
+    counting = lambda self, windows: encoded.append(len(windows)) or encode(self, windows)  # noqa: E731
+    monkeypatch.setattr(ImageTextEncoder, "encode_patches", counting)
+    monkeypatch.setattr(module, "_ANNOUNCED_CROPS", 0)
+    run(photos, replace(config, clip_features="dense"), store)
+    (announced,) = re.findall(r"([\d,]+) crops with", capsys.readouterr().out)
+    assert int(announced) == sum(encoded) > 0
+
+
 def test_a_disk_that_is_too_small_is_found_before_the_work(photos, config, store, calls, monkeypatch):
     usage = shutil.disk_usage(".")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
