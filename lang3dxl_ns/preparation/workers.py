@@ -141,8 +141,8 @@ def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[It
 
 
 def _connect(ray: Any, workers: Workers) -> None:
-    """Connect to the Ray cluster, or start one here, within the time limit, after which the attempt stays in
-    a daemon thread. Raises UserError if there is no answer."""
+    """Connect to the Ray cluster within the time limit, after which the attempt stays in a daemon thread, or
+    start one here. Raises UserError if there is no answer."""
     # A cluster started here listens on this machine only.
     options = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
     if workers.address:
@@ -154,11 +154,14 @@ def _connect(ray: Any, workers: Workers) -> None:
         try:
             answer.set_result(ray.init(log_to_driver=False, **options))
         except BaseException as error:
-            answer.set_exception(error)  # raised below, in the waiting thread
+            answer.set_exception(error)  # raised below
 
-    threading.Thread(target=connect, daemon=True).start()
+    if workers.address:
+        threading.Thread(target=connect, daemon=True).start()
+    else:
+        connect()  # in this thread, with which Ray's processes end
     try:
-        answer.result(PATIENCE_S if workers.address else None)
+        answer.result(PATIENCE_S)
     except Exception as error:
         if answer.done():
             ray.shutdown()  # of what it has started
