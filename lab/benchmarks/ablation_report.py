@@ -231,6 +231,8 @@ def plot(lengths: Mapping[int, Sequence[Mapping[str, Any]]], quality: str) -> by
         label = row["label"].split(":")[0]
         axes.errorbar(seconds, values, [p[1]["std"] for p in points], marker="o", label=label, **style)
     axes.set(xscale="log", xlabel="training, s of one core", ylabel="mAP")
+    axes.xaxis.set_major_formatter("{x:.0f}")
+    axes.xaxis.set_minor_formatter("{x:.0f}")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=7)
+    axes.legend(fontsize=7, loc="best")
     return as_png(figure)
