@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shlex
 import shutil
 import sys
 import time
@@ -182,9 +181,7 @@ def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
 
 def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTrainerConfig:
     """Build the configuration of a run."""
-    import tyro
-
-    from lang3dxl_ns.methods import run_config
+    from lang3dxl_ns.methods import run_config, with_flags
 
     names = settings.clip, settings.dense, run.row.method
     config = run_config(run.scene, work / "runs", run.label, run.steps, *names)
@@ -192,9 +189,7 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
     data = config.pipeline.datamanager
     data.foreground, data.camera_res_scale_factor = settings.foreground, settings.scale
     if settings.flags:
-        # As ns-train reads them: switches take True or False.
-        switches = (tyro.conf.FlagConversionOff,)
-        config = tyro.cli(type(config), args=shlex.split(settings.flags), default=config, config=switches)
+        config = with_flags(config, settings.flags)
         data = config.pipeline.datamanager
     if run.row.own_targets:
         # With a shared cache, rows would overwrite each other's targets. The run makes its own, and is timed.

@@ -154,9 +154,7 @@ class Demo:
 
     def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
         """Build the run's configuration, resuming from an earlier command's checkpoint if there is one."""
-        import tyro
-
-        from lang3dxl_ns.methods import run_config
+        from lang3dxl_ns.methods import run_config, with_flags
 
         steps = self.steps or (250 if self.quick else 1_200)
         config = run_config(scene, out, str(RUN.parts[0]), steps, self.clip, self.dense)
@@ -167,7 +165,7 @@ class Demo:
             config.pipeline.datamanager.dense_tokens = 32
         config.logging.steps_per_log = 50
         if self.ns_train:
-            config = tyro.cli(type(config), args=shlex.split(self.ns_train), default=config)
+            config = with_flags(config, self.ns_train)
         checkpoints = config.get_checkpoint_dir()
         if any(checkpoints.glob("*.ckpt")):
             config.load_dir = checkpoints

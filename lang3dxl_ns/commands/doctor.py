@@ -93,10 +93,7 @@ def versions() -> Iterator[Finding]:
     """Check Python and the required packages, pycolmap among them, against this package's requirements."""
     from packaging.requirements import Requirement
 
-    fine, remedy = (
-        (3, 10) <= sys.version_info[:2] < (3, 13),
-        "make an environment of 3.10, 3.11 or 3.12",
-    )
+    fine, remedy = (3, 10) <= sys.version_info[:2] < (3, 13), "make an environment of 3.10, 3.11 or 3.12"
     yield Finding("Python", sys.version.split()[0], fine, remedy, "problem")
     for need in (Requirement(line) for line in requires("lang3dxl-ns") or []):
         if need.marker is not None:
