@@ -22,12 +22,16 @@ class UserError(Exception):
 
 
 @contextmanager
-def readable(problem: str, remedy: str) -> Iterator[None]:
-    """Turn errors of reading a damaged file into a UserError: problem (error): remedy."""
+def readable(
+    problem: str, remedy: str, errors: tuple[type[Exception], ...] = DAMAGE, most: int = 200
+) -> Iterator[None]:
+    """Turn errors of reading a damaged file into a UserError: problem (error, in `most` characters): remedy."""
     try:
         yield
-    except DAMAGE as error:
-        raise UserError(f"{problem} ({in_a_line(error)}): {remedy}") from error
+    except UserError:
+        raise
+    except errors as error:
+        raise UserError(f"{problem} ({in_a_line(error, most)}): {remedy}") from error
 
 
 def printable(text: str) -> str:

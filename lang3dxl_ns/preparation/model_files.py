@@ -6,17 +6,15 @@ Code that comes with a model is never run, and weights are read as plain tensors
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from lang3dxl_ns.common.errors import UserError, in_a_line
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import check_regular, expanded
 
 CLIP_OPTION = "--pipeline.datamanager.clip"
@@ -146,15 +144,8 @@ def read_config(files: ModelFiles) -> Any:
     return config
 
 
-@contextmanager
-def whole(problem: str, remedy: str) -> Iterator[None]:
-    """Turn any failure of transformers into a UserError, because damaged files make it fail in any way."""
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:
-        raise UserError(f"{problem} ({in_a_line(error, 300)}): {remedy}") from error
+whole = partial(readable, errors=(Exception,), most=300)
+"""Like `readable`, for transformers, which damaged files make fail in any way."""
 
 
 def _download(name: str, option: str) -> Path:
