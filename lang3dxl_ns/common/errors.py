@@ -25,7 +25,7 @@ class UserError(Exception):
 def readable(
     problem: str, remedy: str, errors: tuple[type[Exception], ...] = DAMAGE, most: int = 200
 ) -> Iterator[None]:
-    """Turn errors of reading a damaged file into a UserError: problem (error, in `most` characters): remedy."""
+    """Turn errors of a damaged file into a UserError: problem (error, in `most` characters): remedy."""
     try:
         yield
     except UserError:
