@@ -50,6 +50,13 @@ def test_absent_things_are_below_x_no_more_often_than_x():
     assert (found > DOUBTFUL).double().mean() > 0.75
 
 
+@pytest.mark.parametrize(("others", "said"), [(0, False), (1, False), (2, True), (30, True)])
+def test_at_most_one_unrelated_word_may_fit_as_well_and_taught_words_have_their_own_limit(others, said):
+    doubt = (1 + others) / (1 + len(UNRELATED))
+    assert (doubtful("dome", doubt) is not None) is said
+    assert (doubtful("dome", doubt, taught=True) is not None) is (doubt > 0.1)
+
+
 def test_the_best_gaussians_decide_whatever_their_order():
     relevancy = torch.linspace(0, 1, 1_000)[None]
     best = relevancy[0, -5:].mean()
