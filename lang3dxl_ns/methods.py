@@ -45,8 +45,6 @@ def _optimizers() -> dict[str, dict]:
         "codes": (adam(lr=1e-3, short_lr=3e-2), schedule(end=0.05)),
         "field_encoding": (adam(lr=5e-4, short_lr=1e-2), learned()),
         "field_decoder": (adam(lr=5e-4, short_lr=1e-2, weight_decay=1e-5), learned()),
-        # The long-run rates are as published.
-        "feature3dgs_decoder": (adam(lr=1e-4, short_lr=1e-2), learned()),
         "downsampler": (adam(lr=5e-4, short_lr=5e-3, weight_decay=1e-5), learned()),
         "appearance": (adam(lr=5e-4, short_lr=5e-3), schedule(start=0.1, warm=0.05, end=0.1)),
         "appearance_vectors": (adam(lr=1e-3, short_lr=5e-3), schedule(end=0.1)),

@@ -14,8 +14,8 @@ from conftest import make_trainer
 from fake_gpu import CUDA, GpuTensor, fake_gpu, real_gpu
 from scenes import write_scene
 
+from lab.baselines import BASELINES, langsplat
 from lab.benchmarks.interleaved import interleaved_times
-from lang3dxl_ns.baselines.decoders import DecoderConfig
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
 
@@ -160,10 +160,10 @@ def test_code_maps_are_decoded_at_five_sizes(default):
     assert (min(sizes), max(sizes)) == model.config.decode_size
 
 
-@pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "langsplat", "direct", "lifting"])
-def test_every_decoder_trains(trained, name):
-    decoder = DecoderConfig(name, autoencoder_steps=5)
-    trained(2, pipeline__model__decoder=decoder, pipeline__model__densify_until=0.0)
+@pytest.mark.parametrize("name", BASELINES)
+def test_every_decoder_trains(trained, name, monkeypatch):
+    monkeypatch.setattr(langsplat, "_STEPS", 5)
+    trained(2, pipeline__model__decoder__name=name, pipeline__model__densify_until=0.0)
 
 
 @pytest.mark.parametrize("preset", ["default", "official", "paper"])

@@ -38,7 +38,7 @@ ORDER = (
     {"scene"},
     {"components", "rendering"},
     {"preparation"},
-    {"baselines", "query", "evaluation"},
+    {"query", "evaluation"},
     {"attachment"},
     {"plugin"},
     {"methods", "open_scene"},
@@ -138,7 +138,7 @@ def all_imports(source: str, modules) -> set[str]:
 
 
 def test_public_names_load_at_first_use_and_rooms_below_the_plugin_load_neither_nerfstudio_nor_cuda_code():
-    below = ("common", "scene", "components", "rendering", "preparation", "query", "evaluation", "baselines")
+    below = ("common", "scene", "components", "rendering", "preparation", "query", "evaluation")
     code = f"""
 import importlib, json, sys, lang3dxl_ns
 assert "torch" not in sys.modules

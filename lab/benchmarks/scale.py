@@ -237,9 +237,9 @@ def _landmark_features(path: Path) -> tuple[Tensor, Tensor]:
     """CLIP features gathered onto a small landmark's Gaussians, and their mass; kept in a file."""
     from safetensors.torch import load_file, save
 
+    from lab.baselines.lifting import LiftedFeatures
     from lab.landmark.demo_scene import DemoScene
     from lab.landmark.scene_writer import write_scene
-    from lang3dxl_ns.baselines.lifting import LiftedFeatures
     from lang3dxl_ns.common.files import write_atomically
     from lang3dxl_ns.methods import run_config
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.attachment.known_frames import Similarity
-from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import progress_bar
+from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
@@ -60,7 +60,7 @@ def learn(
     """Learn a decoder and the Gaussians' codes, which are NaN for Gaussians that no photo shows, on the
     splat's device. `cameras` holds the photos' cameras, at the files' resolution, in the splat's frame."""
     field = SemanticFieldConfig(preset="short")
-    decoder = make_decoder(DecoderConfig(), field, targets.clip_dim, 0, torch.zeros(3), 1.0)
+    decoder = make_decoder(DecoderConfig(), field, targets.clip_dim, 0)
     decoder = decoder.to(splats.means.device)
     names = [photo.name for photo in collection.photos]
     dense = partial(targets.dense_features, names) if targets.dense_dim else None

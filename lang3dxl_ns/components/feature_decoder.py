@@ -34,7 +34,7 @@ class Gathered:
 
 
 class Decoder(nn.Module, ABC):
-    """Interface of the semantic field and the baselines.
+    """Interface of the semantic field and of other ways to store features on Gaussians.
 
     The model gives every Gaussian `initial_codes`, renders `carried` values, and decodes the rendered map.
     Outputs are raw (not unit length) CLIP features and, if configured, dense features.
@@ -53,7 +53,7 @@ class Decoder(nn.Module, ABC):
         self.register_buffer("output_std", torch.ones(clip_dim + dense_dim))
 
     name = ""
-    """Name of the decoder in `baselines.decoders.DecoderConfig`."""
+    """Name of the decoder in `decoders.DECODERS`."""
     bounded = False
     """Whether codes are squashed by a sigmoid before they are decoded."""
     per_gaussian = False

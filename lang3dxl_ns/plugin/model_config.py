@@ -7,10 +7,10 @@ from typing import Literal
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from lang3dxl_ns.baselines.decoders import DecoderConfig
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.components import schedules
 from lang3dxl_ns.components.appearance import AppearanceConfig
+from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.plugin.densification import Densification

@@ -13,11 +13,11 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from torch import Tensor
 from torch.nn import Parameter
 
-from lang3dxl_ns.baselines.decoders import make_decoder
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.compression import CompressedField
+from lang3dxl_ns.components.decoders import make_decoder
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.sky import OPACITY, Sky
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
@@ -153,7 +153,7 @@ def _add_decoder(model: RenderingModel, clip_mean: Tensor, dense_mean: Tensor) -
     model.register_buffer("clip_mean", clip_mean)
     model.register_buffer("dense_mean", dense_mean)
     c, channels = model.config, (len(clip_mean), len(dense_mean))
-    model.semantic_field = make_decoder(c.decoder, c.semantic_field, *channels, *model.extent)
+    model.semantic_field = make_decoder(c.decoder, c.semantic_field, *channels)
 
 
 def _add_codes(model: RenderingModel) -> None:

@@ -24,13 +24,13 @@ from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
 
-from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
+from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.query_config import QueryConfig
@@ -332,7 +332,7 @@ def _decoder(file: _File, described: dict[str, Any]) -> Decoder:
     needed = _parameters(settings, clip + dense)
     expect(needed <= 4 * stored + 10_000_000, "its decoder is larger than the file")
     config, choice = SemanticFieldConfig(preset="short", **settings), DecoderConfig(name=described["name"])
-    return file.loaded("decoder", make_decoder(choice, config, clip, dense, torch.zeros(3), 1.0))
+    return file.loaded("decoder", make_decoder(choice, config, clip, dense))
 
 
 def _parameters(settings: Mapping[str, Any], channels: int) -> int:

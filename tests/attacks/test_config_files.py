@@ -143,7 +143,7 @@ def test_a_run_opens_without_nerfstudios_reader_wherever_it_lies(copy):
 
 
 def test_a_run_with_an_unknown_setting_does_not_open(copy):
-    path, decoder = copy / "config.yml", "!!python/object:lang3dxl_ns.baselines.decoders.DecoderConfig\n"
+    path, decoder = copy / "config.yml", "!!python/object:lang3dxl_ns.components.decoders.DecoderConfig\n"
     text = path.read_text()
     indent = " " * (len(text.split(decoder)[1]) - len(text.split(decoder)[1].lstrip()))
     path.write_text(text.replace(decoder, f"{decoder}{indent}begin: noise\n"))

@@ -9,7 +9,7 @@ import torch
 from painted_scene import CHANNELS, encode_texts, painted_file, painted_scene
 from PIL import Image
 
-from lang3dxl_ns.baselines.lifting import LiftedFeatures
+from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands.query import CocoLabels
 from lang3dxl_ns.query.scene_file import read_scene, write_scene

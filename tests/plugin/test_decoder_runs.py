@@ -1,27 +1,33 @@
 """Training runs of the baselines."""
 
 from functools import cache
-from typing import get_args
 
 import pytest
 import torch
 from conftest import make_trainer
 from nerfstudio.utils.eval_utils import eval_setup
 
-from lang3dxl_ns.baselines.decoders import DecoderConfig, DecoderName
+from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.components.compression import CompressionConfig
+from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
 
 @pytest.fixture(scope="module")
 def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
     """The finished short run of a decoder by name, "none" for colors alone; each is made once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(langsplat, "_STEPS", 20)
+        yield runs(scene, tiny_clip, tiny_dense, tmp_path_factory)
+
+
+def runs(scene, tiny_clip, tiny_dense, tmp_path_factory):
 
     @cache
     def made(name: str, dense: bool = True):
         semantics = name != "none"
         few = CompressionConfig(steps=40, batch=512)
-        decoder = DecoderConfig(name, few, autoencoder_steps=20) if semantics else DecoderConfig()
+        decoder = DecoderConfig(name, few) if semantics else DecoderConfig()
         changes = {"pipeline__model__decoder": decoder}
         if not dense:
             changes["pipeline__datamanager__dense"] = "none"
@@ -34,7 +40,7 @@ def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
     return made
 
 
-@pytest.mark.parametrize("name", get_args(DecoderName))
+@pytest.mark.parametrize("name", ["gathered", "paper", *BASELINES])
 def test_a_decoder_trains_gives_features_of_the_targets_width_and_is_the_same_once_loaded(run, name):
     trainer = run(name)
     model = trainer.pipeline.model.eval()

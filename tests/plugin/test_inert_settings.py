@@ -67,3 +67,9 @@ def test_what_is_trained_with_the_scene_may_set_its_weights():
     check_inert(config.pipeline.model, config.pipeline.datamanager)
     plain = changed("pipeline.datamanager.regions", "none")
     check_inert(plain.pipeline.model, plain.pipeline.datamanager)
+
+
+def test_an_unknown_decoder_is_refused_with_the_names_there_are():
+    config = changed("pipeline.model.decoder.name", "fancy")
+    with pytest.raises(UserError, match="unknown feature decoder 'fancy': choose one of gathered, paper"):
+        check_inert(config.pipeline.model, config.pipeline.datamanager)

@@ -19,9 +19,10 @@ from painted_scene import (
 )
 from PIL import Image
 
-from lang3dxl_ns.baselines.decoders import NAMES, DecoderConfig, make_decoder
+from lab.baselines import BASELINES
 from lang3dxl_ns.commands.view import Info
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.scene import Scene
@@ -34,9 +35,7 @@ ATOL = 1e-4 * TEMPERATURE
 def decoded(name: str, seed: int = 0) -> dict:
     """A decoder of this kind with random weights, and codes for the painted Gaussians."""
     torch.manual_seed(seed)
-    decoder = make_decoder(
-        DecoderConfig(name=name), SemanticFieldConfig(preset="short"), CHANNELS, 0, torch.zeros(3), 5.0
-    )
+    decoder = make_decoder(DecoderConfig(name=name), SemanticFieldConfig(preset="short"), CHANNELS, 0)
     decoder.requires_grad_(False)
     count = len(painted_gaussians()["means"])
     if name == "lifting":
@@ -97,7 +96,7 @@ def test_unknown_gaussians_stay_unknown(written):
     assert torch.equal(read_scene(path, "cpu").codes.isnan(), scene.codes.isnan())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["gathered", "paper", *BASELINES])
 def test_every_decoder_answers_from_its_file_as_before(name, tmp_path):
     scene = painted_scene(**decoded(name))
     write_scene(tmp_path / "a.scene", scene)

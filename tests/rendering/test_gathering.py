@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from lang3dxl_ns.baselines.lifting import LiftedFeatures
+from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.components.feature_decoder import Gathered
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, filled_pixels, gather

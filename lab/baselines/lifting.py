@@ -62,4 +62,4 @@ class Feature3DGS(Decoder):
         return self._split(self.output_mean + self.output_std * self.layer(rendered))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        return {"feature3dgs_decoder": list(self.layer.parameters())}
+        return {"field_decoder": list(self.layer.parameters())}

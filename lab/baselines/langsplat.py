@@ -14,7 +14,7 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 
 _ENCODER = (256, 128, 64, 32, 3)
 _DECODER = (16, 32, 64, 128, 256, 256)
-_BATCH = 1024
+_STEPS, _BATCH = 2_000, 1_024
 _RATE = 2e-3
 """Learning rate of the autoencoder. It is higher than the published 7e-4, which is for batches of 64."""
 _MOST_FEATURES = 400_000
@@ -24,14 +24,13 @@ _MOST_FEATURES = 400_000
 class LangSplat(Decoder):
     """Decoder of unit-length codes after rendering: the frozen second half of an autoencoder.
 
-    The autoencoder learns the scene's CLIP targets before the run, as unit vectors, in `steps` iterations;
+    The autoencoder learns the scene's CLIP targets before the run, as unit vectors, in `_STEPS` iterations;
     decoded features are scaled back to the targets' typical length. There are no dense features. The
     published system trains a model for each of three levels of SAM segments; this one uses the targets that
     all decoders share here."""
 
-    def __init__(self, clip_dim: int, steps: int) -> None:
+    def __init__(self, clip_dim: int) -> None:
         super().__init__(clip_dim, 0)
-        self.steps = steps
         self.decoder = _layers((3, *_DECODER, clip_dim)).requires_grad_(False)
         self.first_code: Tensor
         self.norm: Tensor
@@ -64,8 +63,8 @@ class LangSplat(Decoder):
         self.decoder.requires_grad_(True)
         parameters = [*encoder.parameters(), *self.decoder.parameters()]
         optimizer = torch.optim.Adam(parameters, lr=_RATE)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(self.steps, 1))
-        for _ in range(self.steps):
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _STEPS)
+        for _ in range(_STEPS):
             batch = features[torch.randint(len(features), (_BATCH,), generator=generator)]
             decoded = F.normalize(self.decoder(F.normalize(encoder(batch), dim=-1)), dim=-1)
             cosine = F.cosine_similarity(decoded, batch, dim=-1).mean()

@@ -11,8 +11,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lang3dxl_ns.components.feature_decoder import Decoder, Features
+from lang3dxl_ns.components.initialization import center_and_radius
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
+_ALIGNMENT = 0.01
+"""Weight of the loss that aligns CLIP with dense features (published: 0.01 to 0.03)."""
 _STRETCH = 2.0
 """Scale of positions before the grid's sigmoid: those within the scene radius fill 0.12 … 0.88 of the grid
 almost evenly, and all others share the rest."""
@@ -21,34 +24,26 @@ almost evenly, and all others share the rest."""
 class PlaceField(Decoder):
     """Semantic field evaluated at a Gaussian's position instead of a pixel's code.
 
-    Every Gaussian is decoded, and whole features are rendered. Gaussians have no learned codes.
+    Every Gaussian is decoded, and whole features are rendered. Gaussians have no learned codes. The scene's
+    center and radius are those of the Gaussians that are decoded first."""
 
-    Args:
-        center, radius: center and radius of the scene, world units.
-        alignment_weight: weight of the pixel alignment loss.
-    """
-
-    def __init__(
-        self,
-        config: SemanticFieldConfig,
-        clip_dim: int,
-        dense_dim: int,
-        center: Float[Tensor, "3"],
-        radius: float,
-        alignment_weight: float,
-    ) -> None:
+    def __init__(self, config: SemanticFieldConfig, clip_dim: int, dense_dim: int) -> None:
         super().__init__(clip_dim, dense_dim)
         # A position has three coordinates, whatever the field's code size.
         self.field = SemanticField(replace(config, code_dim=3, bounding="sigmoid"), clip_dim, dense_dim)
-        self.alignment_weight = alignment_weight
         self.center: Tensor
         self.radius: Tensor
-        self.register_buffer("center", center.detach().clone())
-        self.register_buffer("radius", center.new_tensor(radius))
+        self.register_buffer("center", torch.zeros(3))
+        self.register_buffer("radius", torch.zeros(()))
 
     def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"]:
         """Decode the features at the Gaussians' positions; positions get no gradient."""
-        places = _STRETCH * (gaussians["means"].detach() - self.center) / self.radius
+        means = gaussians["means"].detach()
+        if self.radius == 0:
+            center, radius = center_and_radius(means)
+            self.center.copy_(center)
+            self.radius.fill_(radius)
+        places = _STRETCH * (means - self.center) / self.radius
         clip, dense = self.field(places)
         return clip if dense is None else torch.cat([clip, dense], dim=-1)
 
@@ -63,7 +58,7 @@ class PlaceField(Decoder):
     ) -> dict[str, Float[Tensor, ""]]:
         if dense is None:
             return {}
-        return {"alignment": self.alignment_weight * pixel_alignment_loss(clip, dense)}
+        return {"alignment": _ALIGNMENT * pixel_alignment_loss(clip, dense)}
 
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
         self.field.set_output_statistics(mean, std)

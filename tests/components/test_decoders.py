@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from lang3dxl_ns.baselines.decoders import DecoderConfig, make_decoder
-from lang3dxl_ns.baselines.fmgs import neighbor_similarity, pixel_alignment_loss
+from lab.baselines import langsplat
+from lab.baselines.fmgs import neighbor_similarity, pixel_alignment_loss
+from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
 NAMES = ("paper", "feature3dgs", "fmgs", "langsplat", "direct")
@@ -13,8 +14,7 @@ CLIP, DENSE = 16, 6
 
 def decoder_of(name: str):
     torch.manual_seed(0)
-    config = DecoderConfig(name, autoencoder_steps=300)
-    return make_decoder(config, SemanticFieldConfig("short"), CLIP, DENSE, torch.tensor([1.0, 2.0, 3.0]), 5.0)
+    return make_decoder(DecoderConfig(name), SemanticFieldConfig("short"), CLIP, DENSE)
 
 
 def statistics():
@@ -109,7 +109,8 @@ def test_alignment_moves_clip_towards_dense_and_not_the_other_way():
     assert dense.grad is None
 
 
-def test_autoencoder_of_langsplat_tells_the_features_of_a_scene_apart():
+def test_autoencoder_of_langsplat_tells_the_features_of_a_scene_apart(monkeypatch):
+    monkeypatch.setattr(langsplat, "_STEPS", 300)
     generator = torch.Generator().manual_seed(0)
     prototypes = torch.randn(4, CLIP, generator=generator)
     targets = [4 * prototypes[torch.randint(4, (9, 8), generator=generator)] for _ in range(3)]

@@ -1,1 +1,0 @@
-"""Baselines from the literature, which implement the semantic field's interface."""

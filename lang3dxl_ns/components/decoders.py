@@ -1,0 +1,59 @@
+"""Choice of a run's feature decoder by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, JointField
+from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+
+
+class Kind(NamedTuple):
+    """A kind of feature decoder."""
+
+    build: Callable[[SemanticFieldConfig, int, CompressionConfig, int], Decoder]
+    """Builds one for a field's settings, CLIP channels, settings of compression, and dense channels."""
+    learns_from_renderings: bool = True
+    """Whether codes are trained with the scene, with all semantic losses."""
+
+
+DECODERS = {"gathered": Kind(CompressedField, False), "paper": Kind(JointField)}
+"""Feature decoders by name. Another one is added by the module that defines it."""
+
+
+@showing("name")
+@dataclass
+class DecoderConfig:
+    """Settings of the model's feature decoder.
+
+    Targets, losses and schedules are the same for all decoders, so that a comparison isolates the decoder."""
+
+    name: str = "gathered"
+    """How features are stored on Gaussians and decoded. gathered: targets are averaged onto the Gaussians
+    after training and compressed to three numbers each, which the semantic field decodes Gaussian by
+    Gaussian. paper: Lang3D-XL as published, with codes trained with the scene and decoded pixel by pixel.
+    """
+
+    compression: CompressionConfig = field(default_factory=CompressionConfig)
+    """gathered: how gathered features are compressed to codes."""
+
+    @property
+    def kind(self) -> Kind:
+        """The decoder's kind. Raises UserError if there is none of that name."""
+        if self.name not in DECODERS:
+            raise UserError(f"unknown feature decoder {self.name!r}: choose one of {', '.join(DECODERS)}")
+        return DECODERS[self.name]
+
+
+def make_decoder(
+    config: DecoderConfig, settings: SemanticFieldConfig, clip_dim: int, dense_dim: int
+) -> Decoder:
+    """Build the feature decoder that `config` names; `settings` applies to decoders with a hash grid."""
+    decoder = config.kind.build(settings, clip_dim, config.compression, dense_dim)
+    decoder.name = config.name
+    return decoder
