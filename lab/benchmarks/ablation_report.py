@@ -25,7 +25,7 @@ FIGURES = {
     "seen_map": ("mAP, seen photos", ".3f"),
     "test_raw_map": ("without blur, test views", ".3f"),
     "test_clip_l1": ("CLIP L1", ".3f"),
-    "test_half_psnr": ("PSNR, half image", ".2f"),
+    "half_psnr": ("PSNR, half image", ".2f"),
     "test_cc_psnr": ("PSNR, matched", ".2f"),
     "train_seconds": ("train, s", ".0f"),
     "train_peak_mb": ("peak, MB", ".0f"),

@@ -45,8 +45,6 @@ _BESIDE = (
     "map",
     "raw_map",
     "localization_accuracy",
-    "half_psnr",
-    "half_ssim",
     "cc_psnr",
     "clip_l1",
     "clip_cosine",
