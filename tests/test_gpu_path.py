@@ -359,7 +359,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
         model.answers = None
 
 
-@pytest.mark.parametrize(("name", "width", "memory"), [("gathered", 3, 2.0), ("lifting", 65, 2.5e4)])
+@pytest.mark.parametrize(("name", "width", "memory"), [("gathered", 3, 2.0), ("lifting", 65, 5e5)])
 def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, width, memory):
     """Wide features as principal components, a few channels at a time, sums on the CPU."""
     monkeypatch.setattr(CompressedField, "gathered_channels", 5)

@@ -29,7 +29,7 @@ from lab.clip_training.photos import store_photos
 from lab.clip_training.small_clip import GRID, PATCH, as_encoder, load_clip, normalize
 from lab.clip_training.views import COLOR, ELEMENT, PART, SPLITS, ViewFolder, background_rendering
 from lang3dxl_ns.preparation.dense_map import build_dense_map, nested_grids
-from lang3dxl_ns.preparation.families import FILE, PatchHead, patch_tokens
+from lang3dxl_ns.preparation.families import FILE, PatchHead, patch_tokens, read_patch_head
 from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model
 
 SIDES = (20, 90)
@@ -65,12 +65,14 @@ class PatchTraining:
     """Folder for rendered views."""
     photos: Path | None = None
     """Folder of labeled photos; none without it."""
-    landmarks: int = 900
+    landmarks: int = 1_942
     """Number of training landmarks, with two views each."""
     most_photos: int = 800
     """Most pictures of photos, each of which counts as taken and by daylight."""
-    steps: int = 4_000
+    steps: int = 8_000
     """Training steps, each with 2,048 patches from landmarks and as many from photos."""
+    beside: Path | None = None
+    """Folder of a CLIP whose head is averaged with the new one: two fits err less than one."""
     processes: int = 1
     """Processes that render landmarks."""
     seed: int = 0
@@ -98,6 +100,10 @@ class PatchTraining:
         texts = torch.stack([_unit(_unit(encoder.encode_texts(words_of(k)[:2])).mean(0)) for k in _classes()])
         head = PatchHead(worlds[0][0][0].shape[-1], texts.shape[1], SIZES, HIDDEN)
         fit(head, worlds, texts, self.steps)
+        if self.beside is not None:
+            other = read_patch_head(self.beside, "cpu")
+            assert other is not None, f"{self.beside} has no head"
+            head = averaged(other, head)
         self.out.mkdir(parents=True, exist_ok=True)
         save_file({name: tensor.half() for name, tensor in head.state_dict().items()}, self.out / FILE)
 
@@ -183,6 +189,24 @@ def fit(
         if (step + 1) % 500 == 0:
             print(f"step {step + 1}: loss {mean:.3f}", flush=True)
     head.eval()
+
+
+def averaged(*heads: PatchHead) -> PatchHead:
+    """Build the head whose output is the mean of those of `heads`; its hidden layer is all of theirs."""
+    first = heads[0]
+    width, channels = first.direct.in_features, first.direct.out_features
+    mean = PatchHead(width, channels, first.sizes, sum(head.inner.out_features for head in heads))
+    with torch.no_grad():
+        for name in ("weight", "bias"):
+            parts = [getattr(head.direct, name) for head in heads]
+            getattr(mean.direct, name).copy_(torch.stack(parts).mean(0))
+        # The norms' scales and offsets move into the layers that follow them.
+        mean.inner.weight.copy_(torch.cat([head.inner.weight * head.norm.weight for head in heads]))
+        offsets = [head.inner.bias + head.inner.weight @ head.norm.bias for head in heads]
+        mean.inner.bias.copy_(torch.cat(offsets))
+        mean.outer.weight.copy_(torch.cat([head.outer.weight for head in heads], 1) / len(heads))
+        mean.outer.bias.copy_(torch.stack([head.outer.bias for head in heads]).mean(0))
+    return mean.eval()
 
 
 if __name__ == "__main__":

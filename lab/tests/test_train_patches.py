@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from lab.clip_training.captions import CLASSES, MAY_BE
-from lab.clip_training.train_patches import fit
+from lab.clip_training.train_patches import averaged, fit
 from lang3dxl_ns.preparation.families import PatchHead
 
 WIDTH, CHANNELS, COUNT = 24, 32, 6_000
@@ -40,3 +40,12 @@ def test_patches_are_read_as_the_texts_of_what_they_show(told_by):
     before = right()
     fit(head, [((tokens, F.one_hot(shown, number).float()), 1.0)], texts, 300)
     assert before < 0.6 < 0.95 < right()
+
+
+def test_the_mean_of_two_heads_is_one_head():
+    heads = [PatchHead(WIDTH, CHANNELS, 2, hidden).eval() for hidden in (16, 24)]
+    for head in heads:
+        for parameter in head.norm.parameters():
+            torch.nn.init.normal_(parameter)
+    tokens = F.normalize(torch.randn(2, 50, WIDTH), dim=-1)
+    torch.testing.assert_close(averaged(*heads)(tokens), (heads[0](tokens) + heads[1](tokens)) / 2)
