@@ -18,6 +18,8 @@ _OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
 STRONG = 0.5
 """Fraction of the way from the threshold to the highest relevancy from which Gaussians are the match."""
+BOXED = 0.75
+"""The same for a box, which is to hold one thing: with half-way some hold a spire and its tower."""
 PEAK = 1e-3
 """Share of a view over which its peak is averaged, so that one stray Gaussian does not decide."""
 LARGE = 0.2
@@ -78,8 +80,9 @@ def strongest_match(
 ) -> Box | None:
     """Find the box of the connected Gaussians that match best; None if none does.
 
-    Only Gaussians more than half-way from the threshold to the best count, so that weaker matches beside the
-    strongest don't widen its box. DBSCAN separates groups that are more than `gap` world units apart.
+    Only Gaussians three quarters of the way from the threshold to the best, or nearer, count, so that weaker
+    matches beside the strongest don't widen its box. DBSCAN separates groups that are more than `gap` world
+    units apart.
 
     scores: relevancy of each Gaussian, 0…1. mass: pixels that each Gaussian fills, over all views.
     """
@@ -90,7 +93,7 @@ def strongest_match(
     # The highest relevancy apart from stray Gaussians: 2 % of the matching mass exceed it.
     order = rows[scores[rows].argsort(descending=True)]
     beyond = (mass[order].cumsum(0) < _OUTLIERS * mass[order].sum()).sum()
-    level = threshold + STRONG * (scores[order[beyond.clamp_max(len(order) - 1)]] - threshold)
+    level = threshold + BOXED * (scores[order[beyond.clamp_max(len(order) - 1)]] - threshold)
     strong = rows[scores[rows] >= level]
     return max(groups(means[strong], weights[strong], gap), key=lambda box: box.share)
 

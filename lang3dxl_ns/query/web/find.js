@@ -1,6 +1,6 @@
 // Location of a match: the views that show it best, and a box around its strongest part, as in Python's query/.
 
-const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, OUTLIERS = 0.02, CORE = 0.002, BINS = 1000;
+const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, BOXED = 0.75, OUTLIERS = 0.02, CORE = 0.002, BINS = 1000;
 
 /** Read views with the Gaussians that they show, and the share of the view that each fills: sizes[codes[k]]. */
 export function readViews(about, buffer) {
@@ -81,7 +81,7 @@ export function boxAround(centers, relevancy, mass, threshold, gap) {
   const total = matching.reduce((sum, i) => sum + mass[i], 0);
   let before = 0;
   const high = relevancy[matching.find((i) => (before += mass[i]) >= OUTLIERS * total) ?? matching.at(-1)];
-  const strong = matching.filter((i) => relevancy[i] >= threshold + STRONG * (high - threshold));
+  const strong = matching.filter((i) => relevancy[i] >= threshold + BOXED * (high - threshold));
   const group = heaviestGroup(strong, centers, (i) => (relevancy[i] - threshold) * mass[i], gap);
   const ends = [0, 1, 2].map((axis) => {
     const sorted = Float32Array.from(group, (i) => centers[3 * i + axis]).sort(), last = sorted.length - 1;
