@@ -31,19 +31,6 @@ PROTOCOL = "half_…: each photo's look is fitted on its left half, and its righ
 
 
 @dataclass(frozen=True)
-class HalfImage:
-    """Result of the protocol for one photo, in the look of its left half."""
-
-    vector: Float[Tensor, " v"]
-    """Appearance vector of the fitted look."""
-    rendering: Float[Tensor, "h w 3"]
-    """Rendering of the whole photo's view in this look."""
-    figures: dict[str, float]
-    """Figures of the right half: `half_psnr` (dB), `half_ssim`, and `half_lpips` if its weights are
-    available. `fit_seconds` is the time of the fit."""
-
-
-@dataclass(frozen=True)
 class HalfImageProtocol:
     """Half-image protocol for photos of one scene, which is not changed."""
 
@@ -61,9 +48,11 @@ class HalfImageProtocol:
     @torch.no_grad()
     def measure(
         self, camera: Camera, photo: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None = None
-    ) -> HalfImage:
-        """Fit the look on a photo's left half (its foreground, given a mask), and score its right half. The
-        camera has the photo's size; colors are 0…1."""
+    ) -> tuple[Float[Tensor, "h w 3"], dict[str, float]]:
+        """Fit the look on a photo's left half (its foreground, given a mask), and score its right half.
+        Return the rendering of the whole view in this look, and the figures: `half_psnr` (dB), `half_ssim`,
+        `half_lpips` if its weights are available, and `fit_seconds`, the time of the fit. The camera has the
+        photo's size; colors are 0…1."""
         middle = photo.shape[1] // 2
         start = perf_counter()
         vector = self.fit(camera, photo[:, :middle], None if mask is None else mask[:, :middle])
@@ -72,8 +61,7 @@ class HalfImageProtocol:
         settings: dict[str, Any] = {"background": self.background, "backend": self.backend}
         rendering = render_in_look(self.splats, camera, Look(self.field, vector), **settings).rgb
         scores = self.metrics(rendering[:, middle:], photo[:, middle:])
-        figures = {f"half_{name}": value for name, value in scores.items()} | {"fit_seconds": seconds}
-        return HalfImage(vector, rendering, figures)
+        return rendering, {f"half_{name}": value for name, value in scores.items()} | {"fit_seconds": seconds}
 
     def fit(
         self,

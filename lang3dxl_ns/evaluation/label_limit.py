@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.evaluation.scores import Maps
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import composite
@@ -24,12 +23,10 @@ Masks = Mapping[str, Bool[Array, "h w"]]
 
 def label_limit(
     splats: Splats, views: Iterable[tuple[Camera, Masks]], categories: list[str], backend: Backend = "auto"
-) -> Callable[[Camera], Maps]:
-    """Return a function from a view to its maps by category, at the size of the rendering."""
+) -> Callable[[Camera], Float[Tensor, "categories h w"]]:
+    """Return a function from a view to its maps, in the order of the categories."""
     shares = lifted_labels(splats, views, categories, backend)
-    return lambda camera: dict(
-        zip(categories, composite(splats, camera, shares, backend).permute(2, 0, 1), strict=True)
-    )
+    return lambda camera: composite(splats, camera, shares, backend).permute(2, 0, 1)
 
 
 def lifted_labels(

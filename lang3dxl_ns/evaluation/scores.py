@@ -115,11 +115,6 @@ def map_size(maps: Maps) -> tuple[int, int]:
     return height, width
 
 
-def resized(maps: Maps, size: tuple[int, int]) -> Maps:
-    """Resize every map to (height, width)."""
-    return {name: resize_map(scores[None], size)[0] for name, scores in maps.items()}
-
-
 def blurred(maps: Maps) -> Maps:
     """Blur every map by a Gaussian of `BLUR` pixels."""
     return _each(maps, lambda score: gaussian_filter(score, BLUR))

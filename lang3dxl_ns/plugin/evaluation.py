@@ -21,12 +21,12 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import host_peak, progress_bar, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
-from lang3dxl_ns.evaluation.half_image import PROTOCOL, HalfImage, HalfImageProtocol
+from lang3dxl_ns.evaluation.half_image import PROTOCOL, HalfImageProtocol
 from lang3dxl_ns.evaluation.label_limit import label_limit
 from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
 from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
 from lang3dxl_ns.evaluation.score_scene import truths_of
-from lang3dxl_ns.evaluation.scores import Maps, bounds, inside, map_size, resized
+from lang3dxl_ns.evaluation.scores import bounds, inside, map_size
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
@@ -41,6 +41,7 @@ from lang3dxl_ns.scene.photo import Photo
 Split = Literal["held-out", "seen", "test"]
 Score = Callable[[Cameras, EvaluatedPhoto, Batch, Photo], None]
 """Function that adds word scores to an evaluated photo."""
+LabelLimit = Callable[[Camera], Float[Tensor, "categories h w"]]
 _COLORS_OF_LIGHT = ("psnr", "ssim", "lpips")
 """Image metrics that are meaningless for views whose lighting differs from the photos'."""
 
@@ -136,9 +137,8 @@ class Evaluation:
                 for name in hidden:
                     evaluated.metrics.pop(name, None)
                 if self._fits_looks(split):
-                    fitted = self._half_image(camera, batch)
-                    evaluated.metrics = fitted.figures | evaluated.metrics
-                    evaluated.images["fitted"] = fitted.rendering
+                    evaluated.images["fitted"], figures = self._half_image(camera, batch)
+                    evaluated.metrics = figures | evaluated.metrics
                 yield evaluated
         self._model.train()
 
@@ -147,7 +147,7 @@ class Evaluation:
         takes most of the time of an evaluation, and matched colors serve for test views."""
         return self._model.appearance is not None and split == "held-out"
 
-    def _half_image(self, camera: Cameras, batch: Batch) -> HalfImage:
+    def _half_image(self, camera: Cameras, batch: Batch) -> tuple[Float[Tensor, "h w 3"], dict[str, float]]:
         model = self._model
         assert model.appearance is not None
         background, weight = model._get_background_color(), model.config.ssim_lambda
@@ -168,7 +168,7 @@ class Evaluation:
             raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
         return self._data.evaluated(seen, labeled)
 
-    def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> Callable[[Camera], Maps]:
+    def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> LabelLimit:
         """Build a function that renders the labels themselves, lifted from the photos to the Gaussians."""
         truth = scorer.truth
         sized = ((camera, p, truth.scoring_size(p.height, p.width)) for camera, p in photos.cameras())
@@ -194,7 +194,7 @@ class Evaluation:
     def _score_words(
         self,
         scorer: LanguageScorer,
-        limit: Callable[[Camera], Maps],
+        limit: LabelLimit,
         camera: Cameras,
         evaluated: EvaluatedPhoto,
         batch: Batch,
@@ -217,7 +217,8 @@ class Evaluation:
         evaluated.maps = inside(raw, keep)
         truths = truths_of(scorer.truth, photo, map_size(raw))
         evaluated.metrics |= scorer.scores(photo.name, variants | {"teacher_": teacher}, truths)
-        evaluated.metrics |= bounds(inside(resized(limit(to_rasterizer(camera)), size), keep), truths)
+        lifted = scorer.named(limit(to_rasterizer(camera)), size)
+        evaluated.metrics |= bounds(inside(lifted, keep), truths)
 
     @torch.no_grad()
     def relevancy(self, camera: Cameras, queries: Queries, yardstick: Queries) -> Float[Tensor, "q h w"]:
