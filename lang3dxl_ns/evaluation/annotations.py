@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from PIL import Image
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
@@ -28,11 +28,9 @@ class Truth:
 
 def read_gray(path: Path, what: str = "ground truth") -> Image.Image:
     """Read a picture as gray values 0…255. Raises UserError if it cannot be read."""
-    try:
-        with open_picture(path) as image:
-            return image.convert("L")
-    except (OSError, NoPictureError) as error:
-        raise UserError(f"{what} {path} can't be read ({error}): replace or remove it") from error
+    problem, damage = f"{what} {path} can't be read", (OSError, NoPictureError)
+    with readable(problem, "replace or remove it", damage), open_picture(path) as image:
+        return image.convert("L")
 
 
 def check_shape(path: Path, mine: tuple[int, int], other: tuple[int, int]) -> None:

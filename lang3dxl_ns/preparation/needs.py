@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.errors import readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.preparation.collection import SCALE_RATIO, CropPlan
@@ -132,14 +132,10 @@ def needs_table(needs: Sequence[Need]) -> str:
     return markdown_table(["component", "measured", "value", "needed above", "verdict"], rows)
 
 
-def as_data(needs: Sequence[Need]) -> dict[str, dict[str, Any]]:
-    """Convert the needs to data for JSON, by component."""
-    return {n.component: {**asdict(n), "verdict": n.verdict} for n in needs}
-
-
 def write_needs(needs: Sequence[Need], folder: Path) -> None:
     """Write scene_needs.json and .md to the run's folder."""
-    write_report(folder, NEEDS_FILE, f"# What this scene needs\n\n{needs_table(needs)}", as_data(needs))
+    data = {n.component: {**asdict(n), "verdict": n.verdict} for n in needs}
+    write_report(folder, NEEDS_FILE, f"# What this scene needs\n\n{needs_table(needs)}", data)
 
 
 def read_needs(folder: Path) -> dict[str, bool]:
@@ -147,11 +143,8 @@ def read_needs(folder: Path) -> dict[str, bool]:
     path = folder / f"{NEEDS_FILE}.json"
     if not path.is_file():
         return {}
-    try:
-        found = read_json(path)
-        return {component: bool(need["needed"]) for component, need in found.items()}
-    except DAMAGE as error:
-        raise UserError(f"{path} can't be read ({error!r}): copy it again, or remove it") from error
+    with readable(f"{path} can't be read", "copy it again, or remove it"):
+        return {component: bool(need["needed"]) for component, need in read_json(path).items()}
 
 
 def _figure(value: float | None) -> str | None:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
 
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.preparation.foreground import find_mask
@@ -118,19 +118,16 @@ def read_transforms(path: Path) -> _Read:
     """Read the photos and poses of a transforms.json, as instant-ngp and nerfstudio write it: photos by file,
     reasons for those left out, and the reconstruction (without points) in its frame. Raises UserError if the
     file is damaged."""
-    try:
+    with readable(f"{path} can't be used", "correct it, or make it again"):
         content = read_json(path)
-        frames = content["frames"]
         photos, left_out, tracked = dict[Path, Photo](), dict[str, UserError](), dict[str, TrackedPhoto]()
-        for frame in frames:
+        for frame in content["frames"]:
             name = _photo_name(path.parent, str(frame["file_path"]))
             try:
                 photo, tracked[name] = _transforms_photo(path.parent, name, {**content, **frame})
                 photos[photo.path] = photo
             except UserError as reason:
                 left_out[name] = reason
-    except DAMAGE as error:
-        raise UserError(f"{path} can't be used ({error!r}): correct it, or make it again") from error
     photos = dict(sorted(photos.items(), key=lambda item: item[1].name))
     nothing = np.zeros((0, 3))
     return photos, left_out, Reconstruction(dict(sorted(tracked.items())), nothing, nothing.astype(np.uint8))

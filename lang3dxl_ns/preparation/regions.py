@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_array
 from lang3dxl_ns.common.image import fitted_size, resize
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
@@ -69,10 +69,8 @@ def region_source(config: PreparationConfig, data: Path, device: torch.device | 
         files = find_sam(config.sam)
         return MaskRegions(partial(_sam_masks, files, device), level, regions="sam", model=files.identity)
     if choice == "text":
-        found, prompts = (
-            find_text_segmenter(config.foreground_model, config.sam),
-            sorted(config.region_prompts),
-        )
+        found = find_text_segmenter(config.foreground_model, config.sam)
+        prompts = sorted(config.region_prompts)
         if not is_sam3(found):
             raise UserError(
                 f"regions text needs a SAM 3, and {found.words.name} is none: {TEXT_OPTION} facebook/sam3"
@@ -180,16 +178,13 @@ def label_size(height: int, width: int) -> tuple[int, int]:
 
 def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
     """Read a file's labels: integers, negative for no region (0 in a picture, which has no sign)."""
-    try:
+    damage = (OSError, NoPictureError, ValueError)
+    with readable(f"regions of {name}: can't read {path}", "make it again, or remove it", damage):
         if path.suffix == ".npy":
             labels, first = read_array(path), 0
         else:
             with open_picture(path) as picture:
                 labels, first = np.asarray(picture), 1
-    except (OSError, NoPictureError, ValueError) as error:
-        raise UserError(
-            f"regions of {name}: can't read {path} ({error}): make it again, or remove it"
-        ) from error
     if labels.ndim != 2 or not labels.size or labels.dtype.kind not in "iu":
         raise UserError(
             f"regions of {name}: {path} holds {labels.dtype} numbers of shape {labels.shape}, not one whole "

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.errors import readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import TrackedPhoto
@@ -42,12 +42,10 @@ def read_novel_views(scene: Path) -> NovelViews | None:
     path = scene / FOLDER / CAMERAS
     if not path.is_file():
         return None
-    try:
+    with readable(f"{path} is damaged", "make the scene again, or remove the file"):
         content = read_json(path)
         cameras = [_tracked(view) for view in content["views"]]
         return NovelViews(path.parent, cameras, bool(content["same_light"]))
-    except DAMAGE as error:
-        raise UserError(f"{path} is damaged ({error!r}): make the scene again, or remove the file") from error
 
 
 def _tracked(view: dict) -> TrackedPhoto:
