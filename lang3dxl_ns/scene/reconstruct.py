@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import shutil
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +26,7 @@ from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
+from lang3dxl_ns.common.timing import measure, part
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import (
@@ -62,15 +62,14 @@ def reconstruct(
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
     good, left_out = _usable(photos)
-    clock: dict[str, float] = {}
-    with _quiet():
-        with _timed(clock, "features"):
+    with _quiet(), measure() as clock:
+        with part("features"):
             copies = _numbered(good, work)
             database = _database(good, copies, work, settings)
             _extract(database, copies, settings)
-        with _timed(clock, "matching"):
+        with part("matching"):
             _match(database, copies.names)
-        with _timed(clock, "mapping"):
+        with part("mapping"):
             models = _map(database, copies, work, settings.mapper)
     features, partners = _features_and_partners(database)
     if not models:
@@ -90,7 +89,7 @@ def reconstruct(
         mapper=settings.mapper, doubtful=doubtful,
         left_out=left_out | {names[number]: why for number, why in reasons.items()},
         other_models=tuple(other.num_reg_images() for other in models[1:]),
-        seconds={stage: round(seconds, 1) for stage, seconds in clock.items()},
+        seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
     )  # fmt: skip
     _publish(models, model)
     write_atomically(work / "report.json", json.dumps(asdict(report), indent=2))
@@ -229,10 +228,8 @@ def _match(database: Path, names: Sequence[str]) -> None:
         pairs = pairs_to_match(known, lambda name: db.read_descriptors(ids[name]).data)
         has = db.exists_matches, db.exists_two_view_geometry
         missing = [(a, b) for a, b in pairs if not all(there(ids[a], ids[b]) for there in has)]
-    options, listed = (
-        pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8)),
-        database.with_name("pairs.txt"),
-    )
+    options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8))
+    listed = database.with_name("pairs.txt")
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     with progress("pairs of photos", len(missing)) as advance:
         for start in range(0, len(missing), _CHUNK_PAIRS):
@@ -346,10 +343,3 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         logging.minloglevel = level
-
-
-@contextmanager
-def _timed(clock: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.monotonic()
-    yield
-    clock[stage] = time.monotonic() - start
