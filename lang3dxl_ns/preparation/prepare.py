@@ -22,6 +22,7 @@ from torch import Tensor
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.stages import roughly
+from lang3dxl_ns.preparation import workers
 from lang3dxl_ns.preparation.dense_map import (
     RULE,
     Grid,
@@ -50,7 +51,6 @@ from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_lab
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
-from lang3dxl_ns.preparation.workers import Workers
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.photo import Photo
 
@@ -146,9 +146,8 @@ def prepare(
         maker = _Maker(config, store, regions, missing)
         store.remove_leftovers()
         maker.announce(len(tasks), str(device))
-        workers = Workers(config.workers, config.engine, config.address)
         with progress("encoding photos", len(missing)) as advance:
-            for task, trouble in workers.run(maker, missing, str(device)):
+            for task, trouble in workers.run(config, maker, missing, str(device)):
                 if trouble:
                     left_out[task.photo.name] = trouble
                 advance()

@@ -11,14 +11,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from multiprocessing import get_context, parent_process
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.settings import PreparationConfig
 
 PATIENCE_S = 30.0
 """Seconds to wait for a named Ray cluster to answer."""
@@ -33,27 +33,19 @@ class Maker(Protocol[Item, Result]):
         """Load everything for the work onto a device, once per worker, and return the work function."""
 
 
-@dataclass(frozen=True)
-class Workers:
-    """Number and kind of workers, as in `PreparationConfig`."""
-
-    count: int = 1
-    engine: Literal["local", "ray"] = "local"
-    address: str | None = None
-
-    def run(
-        self, maker: Maker[Item, Result], items: Sequence[Item], device: str
-    ) -> Iterator[tuple[Item, Result]]:
-        """Yield every item with its result, as they finish. Raises the exceptions of the work, and UserError
-        if a process dies; earlier results are kept."""
-        if self.engine == "ray":
-            yield from _run_on_ray(self, maker, items, device)
-        elif self.count > 1 and len(items) > 1:
-            yield from _run_in_processes(self.count, maker, items, device)
-        else:
-            work = maker.start(device)
-            for item in items:
-                yield item, work(item)
+def run(
+    config: PreparationConfig, maker: Maker[Item, Result], items: Sequence[Item], device: str
+) -> Iterator[tuple[Item, Result]]:
+    """Yield every item with its result, as they finish, from the configured workers. Raises the exceptions of
+    the work, and UserError if a process dies; earlier results are kept."""
+    if config.engine == "ray":
+        yield from _run_on_ray(config, maker, items, device)
+    elif config.workers > 1 and len(items) > 1:
+        yield from _run_in_processes(config.workers, maker, items, device)
+    else:
+        work = maker.start(device)
+        for item in items:
+            yield item, work(item)
 
 
 # --- processes of this machine ----------------------------------------------------------------------------
@@ -120,7 +112,7 @@ class _Actor:
         return item, self._work(item)
 
 
-def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[Item], device: str):
+def _run_on_ray(config: PreparationConfig, maker: Maker[Item, Result], items: Sequence[Item], device: str):
     try:
         import ray
         from ray.util import ActorPool
@@ -128,26 +120,26 @@ def _run_on_ray(workers: Workers, maker: Maker[Item, Result], items: Sequence[It
         raise UserError("--engine ray needs Ray: pip install 'lang3dxl-ns[ray]'") from error
     started = not ray.is_initialized()
     if started:
-        _connect(ray, workers)
+        _connect(ray, config)
     try:
         resources = {"num_gpus": 1} if device.startswith("cuda") else {"num_cpus": 1}
         remote: Any = ray.remote(_Actor)
         actor = remote.options(max_restarts=-1, max_task_retries=-1, **resources)
-        pool: Any = ActorPool([actor.remote(maker, device) for _ in range(workers.count)])
+        pool: Any = ActorPool([actor.remote(maker, device) for _ in range(config.workers)])
         yield from pool.map_unordered(lambda worker, item: worker.do.remote(item), items)
     finally:
         if started:
             ray.shutdown()
 
 
-def _connect(ray: Any, workers: Workers) -> None:
+def _connect(ray: Any, config: PreparationConfig) -> None:
     """Connect to the Ray cluster within the time limit, after which the attempt stays in a daemon thread, or
     start one here. Raises UserError if there is no answer."""
     # A cluster started here listens on this machine only.
-    options = {"num_cpus": workers.count, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-    if workers.address:
-        say(f"connecting to the Ray cluster at {workers.address}: {PATIENCE_S:.0f} s at most")
-        options = {"address": workers.address}
+    options = {"num_cpus": config.workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    if config.address:
+        say(f"connecting to the Ray cluster at {config.address}: {PATIENCE_S:.0f} s at most")
+        options = {"address": config.address}
     answer: Future[None] = Future()
 
     def connect() -> None:
@@ -156,7 +148,7 @@ def _connect(ray: Any, workers: Workers) -> None:
         except BaseException as error:
             answer.set_exception(error)  # raised below
 
-    if workers.address:
+    if config.address:
         threading.Thread(target=connect, daemon=True).start()
     else:
         connect()  # in this thread, with which Ray's processes end
@@ -167,6 +159,6 @@ def _connect(ray: Any, workers: Workers) -> None:
             ray.shutdown()  # of what it has started
         reason = error if answer.done() else f"no answer within {PATIENCE_S:.0f} s"
         raise UserError(
-            f"no Ray cluster answers at {workers.address or 'this machine'} ({reason}): give --address, or "
+            f"no Ray cluster answers at {config.address or 'this machine'} ({reason}): give --address, or "
             "start one with `ray start --head`"
         ) from error

@@ -20,8 +20,8 @@ from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.trainer import writer
 from lang3dxl_ns.preparation import workers
 from lang3dxl_ns.preparation.prepare import _gigabytes
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.preparation.workers import Workers
 
 
 @pytest.fixture
@@ -146,7 +146,7 @@ def test_sizes_are_told_in_a_unit_that_shows_them():
 
 def test_an_attempt_to_connect_that_never_ends_is_left_after_its_time(monkeypatch):
     forever, closed = threading.Event(), []
-    there = Workers(1, "ray", "there")
+    there = PreparationConfig(engine="ray", address="there")
 
     def ray(init):
         return SimpleNamespace(init=init, shutdown=lambda: closed.append(init))
@@ -171,6 +171,6 @@ def test_a_cluster_that_never_answers_is_one_line(monkeypatch, capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(UserError, match=f"no Ray cluster answers at {address}"):
-            list(Workers(1, "ray", address).run(None, [1], "cpu"))
+            list(workers.run(PreparationConfig(engine="ray", address=address), None, [1], "cpu"))
     assert [options["address"] for options in asked] == [address]
     assert f"connecting to the Ray cluster at {address}" in " ".join(capsys.readouterr().out.split())

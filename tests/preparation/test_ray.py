@@ -10,7 +10,8 @@ from tiny_models import make_tiny_clip
 from worker_tasks import Squares, prepare, write_photo
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.workers import Workers, _connect
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.preparation.workers import _connect, run
 
 pytestmark = pytest.mark.nightly
 
@@ -24,7 +25,7 @@ def cluster():
     tests = str(Path(__file__).parents[1])
     patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (tests, os.environ.get("PYTHONPATH", "")))))
     try:
-        _connect(ray, Workers(2, "ray"))
+        _connect(ray, PreparationConfig(workers=2, engine="ray"))
     except UserError as error:
         pytest.skip(f"this machine is too busy to start a cluster: {error}")
     yield ray
@@ -33,7 +34,9 @@ def cluster():
 
 
 def test_a_worker_that_is_killed_is_replaced_and_the_job_ends_complete(tmp_path):
-    found = dict(Workers(2, "ray").run(Squares(tmp_path, deadly=5), range(12), "cpu"))
+    found = dict(
+        run(PreparationConfig(workers=2, engine="ray"), Squares(tmp_path, deadly=5), range(12), "cpu")
+    )
     assert found == {item: item**2 for item in range(12)}
     assert (tmp_path / "sprung").exists()
 
