@@ -56,24 +56,10 @@ class FusedCompositing(torch.autograd.Function):
     """Compositing as in `torch_rasterizer.Compositing`, compiled. The variances get no gradient."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any,
-        means2d: Tensor,
-        conics: Tensor,
-        opacities: Tensor,
-        channels: Tensor,
-        detached_channels: Tensor,
-        variances: Tensor,
-        depths: Tensor,
-        width: int,
-        height: int,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        plan = make_plan(
-            means2d.view(-1, 2), conics, variances, depths, opacities, channels, detached_channels, width,
-            height,
-        )  # fmt: skip
-        ctx.sizes = channels.shape[1], detached_channels.shape[1], 1
-        maps = tuple(channels.new_empty(height, width, size) for size in ctx.sizes)
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+        plan, (means2d, conics, opacities, channels, detached, *_) = make_plan(*inputs), inputs
+        ctx.sizes = channels.shape[1], detached.shape[1], 1
+        maps = tuple(channels.new_empty(plan.height, plan.width, size) for size in ctx.sizes)
         rows, keep = np.diff(plan.starts), any(ctx.needs_input_grad)
         waves = -(-rows // WAVE) if keep else np.zeros_like(rows)
         wave_starts = np.concatenate([np.zeros(1, np.int64), np.cumsum(waves)])
@@ -170,13 +156,13 @@ class Plan(NamedTuple):
 
 
 def make_plan(
-    means2d: Float[Tensor, "n 2"],
+    means2d: Float[Tensor, "1 n 2"],
     conics: Float[Tensor, "n 3"],
-    variances: Float[Tensor, "n 2"],
-    depths: Float[Tensor, " n"],
     opacities: Float[Tensor, " n"],
     channels: Float[Tensor, "n c"],
     detached: Float[Tensor, "n d"],
+    variances: Float[Tensor, "n 2"],
+    depths: Float[Tensor, " n"],
     width: int,
     height: int,
 ) -> Plan:
@@ -184,7 +170,7 @@ def make_plan(
     columns, rows = -(-width // TILE), -(-height // TILE)
     positions, form, spread, opacity, attached_channels, detached_channels = (
         part.detach().contiguous().numpy()
-        for part in (means2d, conics, variances, opacities, channels, detached)
+        for part in (means2d[0], conics, variances, opacities, channels, detached)
     )
     boxes = np.empty((len(opacities), 4), np.int32)
     visible = np.empty(len(opacities), np.int64)
