@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lab.baselines.lifting import split
 from lang3dxl_ns.components.feature_decoder import Decoder, Features
 from lang3dxl_ns.components.initialization import center_and_radius
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
@@ -48,7 +49,7 @@ class PlaceField(Decoder):
         return clip if dense is None else torch.cat([clip, dense], dim=-1)
 
     def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
-        return self._split(rendered)
+        return split(self, rendered)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         return self.field.parameter_groups()

@@ -13,6 +13,12 @@ from lang3dxl_ns.components.feature_decoder import Decoder, Features, Gathered
 _LEAST_COVERAGE = 1e-4
 
 
+def split(decoder: Decoder, features: Float[Tensor, "*batch out"]) -> Features:
+    """Separate a decoder's CLIP features from its dense ones, if it has some."""
+    dense = features[..., decoder.clip_dim :] if decoder.dense_dim else None
+    return features[..., : decoder.clip_dim], dense
+
+
 class LiftedFeatures(Decoder):
     """Decoder of features that are averaged onto the Gaussians after training, by contribution.
 
@@ -22,7 +28,7 @@ class LiftedFeatures(Decoder):
     needs_lifting = True
 
     def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
-        return self._split(rendered[..., :-1] / rendered[..., -1:].clamp_min(_LEAST_COVERAGE))
+        return split(self, rendered[..., :-1] / rendered[..., -1:].clamp_min(_LEAST_COVERAGE))
 
     def learn_gaussians(
         self, gathered: Gathered, advance: Callable[[], None] = lambda: None
@@ -41,7 +47,7 @@ class DirectFeatures(Decoder):
         return self.output_mean.new_zeros(count, len(self.output_mean))
 
     def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
-        return self._split(self.output_mean + self.output_std * rendered)
+        return split(self, self.output_mean + self.output_std * rendered)
 
 
 class Feature3DGS(Decoder):
@@ -59,7 +65,7 @@ class Feature3DGS(Decoder):
         return self.output_mean.new_zeros(count, self.code_dim)
 
     def forward(self, rendered: Float[Tensor, "*batch d"]) -> Features:
-        return self._split(self.output_mean + self.output_std * self.layer(rendered))
+        return split(self, self.output_mean + self.output_std * self.layer(rendered))
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         return {"field_decoder": list(self.layer.parameters())}

@@ -138,6 +138,3 @@ class Decoder(nn.Module, ABC):
 
     def set_progress(self, fraction: float) -> None:
         """Set the fraction of the run done (0 to 1)."""
-
-    def _split(self, features: Float[Tensor, "*batch out"]) -> Features:
-        return features[..., : self.clip_dim], features[..., self.clip_dim :] if self.dense_dim else None
