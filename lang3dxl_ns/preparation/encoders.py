@@ -177,9 +177,7 @@ def usual_dense(config: PreparationConfig, learned: bool) -> str:
     whether the semantics learn dense features, as in the paper, instead of sharpening by them."""
     if config.dense != "auto":
         return config.dense
-    with suppress(
-        UserError
-    ):  # `check_encoders` reports a missing CLIP, together with a missing dense encoder
+    with suppress(UserError):  # `check_encoders` reports a missing CLIP, and a missing dense encoder with it
         reading = None if learned else patch_reading(config.clip, config.clip_features)
         if reading is not None and reading.sizes is not None:
             return "none"
