@@ -51,8 +51,7 @@ def score_scene(
                 scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
                 for queries in (queries_shown, scorer.published_queries)
             )
-            of_published = None if scorer.smooths else published
-            variants = scorer.variants(raw, keep, scene.engine.temperature, of_published)
+            variants = scorer.variants(raw, keep, scene.engine.temperature, published)
             truths = truths_of(truth, photo.photo(), map_size(raw))
             figures[photo.name] = scorer.scores(photo.name, variants, truths)
     masked = sum(photo.mask is not None for photo in photos)

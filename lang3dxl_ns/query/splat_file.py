@@ -83,7 +83,7 @@ def _ply(splats: Splats, relevancy: Float[Tensor, " n"] | None) -> bytes:
     names = [name for group in blocks for name in group]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
-    table = np.concatenate([_array(block) for block in blocks.values()], axis=1)
+    table = np.concatenate([array_of(block) for block in blocks.values()], axis=1)
     return "\n".join(header).encode() + np.ascontiguousarray(table, dtype="<f4").tobytes()
 
 
@@ -95,7 +95,7 @@ def _spz(splats: Splats) -> bytes:
         raise UserError(".spz files need gsply: pip install 'lang3dxl-ns[share]', or write a .ply") from error
     quats, harmonics = F.normalize(splats.quats, dim=1), splats.harmonics
     parts = (splats.means, log_scales(splats), quats, logits(splats), harmonics[:, 0], harmonics[:, 1:])
-    means, scales, turned, opacities, base, rest = (np.array(_array(part)) for part in parts)
+    means, scales, turned, opacities, base, rest = (np.array(array_of(part)) for part in parts)
     data = gsply.GSData(means, scales, turned, opacities, base, rest)
     farthest = float(splats.means.abs().max()) if len(splats) else 0.0
     bits = int(np.clip(np.floor(22 - np.log2(max(farthest, 1e-3))), 1, 20))
@@ -109,5 +109,6 @@ def _numbered(name: str, count: int) -> tuple[str, ...]:
     return tuple(f"{name}_{i}" for i in range(count))
 
 
-def _array(tensor: Tensor) -> Float32[Array, "n ..."]:
+def array_of(tensor: Tensor) -> Float32[Array, "..."]:
+    """Return a tensor as a NumPy array of float32, without gradient."""
     return tensor.detach().cpu().float().numpy()

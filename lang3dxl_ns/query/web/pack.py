@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
@@ -20,6 +20,7 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.hash_grid import HASH_PRIMES
 from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.query.engine import PerGaussian
+from lang3dxl_ns.query.splat_file import array_of
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera
@@ -146,7 +147,7 @@ def _packed_field(field: SemanticField) -> tuple[dict[str, Any], dict[str, bytes
         "layers": [[layer.in_features, layer.out_features] for layer in layers],
         "rectify": [settings.activation == "every" or layer is layers[-1] for layer in layers],
     }
-    weights = [np.concatenate([_array(x.weight.T).ravel(), _array(x.bias)]) for x in layers]
+    weights = [np.concatenate([array_of(x.weight.T).ravel(), array_of(x.bias)]) for x in layers]
     return described, {"field.bin": np.concatenate(weights).astype("<f4").tobytes() + halves(table)}
 
 
@@ -172,8 +173,4 @@ def camera_json(camera: Camera) -> dict[str, Any]:
 
 def halves(values: Tensor) -> bytes:
     """Encode values in half precision."""
-    return _array(values).astype("<f2").tobytes()
-
-
-def _array(values: Tensor) -> Shaped[Array, "..."]:
-    return values.detach().float().cpu().numpy()
+    return array_of(values).astype("<f2").tobytes()
