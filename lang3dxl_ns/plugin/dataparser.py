@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 
@@ -191,9 +191,9 @@ class PhotoCollectionDataParser(ColmapDataParser):
     @cached_property
     def reconstruction(self) -> Reconstruction:
         """The model with its usable photos alone. Which are left out, and why, is logged once."""
-        found = read_reconstruction(self.config.data / self.config.colmap_path)
-        self.photos, kept, self._left_out = usable_photos(
-            found, self._images_folder, self._mask_path, self.config.follow_links
+        model = read_reconstruction(self.config.data / self.config.colmap_path)
+        self.photos, self._left_out, usable = usable_photos(
+            model, self._images_folder, self._mask_path, self.config.follow_links
         )
         if len(self.photos) == 1:
             raise UserError(
@@ -211,7 +211,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
             for name, why in self._left_out.items():
                 CONSOLE.log(f"  {escape(printable(f'{name}: {why}'))}")
         self._mention_what_is_not_used()
-        return replace(found, photos={name: p for name, p in kept.items() if name not in self._left_out})
+        return usable
 
     def _mask_path(self, name: str) -> Path | None:
         """Find the photo's mask: the same name with an image suffix, or COLMAP's form `photo.jpg.png`."""

@@ -28,6 +28,7 @@ OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
 """Folder of a model that is reconstructed here, if sparse/ is taken."""
 TRANSFORMS = "transforms.json"
 MaskOf = Callable[[str], Path | None]
+_Read = tuple[dict[Path, Photo], dict[str, UserError], Reconstruction]
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,8 @@ def read_collection(data: str | Path) -> PhotoCollection:
     if model is None and (folder / TRANSFORMS).is_file():
         return _collection(folder, *read_transforms(folder / TRANSFORMS))
     place = folder / model if model is not None else reconstruct_scene(folder)[1]
-    images, reconstruction = folder / images_path(folder), read_reconstruction(place)
-    photos, kept, left_out = usable_photos(
-        reconstruction, images, lambda name: find_mask(folder / "masks", name)
-    )
-    return _collection(folder, photos, left_out, replace(reconstruction, photos=kept))
+    images, found = folder / images_path(folder), read_reconstruction(place)
+    return _collection(folder, *usable_photos(found, images, lambda name: find_mask(folder / "masks", name)))
 
 
 def find_colmap_model(data: Path, folders: Sequence[Path] = (*MODEL_FOLDERS, OWN_MODEL)) -> Path | None:
@@ -75,9 +73,8 @@ def _collection(
     if not photos:
         first = next(iter(left_out.values()), "it lists none")
         raise UserError(f"none of the {len(left_out)} photos of {folder} can be used; the first: {first}")
-    kept = {name: tracked for name, tracked in reconstruction.photos.items() if name not in left_out}
     reasons = {name: str(reason) for name, reason in left_out.items()}
-    return PhotoCollection(folder, list(photos.values()), replace(reconstruction, photos=kept), reasons)
+    return PhotoCollection(folder, list(photos.values()), reconstruction, reasons)
 
 
 def images_path(data: Path, named: Path = Path("images")) -> Path:
@@ -89,9 +86,9 @@ def images_path(data: Path, named: Path = Path("images")) -> Path:
 
 def usable_photos(
     reconstruction: Reconstruction, images: Path, mask_of: MaskOf, follow_links: bool = False
-) -> tuple[dict[Path, Photo], dict[str, TrackedPhoto], dict[str, UserError]]:
-    """Find the photos of a COLMAP model on disk, below the folder `images`: usable ones by file, their
-    entries in the model turned like the files, and reasons for the others. `mask_of` finds a photo's
+) -> _Read:
+    """Find the photos of a COLMAP model on disk, below the folder `images`: usable ones by file, reasons for
+    the others, and the model with the usable ones alone, turned like the files. `mask_of` finds a photo's
     foreground mask by its name; `follow_links` allows links that leave the folder."""
     photos, left_out = dict[Path, Photo](), dict[str, UserError]()
     kept = dict[str, TrackedPhoto]()
@@ -100,18 +97,17 @@ def usable_photos(
         try:
             if not inside(images, name, follow_links).is_file():
                 raise UserError(f"there is no {path}")
-            kept[name] = upright_in_model(tracked, path)
-            photos[path] = Photo.from_model(kept[name], path, mask_of(name))
+            turned = upright_in_model(tracked, path)
+            photos[path], kept[name] = Photo.from_model(turned, path, mask_of(name)), turned
         except UserError as reason:
             left_out[name] = reason
-    return photos, kept, left_out
+    return photos, left_out, replace(reconstruction, photos=kept)
 
 
 # ── transforms.json ─────────────────────────────────────────────────────────────────────────────────────
 
 
 _LENSES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV_FISHEYE")
-_Read = tuple[dict[Path, Photo], dict[str, UserError], Reconstruction]
 
 
 def read_transforms(path: Path) -> _Read:
