@@ -56,25 +56,23 @@ def read_collection(data: str | Path) -> PhotoCollection:
         raise UserError(f"{folder} is not a folder: give the folder of the splat's photos as --data")
     model = find_colmap_model(folder)
     if model is None and (folder / TRANSFORMS).is_file():
-        return _collection(folder, *read_transforms(folder / TRANSFORMS))
-    place = folder / model if model is not None else reconstruct_scene(folder)[1]
-    images, found = folder / images_path(folder), read_reconstruction(place)
-    return _collection(folder, *usable_photos(found, images, lambda name: find_mask(folder / "masks", name)))
-
-
-def find_colmap_model(data: Path, folders: Sequence[Path] = (*MODEL_FOLDERS, OWN_MODEL)) -> Path | None:
-    """Return the first of some folders (relative to `data`) that holds a COLMAP model; None if none does."""
-    return next((folder for folder in folders if any((data / folder).glob("images.*"))), None)
-
-
-def _collection(
-    folder: Path, photos: dict[Path, Photo], left_out: Mapping[str, UserError], reconstruction: Reconstruction
-) -> PhotoCollection:
+        photos, left_out, reconstruction = read_transforms(folder / TRANSFORMS)
+    else:
+        place = folder / model if model is not None else reconstruct_scene(folder)[1]
+        images, found = folder / images_path(folder), read_reconstruction(place)
+        photos, left_out, reconstruction = usable_photos(
+            found, images, lambda name: find_mask(folder / "masks", name)
+        )
     if not photos:
         first = next(iter(left_out.values()), "it lists none")
         raise UserError(f"none of the {len(left_out)} photos of {folder} can be used; the first: {first}")
     reasons = {name: str(reason) for name, reason in left_out.items()}
     return PhotoCollection(folder, list(photos.values()), reconstruction, reasons)
+
+
+def find_colmap_model(data: Path, folders: Sequence[Path] = (*MODEL_FOLDERS, OWN_MODEL)) -> Path | None:
+    """Return the first of some folders (relative to `data`) that holds a COLMAP model; None if none does."""
+    return next((folder for folder in folders if any((data / folder).glob("images.*"))), None)
 
 
 def images_path(data: Path, named: Path = Path("images")) -> Path:
