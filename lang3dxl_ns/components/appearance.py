@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -271,11 +272,8 @@ def render_in_look(
     """Render Gaussians (world frame) under a photo's lighting, or in their own colors without a look; for the
     other arguments see `render`. Coverage, depth and further channels belong to the scene, not to a photo. If
     a look changes opacities, they are rendered separately, with the opacities of the scene."""
-    settings = {"background": background, "backend": backend}
-    if look is None:
-        return render(splats, camera, channels, **settings)  # type: ignore[arg-type]
-    lit = look.apply(splats, camera, everywhere=False)
+    draw = partial(render, camera=camera, background=background, backend=backend)
+    lit = splats if look is None else look.apply(splats, camera, everywhere=False)
     if lit.opacities is splats.opacities:
-        return render(lit, camera, channels, **settings)  # type: ignore[arg-type]
-    photo = render(lit, camera, **settings)  # type: ignore[arg-type]
-    return replace(render(splats, camera, channels, backend=backend), rgb=photo.rgb)
+        return draw(lit, channels=channels)
+    return replace(draw(splats, channels=channels), rgb=draw(lit).rgb)
