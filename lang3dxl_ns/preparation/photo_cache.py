@@ -60,12 +60,6 @@ class PhotoCache:
             self._ahead[index] = self._pool.submit(self._read, index)
         return self._ahead[index].result()
 
-    @property
-    def bytes(self) -> int:
-        """Memory of the decoded photos, including those read ahead."""
-        done = (f.result() for f in self._ahead.values() if f.done() and not f.exception())
-        return sum(map(_bytes, (*self._kept.values(), *done)))
-
 
 def _bytes(data: dict[str, Any]) -> int:
     return sum(value.nbytes for value in data.values() if isinstance(value, Tensor))

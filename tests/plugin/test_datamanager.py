@@ -29,7 +29,8 @@ def test_cache_returns_the_right_photo_and_stays_within_its_memory():
     for step in range(60):
         index = step * 7 % 20
         assert int(cache.get(index, [(index + 7) % 20])["image"][0, 0]) == index
-    assert cache.bytes <= 500 + 100  # plus the one read ahead
+    assert sum(kept["image"].nbytes for kept in cache._kept.values()) == 500
+    assert len(cache._ahead) <= 1  # the one read ahead
 
 
 def test_cache_reads_a_photo_once_while_it_fits():
