@@ -141,8 +141,8 @@ def in_chunks(
 
 @torch.no_grad()
 def cosines_of_codes(
-    decode: Decode, codes: Float[Tensor, "n code"], queries: Queries, max_mb: float | None = None
+    decode: Decode, codes: Float[Tensor, "n code"], queries: Queries
 ) -> Float[Tensor, "n v"]:
     """Compute the exact cosines of codes, decoded `in_chunks` to avoid a feature map of an image."""
-    most = (_GPU_MB if codes.is_cuda else _CPU_MB) if max_mb is None else max_mb
+    most = _GPU_MB if codes.is_cuda else _CPU_MB
     return in_chunks(lambda part: queries.cosines(decode(part)), codes, queries.vectors.shape[-1], most)

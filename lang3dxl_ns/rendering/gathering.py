@@ -60,31 +60,26 @@ class Pixels:
 
 
 def gather(
-    count: int,
-    views: Iterable[tuple[Composite, Pixels]],
-    width: int,
-    like: Tensor,
-    memory: float | None = None,
+    count: int, views: Iterable[tuple[Composite, Pixels]], width: int, like: Tensor
 ) -> tuple[Float[Tensor, "n c"], Float[Tensor, " n"]]:
     """Average the values of all pixels of all views onto the Gaussians; return means and masses.
 
     The mean is weighted by a Gaussian's contribution w to each pixel p, Σ w(g, p) F(p) / Σ w(g, p). Its mass
     is Σ w(g, p), in pixels. Gaussians that are never visible have mass and mean 0. So do those with more mass
-    outside the foreground, or else the sky would take on values from the edges of towers.
+    outside the foreground, or else the sky would take on values from the edges of towers. The work takes
+    `MEMORY` bytes besides the result, which is on the CPU if it is larger.
 
     Args:
         count: number of Gaussians, n.
         views: for each view, a function that composites values of the Gaussians, and the pixels' values F.
         width: number of channels of the maps of F.
         like: tensor whose number type and device are used.
-        memory: bytes to work in (default `MEMORY`), besides the result, which is on the CPU if it is larger.
     """
-    memory = memory or MEMORY
-    place = like.device if 4 * count * (width + 2) <= memory else torch.device("cpu")
+    place = like.device if 4 * count * (width + 2) <= MEMORY else torch.device("cpu")
     sums = torch.zeros(count, width + 2, dtype=like.dtype, device=place)
     for composite, pixels in views:
         numbers = 2 * (count + pixels.foreground.numel())  # per channel
-        channels = max(int(memory / 4 / numbers), 1)
+        channels = max(int(MEMORY / 4 / numbers), 1)
         for start in range(0, width + 2, channels):
             part = pixels.channels(start, start + channels).to(like)
             sums[:, start : start + channels] += filled_parts(composite, part, count).to(place)

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.query import relevancy as module
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries, cosines_of_codes
 
 
@@ -61,13 +62,14 @@ def test_opposite_and_extreme_vectors_stay_finite(vectors):
 
 
 @pytest.mark.parametrize("max_mb", [1e-6, 0.01, 256.0])
-def test_chunks_change_nothing(vectors, max_mb):
+def test_chunks_change_nothing(vectors, max_mb, monkeypatch):
+    monkeypatch.setattr(module, "_CPU_MB", max_mb)
     field = SemanticField(SemanticFieldConfig(preset="short"), 32, 8)
     codes = torch.randn(7, 11, 3, generator=torch.Generator().manual_seed(1))
     _, queries, canonical = vectors
     expected = relevancy(field.decode_clip(codes).detach(), queries, canonical)
     prompts = Queries.of(queries[:, None].unbind(), canonical)
-    cosines = cosines_of_codes(field.decode_clip, codes.flatten(0, 1), prompts, max_mb)
+    cosines = cosines_of_codes(field.decode_clip, codes.flatten(0, 1), prompts)
     torch.testing.assert_close(prompts.relevancy_of_cosines(cosines), expected.flatten(1))
 
 

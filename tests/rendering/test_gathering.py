@@ -7,7 +7,7 @@ import torch
 
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.components.feature_decoder import Gathered
-from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering import Gaussians, gathering, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, filled_pixels, gather
 from lang3dxl_ns.scene.camera import Camera
 
@@ -73,7 +73,7 @@ def test_a_lifted_feature_is_the_mean_of_the_pixels_weighted_by_the_contribution
     assert (lifted[-1] == 0).all()  # never seen
 
 
-def test_the_memory_given_changes_nothing():
+def test_the_memory_to_work_in_changes_nothing(monkeypatch):
     """Channels are gathered a few at a time where memory is short, and the result moves to the CPU."""
     generator = torch.Generator().manual_seed(2)
     views = [
@@ -96,7 +96,8 @@ def test_the_memory_given_changes_nothing():
 
     watching = [(partial(watched, work=work), pixels) for work, pixels in views]
     numbers = 2 * (5 + SIZE * SIZE)
-    found = gather(5, watching, 7, like, memory=4 * 4 * numbers)
+    monkeypatch.setattr(gathering, "MEMORY", 4 * 4 * numbers)
+    found = gather(5, watching, 7, like)
     assert widths == [4, 4, 1] * len(views)
     for mine, other in zip(found, expected, strict=True):
         torch.testing.assert_close(mine, other)
