@@ -9,9 +9,10 @@ from collections.abc import Callable
 
 class Worker:
     """Thread that runs jobs one at a time. A new job replaces one that is still waiting, so a text box can
-    submit a delayed job per keystroke, and only the last one runs."""
+    submit a delayed job per keystroke, and only the last one runs. `failed` is called with a job's error."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, failed: Callable[[Exception], None]) -> None:
+        self._failed = failed
         self._changed = threading.Condition()
         self._waiting: tuple[float, Callable[[], None]] | None = None
         self._busy = False
@@ -36,6 +37,8 @@ class Worker:
                 job, self._waiting, self._busy = self._waiting[1], None, True
             try:
                 job()
+            except Exception as error:
+                self._failed(error)
             finally:
                 with self._changed:
                     self._busy = False

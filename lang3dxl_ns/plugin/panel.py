@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
@@ -15,20 +14,19 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from numpy import ndarray as Array
-from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
-from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.query.conversation import Conversation, plain
 from lang3dxl_ns.query.match import Found
-from lang3dxl_ns.query.run_file import SceneFile, overview
+from lang3dxl_ns.query.run_file import overview
 from lang3dxl_ns.query.web.viewer_guard import Guard, guard_viewers
-from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
+
+    from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 
 INVITATION = (
     'Type what to look for: `rose window`, several as `dome; towers`, or `"windows" not "doors"`. '
@@ -45,25 +43,12 @@ class AskPanel(ViewerControl):
     """A text box, heat maps over the view, and the views that show a match best.
 
     nerfstudio's viewer finds the panel as an attribute of the pipeline, and sets it up on start.
-
-    Args:
-        model: the model that is queried.
-        scene_file: returns photos, cameras and CLIP.
-        query: returns the initial prompts.
-        learn_words: gathers the photos' features onto the present Gaussians, and learns codes.
     """
 
-    def __init__(
-        self,
-        model: Lang3DXLModel,
-        scene_file: Callable[[], SceneFile],
-        query: Callable[[], str],
-        learn_words: Callable[[], None],
-    ) -> None:
+    def __init__(self, pipeline: Lang3DXLPipeline) -> None:
         guard_viewers()  # must precede the server that nerfstudio starts
         keep_frames_recognizable()
-        self._model, self._scene_file, self._query = model, scene_file, query
-        self._learn_words = learn_words
+        self._pipeline, self._model = pipeline, pipeline.model
         self._views: list[tuple[Found, int]] = []
         """Views to fly to: pairs of a match and its view's number, all best views before all second ones."""
         self._place = -1
@@ -89,7 +74,7 @@ class AskPanel(ViewerControl):
             with gui.add_folder("Who can open this page", expand_by_default=False):
                 gui.add_markdown(guard.who_may_look)
         CONSOLE.print(guard.who_may_look.replace("`", ""), soft_wrap=True, highlight=False)
-        self._photos = [photo for photo in self._scene_file().photos if photo.split == "train"]
+        self._photos = [photo for photo in self._pipeline.scene_file.photos if photo.split == "train"]
         self.viser_server.on_client_connect(self._welcome)
         if model.semantic_field is not None:
             self._start(viewer)
@@ -100,24 +85,25 @@ class AskPanel(ViewerControl):
         self._message = gui.add_markdown(INVITATION)
         self._fly = gui.add_button("Fly to the next view", icon=viser.Icon.PLANE, visible=False)
         self._status = gui.add_markdown("")
-        self._question.on_update(lambda _: self._asker.submit(self._guarded(self._ask), _TYPING))
+        self._question.on_update(lambda _: self._asker.submit(self._ask, _TYPING))
         self._fly.on_click(lambda event: self._fly_on(event.client))
 
     def _start(self, viewer: Viewer) -> None:
         self.conversation = Conversation(
             self._model,
-            self._scene_file(),
+            self._pipeline.scene_file,
             viewer.log_filename.parent,
             viewer.train_lock or nullcontext(),
             learning=lambda: viewer.trainer is not None and viewer.trainer.training_state != "completed",
-            learn=self._learn_words,
+            learn=self._pipeline.learn_words,
             shown=self._outputs_shown,
             watch=self._say,
+            drawn=self._drawn,
         )
-        self._asker, self._finder = Worker("ask"), Worker("find")
-        self._model.answers = self
-        if query := self._query():
-            self._question.value = query
+        self._asker, self._finder = Worker("ask", self._failed), Worker("find", self._failed)
+        self._model.answers = self.conversation
+        if self._pipeline.query:
+            self._question.value = self._pipeline.query
 
     def _leave_out_logo(self, share: bool) -> None:
         """Show nerfstudio's title bar without its logo, which would be loaded from the Internet."""
@@ -132,19 +118,12 @@ class AskPanel(ViewerControl):
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
 
-    def _guarded(self, job: Callable[[], None]) -> Callable[[], None]:
-        """Wrap a job so that its errors appear in the panel; in a thread they would go unseen."""
-
-        def guarded() -> None:
-            try:
-                job()
-            except UserError as error:
-                self._say(plain(str(error)))
-            except Exception as error:
-                self._say(plain(f"Something went wrong, see the terminal: {error!r}"))
-                CONSOLE.print_exception()
-
-        return guarded
+    def _failed(self, error: Exception) -> None:
+        """Show a job's error in the panel; in a thread it would go unseen."""
+        if isinstance(error, UserError):
+            return self._say(plain(str(error)))
+        self._say(plain(f"Something went wrong, see the terminal: {error!r}"))
+        CONSOLE.print_exception()
 
     def _ask(self) -> None:
         text = self._question.value.strip()
@@ -156,7 +135,7 @@ class AskPanel(ViewerControl):
         self._say("…")
         self.conversation.ask(text)
         self._show_output("overlay")
-        self._finder.submit(self._guarded(self._find))
+        self._finder.submit(self._find)
 
     def _find(self) -> None:
         if self.conversation.question is None:
@@ -175,23 +154,12 @@ class AskPanel(ViewerControl):
 
     # ── showing ─────────────────────────────────────────────────────────────────────────────────────
 
-    @property
-    def shows_bottleneck(self) -> bool:
-        """Whether a viewer shows the picture of the codes; see `Answers`, whose methods the panel has."""
-        return self.conversation.shows_bottleneck
-
-    def channels(self) -> Tensor | None:
-        """Return the values that Gaussians carry in the next rendering; see `Answers.channels`."""
-        return self.conversation.channels()
-
-    def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """Return further outputs; see `Answers.outputs`. The render thread calls this, and holds the lock."""
-        found = self.conversation.outputs(rendering, seconds)
+    def _drawn(self) -> None:
+        """Tell how a frame went. The render thread calls this, and holds the lock."""
         self._status.content = self.conversation.status()
         if self._first_frame:
             self._first_frame = False
-            self._finder.submit(self._guarded(self._find), 1.0)
-        return found
+            self._finder.submit(self._find, 1.0)
 
     def _say(self, message: str) -> None:
         self._message.content = message

@@ -25,29 +25,12 @@ from lang3dxl_ns.plugin.evaluation import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.panel import AskPanel
+from lang3dxl_ns.plugin.rendering_model import RenderedAnswers
 from lang3dxl_ns.query.match import Match
-from lang3dxl_ns.query.question import Question, pictures
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.rendering import Rendering
 
 QUERY_VARIABLE = "LANG3DXL_QUERY"
-
-
-@dataclass(frozen=True)
-class RenderedAnswers:
-    """The outputs that `ns-render` adds to every rendering."""
-
-    question: Question
-    shows_bottleneck: bool = True
-
-    def channels(self) -> Tensor:
-        """Return the values that Gaussians carry in a rendering; see `Answers.channels`."""
-        return self.question.channels
-
-    def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """Return the outputs that answer the question; see `Answers.outputs`."""
-        return pictures(rendering, self.question)
 
 
 @dataclass
@@ -75,7 +58,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         print_user_errors_plainly()
         super().__init__(*args, **kwargs)
         # nerfstudio's viewer looks for controls among the pipeline's attributes.
-        self.panel = AskPanel(self.model, lambda: self.scene_file, lambda: self.query, self.learn_words)
+        self.panel = AskPanel(self)
 
     @cached_property
     def evaluation(self) -> Evaluation:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -26,7 +26,9 @@ from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import SceneFacts
+from lang3dxl_ns.query.conversation import Conversation
 from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import Question, pictures
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import EncodeTexts
@@ -38,18 +40,20 @@ from lang3dxl_ns.rendering.splats import harmonics_of
 from lang3dxl_ns.scene.camera import in_view
 
 
-class Answers(Protocol):
-    """Interface of what a viewer or `ns-render` adds to the renderings it shows."""
+@dataclass(frozen=True)
+class RenderedAnswers:
+    """The outputs that `ns-render` adds to every rendering, as a viewer's `Conversation` does."""
 
-    @property
-    def shows_bottleneck(self) -> bool:
-        """Whether a viewer shows the picture of the codes, which costs three more channels."""
+    question: Question
+    shows_bottleneck: bool = True
 
-    def channels(self) -> Float[Tensor, "n d"] | None:
-        """Return values of the Gaussians to composite; None without prompts."""
+    def channels(self) -> Tensor:
+        """Return the values that Gaussians carry in a rendering."""
+        return self.question.channels
 
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """Return further outputs of a rendering with these channels, which took this many seconds."""
+        """Return the outputs that answer the question."""
+        return pictures(rendering, self.question)
 
 
 class RenderingModel(SplatfactoModel):
@@ -71,7 +75,7 @@ class RenderingModel(SplatfactoModel):
     sky: Sky | None
     """Colors of the sky's Gaussians, the first ones; None: there is no sky, or it was trained like the
     rest."""
-    answers: Answers | None = None
+    answers: RenderedAnswers | Conversation | None = None
     codes_have_begun = False
     """Whether training has reached the codes; part of a checkpoint's run state."""
 

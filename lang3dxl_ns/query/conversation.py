@@ -52,6 +52,8 @@ class Conversation:
     """Returns the names of the outputs that the viewer shows."""
     watch: Callable[[str], None]
     """Called with a short description of slow work."""
+    drawn: Callable[[], None] = lambda: None
+    """Called after each frame."""
     found: list[Found] | None = None
     """Matches of the question; None: not searched yet."""
     seconds: float | None = None
@@ -133,7 +135,7 @@ class Conversation:
 
     @property
     def shows_bottleneck(self) -> bool:
-        """Whether a viewer shows the picture of the codes."""
+        """Whether a viewer shows the picture of the codes, which costs three more channels."""
         return "bottleneck" in self.shown()
 
     def channels(self) -> Tensor | None:
@@ -153,6 +155,7 @@ class Conversation:
             rendering = replace(rendering, channels=of_snapshot.channels, alpha=of_snapshot.alpha)
         found = pictures(rendering, question)
         self.seconds = seconds + time.perf_counter() - start
+        self.drawn()
         return found
 
     # ── saying how it went ──────────────────────────────────────────────────────────────────────────

@@ -5,8 +5,12 @@ import threading
 from lang3dxl_ns.common.worker import Worker
 
 
+def raised(error: Exception) -> None:
+    raise error
+
+
 def test_the_last_of_several_waiting_jobs_is_done():
-    done, worker = [], Worker("test")
+    done, worker = [], Worker("test", raised)
     for i in range(5):
         worker.submit(lambda i=i: done.append(i), delay=0.05)
     assert worker.wait(5)
@@ -14,7 +18,7 @@ def test_the_last_of_several_waiting_jobs_is_done():
 
 
 def test_a_job_under_way_is_not_given_up():
-    done, worker, begun, go_on = [], Worker("test"), threading.Event(), threading.Event()
+    done, worker, begun, go_on = [], Worker("test", raised), threading.Event(), threading.Event()
 
     def slow():
         begun.set()
@@ -28,3 +32,12 @@ def test_a_job_under_way_is_not_given_up():
     go_on.set()
     assert worker.wait(5)
     assert done == ["slow", "next"]
+
+
+def test_a_failed_job_is_reported_and_the_next_one_done():
+    done, worker = [], Worker("test", lambda error: done.append(str(error)))
+    worker.submit(lambda: int("seven"))
+    assert worker.wait(5)
+    worker.submit(lambda: done.append("next"))
+    assert worker.wait(5)
+    assert "seven" in done[0] and done[1] == "next"

@@ -66,7 +66,7 @@ def panel(viewer):
 def type_in(panel, text: str) -> str:
     """The panel's message after a text is processed."""
     panel._question.value = text
-    panel._asker.submit(panel._guarded(panel._ask))
+    panel._asker.submit(panel._ask)
     time.sleep(0.05)  # setting a box tells the panel in a thread of viser's
     assert panel._asker.wait() and panel._finder.wait()
     return panel._message.content
