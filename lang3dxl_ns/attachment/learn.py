@@ -14,7 +14,6 @@ from torch import Tensor
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
@@ -64,14 +63,8 @@ def learn(
     decoder = decoder.to(splats.means.device)
     names = [photo.name for photo in collection.photos]
     dense = partial(targets.dense_features, names) if targets.dense_dim else None
-    with progress_bar() as bar:
-        photos = bar.track(collection.photos, description="gathering features")
-        learning = bar.add_task("learning codes", total=decoder.learning_steps(len(splats)) or None)
-        views = _views(splats, photos, cameras, targets)
-        clip, advance = partial(targets.clip_features, names), partial(bar.advance, learning)
-        codes = learn_codes(decoder, views, splats.means, clip, dense, advance)
-    if decoder.learned is not None:
-        say(decoder.learned)
+    clip, views = partial(targets.clip_features, names), _views(splats, collection.photos, cameras, targets)
+    codes = learn_codes(decoder, views, len(names), splats.means, clip, dense)
     return decoder.eval().requires_grad_(False), codes
 
 

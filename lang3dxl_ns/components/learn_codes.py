@@ -15,6 +15,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.components.feature_decoder import Decoder, Gathered
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
@@ -51,22 +53,23 @@ class TargetView:
 def learn_codes(
     decoder: Decoder,
     views: Iterable[TargetView],
+    count: int,
     means: Float[Tensor, "n 3"],
     clip_targets: ClipMaps,
     dense_targets: DenseMaps | None = None,
-    advance: Callable[[], None] = lambda: None,
 ) -> Float[Tensor, "n code"]:
-    """Average the photos' targets over the Gaussians that they show, and let the decoder learn codes.
+    """Average the photos' targets over the Gaussians that they show, and let the decoder learn codes, with
+    progress bars and a line about what it learned.
 
     Codes of Gaussians that no photo shows are NaN.
 
     Args:
         decoder: a decoder with `learn_gaussians`, which is trained in place.
         views: the photos, each once.
+        count: number of the photos.
         means: centers of the Gaussians, which determine number, type and device of the codes.
         clip_targets: the CLIP targets of the views, from which a basis is computed.
         dense_targets: the dense features of the views; None if features are not to be sharpened.
-        advance: called `decoder.learning_steps` times while the decoder learns.
     """
     basis = fine_basis = None
     width = channels = decoder.clip_dim
@@ -78,17 +81,22 @@ def learn_codes(
         channels += fine_basis.axes.shape[1]
 
     def targets():
-        for view in views:
+        for view in bar.track(views, total=count, description="gathering features"):
             maps = [view.clip if basis is None else basis.to(view.clip).coordinates(view.clip)]
             if fine_basis is not None and view.dense is not None:
                 maps.append(fine_basis.to(view.clip).coordinates(_unit(view.dense)))
             yield view.composite, Pixels.of(maps, view.size, view.mask)
 
-    features, mass = gather(len(means), targets(), channels, means)
-    if fine_basis is not None:
-        features = sharpen(features[:, :width], features[:, width:], mass)
+    with progress_bar() as bar:
+        learning = bar.add_task("learning codes", total=decoder.learning_steps(len(means)) or None)
+        features, mass = gather(len(means), targets(), channels, means)
+        if fine_basis is not None:
+            features = sharpen(features[:, :width], features[:, width:], mass)
+        codes = decoder.learn_gaussians(Gathered(features, mass, basis), lambda: bar.advance(learning))
+    if decoder.learned is not None:
+        say(decoder.learned)
     # Many features are kept on the CPU, so codes that are features themselves come from there.
-    return decoder.learn_gaussians(Gathered(features, mass, basis), advance).to(means.device)
+    return codes.to(means.device)
 
 
 def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
@@ -107,17 +107,15 @@ class Lang3DXLModel(RenderingModel):
                 colors = color_parameters(self.sky.colors, self.config.sh_degree)
                 self.gauss_params["features_dc"][: len(self.sky)] = colors
 
-    def learn_from_photos(
-        self, photos: Iterable[tuple[Cameras, Batch]], advance: Callable[[], None] = lambda: None
-    ) -> None:
-        """Give the Gaussians codes that represent the targets of the photos (cameras and batches); see
-        `learn_codes`. `advance` is called `learning_steps` times as the decoder learns."""
+    def learn_from_photos(self, photos: Iterable[tuple[Cameras, Batch]], count: int) -> None:
+        """Give the Gaussians codes that represent the targets of this number of photos (cameras and batches);
+        see `learn_codes`."""
         decoder, facts = self.semantic_field, self.facts
         assert decoder is not None and facts.clip_targets is not None
         views, means = (self._target_view(*photo) for photo in photos), self.means.detach()
         # Codes that training goes on from start at what it compares with, which is not sharpened.
         dense = None if self.learns_from_renderings else facts.dense_targets
-        codes = learn_codes(decoder, views, means, facts.clip_targets, dense, advance)
+        codes = learn_codes(decoder, views, count, means, facts.clip_targets, dense)
         if self.learns_from_renderings:
             self.gauss_params["codes"].data.copy_(codes.nan_to_num(0.0))
         else:

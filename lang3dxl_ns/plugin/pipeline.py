@@ -19,7 +19,6 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.evaluation import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.load_scene import model_state
@@ -124,23 +123,12 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""
-        decoder = self.model.semantic_field
-        assert decoder is not None
-        training = self.model.training
+        data, training = self.datamanager, self.model.training
         self.model.train()
-        photos = self.datamanager.train_photos()
         try:
-            with progress_bar() as bar:
-                total = len(self.datamanager.train_dataset)
-                gathering = bar.track(photos, total=total, description="gathering features")
-                learning = bar.add_task(
-                    "learning codes", total=decoder.learning_steps(self.model.num_points) or None
-                )
-                self.model.learn_from_photos(gathering, lambda: bar.advance(learning))
+            self.model.learn_from_photos(data.train_photos(), len(data.train_dataset))
         finally:
             self.model.train(training)
-        if decoder.learned is not None:
-            CONSOLE.log(escape(decoder.learned))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""
