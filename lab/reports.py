@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # imported where it is used, so that a command's help does no
     from matplotlib.figure import Figure
 
 Result = TypeVar("Result")
+Settings = TypeVar("Settings")
 
 
 def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence[str] = ()) -> Result:
@@ -36,6 +37,15 @@ def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence
         context.set_forkserver_preload(list(preload))
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         return pool.submit(work, *args).result()
+
+
+def with_flags(config: Settings, flags: str) -> Settings:
+    """Change a configuration by flags as `ns-train` reads them: switches take True or False."""
+    import tyro
+
+    return tyro.cli(
+        type(config), args=shlex.split(flags), default=config, config=(tyro.conf.FlagConversionOff,)
+    )
 
 
 def as_png(figure: Figure) -> bytes:

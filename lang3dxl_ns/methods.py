@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from copy import deepcopy
 from functools import partial
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-import tyro
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -135,10 +133,3 @@ def run_config(
     config.max_num_iterations = iterations
     config.pipeline.datamanager.clip, config.pipeline.datamanager.dense = clip, dense
     return config
-
-
-def with_flags(config: Lang3DXLTrainerConfig, flags: str) -> Lang3DXLTrainerConfig:
-    """Change a configuration by flags as `ns-train` reads them: switches take True or False."""
-    return tyro.cli(
-        type(config), args=shlex.split(flags), default=config, config=(tyro.conf.FlagConversionOff,)
-    )

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 
 from lab.benchmarks.ablation_rows import CLIPSEG, FINE_TEACHER, LANGSAM, SAM3, SEGMENTERS, Row
-from lab.reports import in_own_process
+from lab.reports import in_own_process, with_flags
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.reports import host_peak
@@ -179,7 +179,7 @@ def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
 
 def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTrainerConfig:
     """Build the configuration of a run."""
-    from lang3dxl_ns.methods import run_config, with_flags
+    from lang3dxl_ns.methods import run_config
 
     names = settings.clip, settings.dense, run.row.method
     config = run_config(run.scene, work / "runs", run.label, run.steps, *names)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich import get_console
 from rich.markdown import Markdown
 
-from lab.reports import command_line
+from lab.reports import command_line, with_flags
 from lab.stages import MeasuredStages
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
@@ -24,6 +24,7 @@ from lang3dxl_ns.common.settings_help import showing
 if TYPE_CHECKING:
     from lab.landmark.picture import PictureRow
     from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
+    from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
     from lang3dxl_ns.query.match import Match
@@ -103,7 +104,7 @@ class Demo:
         report |= stages.figures()
         folder = config.get_base_dir()
         write_report(folder, "report", self.markdown(report), report)
-        matches = trainer.pipeline.scored_matches([photo.name for photo in photos])
+        matches = _scored_matches(trainer.pipeline, [photo.name for photo in photos])
         drawn = (_picture_row(photo, trainer, matches[photo.name]) for photo in photos)
         if rows := [row for row in drawn if row.truth]:
             from lab.landmark.picture import draw_picture, most_telling
@@ -154,7 +155,7 @@ class Demo:
 
     def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
         """Build the run's configuration, resuming from an earlier command's checkpoint if there is one."""
-        from lang3dxl_ns.methods import run_config, with_flags
+        from lang3dxl_ns.methods import run_config
 
         steps = self.steps or (250 if self.quick else 1_200)
         config = run_config(scene, out, str(RUN.parts[0]), steps, self.clip, self.dense)
@@ -218,6 +219,19 @@ _BOUNDS = {"seed": (0, 2**63), "photos": (4, 9999), "steps": (1, 1e9), "test_vie
 
 _SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evaluate": 0.28}
 """Stages of the demo, with their usual shares of its time on a CPU."""
+
+
+def _scored_matches(pipeline: Lang3DXLPipeline, photos: list[str]) -> dict[str, dict[str, Match]]:
+    """Find every scored prompt in the views of some photos as a user would, by photo and prompt. Without
+    words or ground truth there are no matches."""
+    from lang3dxl_ns.query.text import Prompt
+
+    scorer, model = pipeline.evaluation.scorer, pipeline.model
+    if scorer is None or model.carried is None:
+        return {photo: {} for photo in photos}
+    scene, prompts = model.scene(pipeline.scene_file), scorer.truth.categories
+    question = scene.ask([Prompt(text) for text in prompts])
+    return {photo: dict(zip(prompts, scene.matches(question, photo), strict=True)) for photo in photos}
 
 
 def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, matches: dict[str, Match]) -> PictureRow:

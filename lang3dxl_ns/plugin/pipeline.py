@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -25,9 +25,7 @@ from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.plugin.rendering_model import RenderedAnswers
-from lang3dxl_ns.query.match import Match
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
-from lang3dxl_ns.query.text import Prompt
 
 QUERY_VARIABLE = "LANG3DXL_QUERY"
 
@@ -105,16 +103,6 @@ class Lang3DXLPipeline(VanillaPipeline):
             CONSOLE.log(f"Looking for {escape(self.query)}")
             scene = self.model.scene(self.scene_file, cache=cache)
             self.model.answers = RenderedAnswers(scene.ask(self.query))
-
-    def scored_matches(self, photos: Sequence[str]) -> dict[str, dict[str, Match]]:
-        """Find every scored prompt in the views of some photos as a user would, by photo and prompt. Without
-        words or ground truth there are no matches."""
-        scorer = self.evaluation.scorer
-        if scorer is None or self.model.carried is None:
-            return {photo: {} for photo in photos}
-        scene, prompts = self.model.scene(self.scene_file), scorer.truth.categories
-        question = scene.ask([Prompt(text) for text in prompts])
-        return {photo: dict(zip(prompts, scene.matches(question, photo), strict=True)) for photo in photos}
 
     @property
     def has_words_to_learn(self) -> bool:
