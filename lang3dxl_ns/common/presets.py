@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 
 _PACKAGE = Path(__file__).parents[1]
 # Configs are inside the package in an installed wheel, and beside it in a checkout.
@@ -20,10 +20,8 @@ def load_preset(name: str) -> dict[str, Any]:
     known = sorted(path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml"))
     if name not in known:
         raise UserError(f"there is no preset {name!r}: choose one of {', '.join(known)}")
-    try:
+    with readable(f"{FOLDER / name}.yaml can't be read", "restore it", (yaml.YAMLError, ValueError)):
         settings = yaml.safe_load((FOLDER / f"{name}.yaml").read_text())
-    except (yaml.YAMLError, ValueError) as error:
-        raise UserError(f"{FOLDER / name}.yaml can't be read ({error}): restore it") from error
     if not isinstance(settings, dict):
         raise UserError(f"{FOLDER / name}.yaml should hold settings, not {settings!r}: restore it")
     return settings

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.data.scene_box import SceneBox
 
 from lang3dxl_ns.common.device import best_device
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.query_config import QueryConfig
@@ -40,42 +40,31 @@ def load_run(
     Raises:
         UserError: the folder has no checkpoint, or the run is damaged or of another method.
     """
-    path = find_config(run)
-    settings_of_model, checkpoints = read_model_config(path)
-    file = SceneFile.read(path.parent / SCENE_FILE)
-    model = _load_model(
-        settings_of_model, path.parent / checkpoints, file, torch.device(device or best_device())
-    )
-    if model.semantic_field is not None and model.carried is None:
-        raise UserError(NOT_FINISHED)
-    return model.scene(file, config=config, cache=path.parent / "lang3dxl_visible.safetensors")
-
-
-def _load_model(config: Any, checkpoints: Path, file: SceneFile, device: torch.device) -> Lang3DXLModel:
-    path, checkpoint = latest_checkpoint(checkpoints)
-    state = checkpoint["pipeline"]
-    if not isinstance(config, Lang3DXLModelConfig):
-        raise UserError(f"{checkpoints.parent} is a run of another method: train one with ns-train lang3dxl")
+    place, worker = find_config(run), torch.device(device or best_device())
+    settings, checkpoints = read_model_config(place)
+    folder, file = place.parent, SceneFile.read(place.parent / SCENE_FILE)
+    path, checkpoint = latest_checkpoint(folder / checkpoints)
+    if not isinstance(settings, Lang3DXLModelConfig):
+        raise UserError(f"{folder} is a run of another method: train one with ns-train lang3dxl")
     names, metadata = [photo.name for photo in file.photos if photo.split == "train"], dict[str, Any]()
     SceneFacts(names).into(metadata)
     # The checkpoint brings its own Gaussians, so start with as few as possible.
-    start = replace(config, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
+    start = replace(settings, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
     model = start.setup(
         scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
         num_train_data=len(names),
         metadata=metadata,
-        device=device,
+        device=worker,
         grad_scaler=None,
         seed_points=(torch.eye(4)[:, :3], torch.zeros(4, 3)),
     )
     assert isinstance(model, Lang3DXLModel)
-    try:
-        model.load_state_dict(model_state(state), strict=True)
-    except (RuntimeError, LookupError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"the checkpoint {path} does not fit the config.yml beside it ({error}): copy both from one run"
-        ) from error
-    return model.to(device).eval()
+    with readable(f"the checkpoint {path} does not fit the config.yml beside it", "copy both from one run"):
+        model.load_state_dict(model_state(checkpoint["pipeline"]), strict=True)
+    if model.semantic_field is not None and model.carried is None:
+        raise UserError(NOT_FINISHED)
+    model.to(worker).eval()
+    return model.scene(file, config=config, cache=folder / "lang3dxl_visible.safetensors")
 
 
 def model_state(state: Mapping[str, Any]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, say
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.evaluation import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.load_scene import model_state
@@ -120,13 +120,9 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""
-        try:
+        remedy = "load it with the config.yml beside it, or with the options that it was trained with"
+        with readable("the checkpoint does not fit this configuration", remedy):
             self.model.load_state_dict(model_state(state_dict), strict=True)
-        except (RuntimeError, KeyError) as error:
-            raise UserError(
-                f"the checkpoint does not fit this configuration: {error}. "
-                f"Load it with the config.yml beside it, or with the options that it was trained with"
-            ) from error
 
 
 _previous_hook = sys.excepthook
