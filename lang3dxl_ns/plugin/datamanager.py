@@ -9,7 +9,6 @@ from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import numpy as np
 import torch
 import tyro
 from nerfstudio.cameras.cameras import Cameras
@@ -41,7 +40,7 @@ from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
-from lang3dxl_ns.preparation.physical_scale import pixel_size
+from lang3dxl_ns.preparation.physical_scale import pixel_sizes
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -249,13 +248,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
         None if crops are relative."""
         if self.crop_plan.pixel_sizes is None or self.test_views is None:
             return None
-        views, rules = self.test_views.cameras, (self.config.pixel_distance, self.config.pixel_angle)
-        sizes = {
-            view.name: (pixel_size(view, *rules), view.width) for view in views
-        }  # per pixel of the files
-        usual = float(np.median([size for size, _ in sizes.values() if size is not None]))
-        named = ((photo, *sizes[photo.name]) for photo in photos)
-        return {p.name: (usual if size is None else size) * width / p.width for p, size, width in named}
+        views = {view.name: view for view in self.test_views.cameras}
+        seen = replace(self._reconstruction(), photos=views)
+        # These are per pixel of the views' files.
+        sizes, _ = pixel_sizes(seen, self.config.pixel_distance, self.config.pixel_angle)
+        return {photo.name: sizes[photo.name] * views[photo.name].width / photo.width for photo in photos}
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
