@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.preparation.settings import PreparationConfig
 
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
@@ -30,5 +30,4 @@ class AttachConfig(PreparationConfig):
     def check(self) -> None:
         """Raise UserError if a setting is invalid."""
         super().check()
-        if not 4 <= self.views <= 10_000:
-            raise UserError(f"--views is {self.views}: give a number from 4 to 10000")
+        check_numbers(self, {"views": (4, 10_000)})

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
-from typing import TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import tyro
 
@@ -14,14 +14,7 @@ Class = TypeVar("Class", bound=type)
 
 def without(*names: str) -> Callable[[Class], Class]:
     """Return a dataclass decorator that takes inherited settings off the command line."""
-
-    def hide(kind: Class) -> Class:
-        hints = get_type_hints(kind, include_extras=True)
-        for name in names:
-            kind.__annotations__[name] = tyro.conf.Fixed[hints[name]]  # type: ignore[valid-type, misc]
-        return kind
-
-    return hide
+    return lambda kind: _marked(kind, tyro.conf.Fixed, names)
 
 
 def showing(*names: str) -> Callable[[Class], Class]:
@@ -30,12 +23,16 @@ def showing(*names: str) -> Callable[[Class], Class]:
     def hide(kind: Class) -> Class:
         if not {"-h", "--help"} & set(sys.argv[1:]):  # tyro would not accept what it does not print
             return kind
-        hints = get_type_hints(kind, include_extras=True)
-        for name in (item.name for item in fields(kind) if item.name not in names):
-            kind.__annotations__[name] = tyro.conf.Suppress[hints[name]]  # type: ignore[valid-type, misc]
-        return kind
+        return _marked(kind, tyro.conf.Suppress, [f.name for f in fields(kind) if f.name not in names])
 
     return hide
+
+
+def _marked(kind: Class, mark: Any, names: Iterable[str]) -> Class:
+    hints = get_type_hints(kind, include_extras=True)
+    for name in names:
+        kind.__annotations__[name] = mark[hints[name]]
+    return kind
 
 
 def asked_for_all(arguments: list[str]) -> list[str]:

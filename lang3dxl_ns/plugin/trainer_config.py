@@ -79,8 +79,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         for it. nerfstudio calls this once, before the configuration is printed and saved."""
         print_user_errors_plainly()
         check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
-        if self.pipeline.model.max_gaussians is not None:
-            check_numbers(self.pipeline.model, {"max_gaussians": (0, 1e9)}, "--pipeline.model.")
+        check_numbers(self.pipeline.model, {"max_gaussians": (0, 1e9)}, "--pipeline.model.")
         check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
         self.pipeline.datamanager.check()
         check_data(self.pipeline.datamanager.data or self.data)
