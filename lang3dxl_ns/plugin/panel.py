@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import viser
@@ -26,8 +26,6 @@ from lang3dxl_ns.scene.camera import Camera
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
 
-    from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
-
 INVITATION = (
     'Type what to look for: `rose window`, several as `dome; towers`, or `"windows" not "doors"`. '
     "A finished run has a richer page: `lang3dxl view`."
@@ -43,9 +41,11 @@ class AskPanel(ViewerControl):
     """A text box, heat maps over the view, and the views that show a match best.
 
     nerfstudio's viewer finds the panel as an attribute of the pipeline, and sets it up on start.
+
+    pipeline: the `Lang3DXLPipeline`, whose module imports this one.
     """
 
-    def __init__(self, pipeline: Lang3DXLPipeline) -> None:
+    def __init__(self, pipeline: Any) -> None:
         guard_viewers()  # must precede the server that nerfstudio starts
         keep_frames_recognizable()
         self._pipeline, self._model = pipeline, pipeline.model
