@@ -112,20 +112,23 @@ class TargetReader:
         """Compute channel statistics over at most `sample` photos, evenly spaced in `names` (or in all)."""
         names = self.names if names is None else list(names)
         names = names[:: -(-len(names) // sample)]
-        clip = _statistics(self.clip_features(names))
+        clip = _statistics(self.clip(name).features for name in names)
         dense = _statistics(self.dense_features(names)) if with_dense and self.dense_dim else None
         return FeatureStatistics(clip, dense)
 
 
 def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:
-    """Compute statistics over all maps' pixels. In float64, the difference of squares keeps nine digits even
-    where the mean is a thousand deviations."""
-    count, total, squares = 0, torch.zeros(()), torch.zeros(())
+    """Compute statistics over all maps' pixels, merged map by map in float64 (Chan, Golub & LeVeque 1983)."""
+    count, mean, squares = 0, torch.zeros(()), torch.zeros(())
     for values in maps:
         pixels = values.flatten(0, 1).double()
-        count, total, squares = count + len(pixels), total + pixels.sum(0), squares + pixels.square().sum(0)
-    mean = total / count
-    std = (squares / count - mean.square()).clamp_min(0).sqrt()
+        variance, own_mean = torch.var_mean(pixels, dim=0, correction=0)
+        both = count + len(pixels)
+        step = own_mean - mean
+        mean = mean + step * len(pixels) / both
+        squares = squares + variance * len(pixels) + step**2 * count * len(pixels) / both
+        count = both
+    std = (squares / count).sqrt()
     floor = max(_STD_FLOOR * float(std.mean()), torch.finfo(torch.float32).eps)
     return ChannelStatistics(mean.float(), std.clamp_min(floor).float())
 
