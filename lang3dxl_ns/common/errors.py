@@ -41,7 +41,8 @@ def printable(text: str) -> str:
 
 def in_a_line(error: BaseException, most: int = 200) -> str:
     """Return the beginning of another library's error in one line, or its type if it has no message."""
-    return " ".join(str(error).split())[:most] or type(error).__name__
+    text = f"no {error}" if isinstance(error, KeyError) else str(error)
+    return " ".join(text.split())[:most] or type(error).__name__
 
 
 def is_plain(text: str) -> bool:
