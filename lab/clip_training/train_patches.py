@@ -2,8 +2,9 @@
 
     python -m lab.clip_training.train_patches --cache DIR --photos FACADES --out lang3dxl_ns/demo/clip
 
-Both towers are frozen. The head sees every patch in windows of several sizes. Nearly all of the time goes to
-rendering landmarks (a second each) and reading views (half a second each); the fit takes three minutes.
+Both towers are frozen. The head sees every patch in windows of several sizes. Most of the time goes to
+reading views (half a second each); a landmark is rendered in a third of a second, and the fit takes a quarter
+of an hour.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from lab.clip_training.crops import augment, class_map
 from lab.clip_training.photos import store_photos
 from lab.clip_training.small_clip import GRID, PATCH, as_encoder, load_clip, normalize
 from lab.clip_training.views import COLOR, ELEMENT, PART, SPLITS, ViewFolder, background_rendering
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.dense_map import build_dense_map, nested_grids
 from lang3dxl_ns.preparation.families import FILE, PatchHead, patch_tokens, read_patch_head
 from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model
@@ -102,7 +104,10 @@ class PatchTraining:
         fit(head, worlds, texts, self.steps)
         if self.beside is not None:
             other = read_patch_head(self.beside, "cpu")
-            assert other is not None, f"{self.beside} has no head"
+            if other is None:
+                raise UserError(
+                    f"{self.beside} has no {FILE} to average with: name the folder of a CLIP that has one"
+                )
             head = averaged(other, head)
         self.out.mkdir(parents=True, exist_ok=True)
         save_file({name: tensor.half() for name, tensor in head.state_dict().items()}, self.out / FILE)
