@@ -6,13 +6,14 @@ Importing this package adds them to the names that `--pipeline.model.decoder.nam
 from lab.baselines.fmgs import PlaceField
 from lab.baselines.langsplat import LangSplat
 from lab.baselines.lifting import DirectFeatures, Feature3DGS, LiftedFeatures
-from lang3dxl_ns.components.decoders import DECODERS, Kind
+from lang3dxl_ns.components.decoders import DECODERS
+from lang3dxl_ns.components.feature_decoder import Decoder
 
-BASELINES = {
-    "feature3dgs": Kind(lambda field, clip, compression, dense: Feature3DGS(clip, dense)),
-    "fmgs": Kind(lambda field, clip, compression, dense: PlaceField(field, clip, dense)),
-    "langsplat": Kind(lambda field, clip, compression, dense: LangSplat(clip)),
-    "direct": Kind(lambda field, clip, compression, dense: DirectFeatures(clip, dense)),
-    "lifting": Kind(lambda field, clip, compression, dense: LiftedFeatures(clip, dense), False),
+BASELINES: dict[str, type[Decoder]] = {
+    "feature3dgs": Feature3DGS,
+    "fmgs": PlaceField,
+    "langsplat": LangSplat,
+    "direct": DirectFeatures,
+    "lifting": LiftedFeatures,
 }
 DECODERS |= BASELINES

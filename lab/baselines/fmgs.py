@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -12,7 +13,6 @@ from torch import Tensor, nn
 
 from lab.baselines.lifting import split
 from lang3dxl_ns.components.feature_decoder import Decoder, Features
-from lang3dxl_ns.components.initialization import center_and_radius
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
 _ALIGNMENT = 0.01
@@ -25,8 +25,7 @@ almost evenly, and all others share the rest."""
 class PlaceField(Decoder):
     """Semantic field evaluated at a Gaussian's position instead of a pixel's code.
 
-    Every Gaussian is decoded, and whole features are rendered. Gaussians have no learned codes. The scene's
-    center and radius are those of the Gaussians that are decoded first."""
+    Every Gaussian is decoded, and whole features are rendered. Gaussians have no learned codes."""
 
     def __init__(self, config: SemanticFieldConfig, clip_dim: int, dense_dim: int) -> None:
         super().__init__(clip_dim, dense_dim)
@@ -35,16 +34,21 @@ class PlaceField(Decoder):
         self.center: Tensor
         self.radius: Tensor
         self.register_buffer("center", torch.zeros(3))
-        self.register_buffer("radius", torch.zeros(()))
+        self.register_buffer("radius", torch.ones(()))
+
+    @classmethod
+    def build(
+        cls, settings: SemanticFieldConfig, clip_dim: int, compression: Any, dense_dim: int
+    ) -> PlaceField:
+        return cls(settings, clip_dim, dense_dim)
+
+    def set_extent(self, center: Float[Tensor, "3"], radius: float) -> None:
+        self.center.copy_(center)
+        self.radius.fill_(radius)
 
     def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"]:
         """Decode the features at the Gaussians' positions; positions get no gradient."""
-        means = gaussians["means"].detach()
-        if self.radius == 0:
-            center, radius = center_and_radius(means)
-            self.center.copy_(center)
-            self.radius.fill_(radius)
-        places = _STRETCH * (means - self.center) / self.radius
+        places = _STRETCH * (gaussians["means"].detach() - self.center) / self.radius
         clip, dense = self.field(places)
         return clip if dense is None else torch.cat([clip, dense], dim=-1)
 

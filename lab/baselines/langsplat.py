@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -36,6 +37,10 @@ class LangSplat(Decoder):
         self.norm: Tensor
         self.register_buffer("first_code", torch.tensor([0.0, 0.0, 1.0]))
         self.register_buffer("norm", torch.ones(()))
+
+    @classmethod
+    def build(cls, settings: Any, clip_dim: int, compression: Any, dense_dim: int) -> LangSplat:
+        return cls(clip_dim)
 
     def initial_codes(self, count: int) -> Float[Tensor, "count 3"]:
         """Return codes that all lie near the code of the mean target."""

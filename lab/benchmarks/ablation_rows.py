@@ -53,8 +53,11 @@ def _decoder(name: str, label: str, published: str = "") -> Row:
     return Row(name, "decoder", label, {"pipeline.model.decoder.name": name}, published=published)
 
 
-_RATES = {f"optimizers.field_decoder.optimizer.{k}": v for k, v in (("lr", 1e-4), ("weight_decay", 0.0))}
-"""Published learning rate of Feature 3DGS in long runs."""
+_RATES = {
+    "optimizers.field_decoder.optimizer.lr": 1e-4,
+    "optimizers.field_decoder.optimizer.weight_decay": 0.0,
+}
+"""Rates of Feature 3DGS's layer in long runs, as published."""
 _PAPER = {"pipeline.model.decoder.name": "paper"}
 """Changes of rows whose codes are trained with the scene, as in the row "paper", the one to compare with."""
 ROWS = (

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -246,6 +247,10 @@ class _LearningField(SemanticField):
     ) -> None:
         super().__init__(config, clip_dim, dense_dim)
         self.config, self.compression = config, compression or CompressionConfig()
+
+    @classmethod
+    def build(cls, settings: Any, clip_dim: int, compression: Any, dense_dim: int) -> SemanticField:
+        return cls(settings, clip_dim, compression, dense_dim)
 
     def learning_steps(self, count: int) -> int:
         return self.compression.grown(count).steps

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
@@ -12,18 +10,8 @@ from lang3dxl_ns.components.compression import CompressedField, CompressionConfi
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
-
-class Kind(NamedTuple):
-    """A kind of feature decoder."""
-
-    build: Callable[[SemanticFieldConfig, int, CompressionConfig, int], Decoder]
-    """Builds one for a field's settings, CLIP channels, settings of compression, and dense channels."""
-    learns_from_renderings: bool = True
-    """Whether codes are trained with the scene, with all semantic losses."""
-
-
-DECODERS = {"gathered": Kind(CompressedField, False), "paper": Kind(JointField)}
-"""Feature decoders by name. Another one is added by the module that defines it."""
+DECODERS: dict[str, type[Decoder]] = {"gathered": CompressedField, "paper": JointField}
+"""Classes of feature decoders by name. Another one is added by the module that defines it."""
 
 
 @showing("name")
@@ -43,11 +31,16 @@ class DecoderConfig:
     """gathered: how gathered features are compressed to codes."""
 
     @property
-    def kind(self) -> Kind:
-        """The decoder's kind. Raises UserError if there is none of that name."""
+    def kind(self) -> type[Decoder]:
+        """The decoder's class. Raises UserError if there is none of that name."""
         if self.name not in DECODERS:
             raise UserError(f"unknown feature decoder {self.name!r}: choose one of {', '.join(DECODERS)}")
         return DECODERS[self.name]
+
+    @property
+    def learns_from_renderings(self) -> bool:
+        """Whether codes are trained with the scene, with all semantic losses."""
+        return not self.kind.needs_lifting
 
 
 def make_decoder(

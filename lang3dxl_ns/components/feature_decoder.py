@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -52,6 +53,12 @@ class Decoder(nn.Module, ABC):
         self.register_buffer("output_mean", torch.zeros(clip_dim + dense_dim))
         self.register_buffer("output_std", torch.ones(clip_dim + dense_dim))
 
+    @classmethod
+    def build(cls, settings: Any, clip_dim: int, compression: Any, dense_dim: int) -> Decoder:
+        """Build a decoder for a run. settings, compression: the run's `SemanticFieldConfig` and
+        `CompressionConfig`, for decoders with a semantic field."""
+        return cls(clip_dim, dense_dim)
+
     name = ""
     """Name of the decoder in `decoders.DECODERS`."""
     bounded = False
@@ -91,7 +98,7 @@ class Decoder(nn.Module, ABC):
         self, gathered: Gathered, advance: Callable[[], None] = lambda: None
     ) -> Float[Tensor, "n code"]:
         """Learn codes for features gathered onto the Gaussians, and call `advance` `learning_steps` times."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} does not learn from gathered features")
 
     def learning_steps(self, count: int) -> int:
         """Return the number of steps of `learn_gaussians` for `count` Gaussians."""
@@ -119,6 +126,9 @@ class Decoder(nn.Module, ABC):
     ) -> dict[str, Float[Tensor, ""]]:
         """Compute the decoder's own losses on a decoded map, already weighted."""
         return {}
+
+    def set_extent(self, center: Float[Tensor, "3"], radius: float) -> None:
+        """Set the scene's center and radius in world units, for decoders of places."""
 
     def learn_targets(self, targets: Callable[[], Iterable[Float[Tensor, "h w clip"]]]) -> None:
         """Learn from the photos' CLIP targets. The model calls this before training."""

@@ -41,7 +41,7 @@ def check_inert(model: Any, data: Any) -> None:
     ]
     if changed:
         raise UserError(f"{changed[0]} has no effect here: no method of this package reads it; leave it off")
-    if model.decoder.kind.learns_from_renderings:
+    if model.decoder.learns_from_renderings:
         return
     changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")
     if data.regions not in ("auto", "none"):

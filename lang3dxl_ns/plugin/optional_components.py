@@ -154,6 +154,7 @@ def _add_decoder(model: RenderingModel, clip_mean: Tensor, dense_mean: Tensor) -
     model.register_buffer("dense_mean", dense_mean)
     c, channels = model.config, (len(clip_mean), len(dense_mean))
     model.semantic_field = make_decoder(c.decoder, c.semantic_field, *channels)
+    model.semantic_field.set_extent(*model.extent)
 
 
 def _add_codes(model: RenderingModel) -> None:

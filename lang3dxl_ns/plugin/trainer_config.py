@@ -160,7 +160,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.pipeline.model.fit_to_run(iterations)
         self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
         datamanager = self.pipeline.datamanager
-        learned = self.pipeline.model.decoder.kind.learns_from_renderings
+        learned = self.pipeline.model.decoder.learns_from_renderings
         datamanager.settle_targets(learned, not learned or self.pipeline.model.codes_from == "photos")
         datamanager.data = _absolute(datamanager.data or self.data)
         self.data = datamanager.data

@@ -1,14 +1,14 @@
-"""Laws of the baselines' feature decoders."""
+"""Laws of the feature decoders that are trained with the scene, the baselines' among them."""
 
 import pytest
 import torch
 
 from lab.baselines import langsplat
 from lab.baselines.fmgs import neighbor_similarity, pixel_alignment_loss
-from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
+from lang3dxl_ns.components.decoders import DECODERS, DecoderConfig, make_decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 
-NAMES = ("paper", "feature3dgs", "fmgs", "langsplat", "direct")
+NAMES = [name for name, kind in DECODERS.items() if not kind.needs_lifting]
 CLIP, DENSE = 16, 6
 
 
@@ -82,6 +82,11 @@ def test_fmgs_gives_gaussians_at_one_place_one_feature_and_others_other_features
     first, same, other = decoder.carried({"means": places})
     torch.testing.assert_close(first, same)
     assert not torch.allclose(first, other)
+    decoder.set_extent(places[0], 5.0)  # the world's unit and origin change nothing
+    moved = decoder_of("fmgs")
+    moved.set_extent(10 * places[0] - 7, 50.0)
+    near = decoder.carried({"means": places})
+    torch.testing.assert_close(moved.carried({"means": 10 * places - 7}), near)
 
 
 def test_alignment_is_nothing_where_clip_and_dense_features_have_the_same_edges():
