@@ -35,8 +35,8 @@ DOUBTFUL = 0.04
 unrelated word may fit as well (docs/lab/words.md)."""
 DOUBTFUL_TAUGHT = 0.1
 """The same for words taught by example, whose doubt is measured in what was not marked."""
-LEAST_PEAK = 0.012
-"""Prompts with a lower peak are doubtful whatever unrelated words reach. Present things reach 0.3 or more."""
+LEAST_PEAK = 0.05
+"""Prompts with a lower peak are doubtful whatever unrelated words reach. Most present things reach 0.3."""
 BEST = 0.005
 """Share of the Gaussians that a prompt's peak is the mean of."""
 _AT_A_TIME = 4

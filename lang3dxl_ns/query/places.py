@@ -18,7 +18,7 @@ _OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
 STRONG = 0.5
 """Fraction of the way from the threshold to the highest relevancy from which Gaussians are the match."""
-BOXED = 0.75
+BOXED = 0.85
 """The same for a box, which is to hold one thing: with half-way some hold a spire and its tower."""
 PEAK = 1e-3
 """Share of a view over which its peak is averaged, so that one stray Gaussian does not decide."""
@@ -80,7 +80,7 @@ def strongest_match(
 ) -> Box | None:
     """Find the box of the connected Gaussians that match best; None if none does.
 
-    Only Gaussians three quarters of the way from the threshold to the best, or nearer, count, so that weaker
+    Only Gaussians `BOXED` of the way from the threshold to the best, or nearer, count, so that weaker
     matches beside the strongest don't widen its box. DBSCAN separates groups that are more than `gap` world
     units apart.
 

@@ -1,6 +1,6 @@
 // Location of a match: the views that show it best, and a box around its strongest part, as in Python's query/.
 
-const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, BOXED = 0.75;
+const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, BOXED = 0.85;
 const OUTLIERS = 0.02, CORE = 0.002, BINS = 1000;
 
 /** Read views with the Gaussians that they show, and the share of the view that each fills: sizes[codes[k]]. */
