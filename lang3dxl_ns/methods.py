@@ -81,7 +81,7 @@ def _paper_config() -> Lang3DXLTrainerConfig:
     x = 1 / 70_000
     model, data, groups = config.pipeline.model, config.pipeline.datamanager, config.optimizers
     model.decoder.name = "paper"
-    model.decode_size, model.dense_weight = (80, 120), 0.5
+    model.dense_weight = 0.5
     model.dense_compare, model.mask_dense = "target", False
     model.feature_gradient_to_geometry, model.semantic_ramp = True, 15_000 * x
     model.densify_from, model.densify_until, model.densify_every = 2_000 * x, 15_000 * x, 2_000 * x
