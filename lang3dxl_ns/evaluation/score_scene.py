@@ -18,7 +18,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.label_limit import Masks, lifted_labels
 from lang3dxl_ns.evaluation.language import LanguageScorer
 from lang3dxl_ns.evaluation.scores import map_size, overlap
-from lang3dxl_ns.query.places import Box, groups
+from lang3dxl_ns.query.places import Box, groups, shared_volume
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.teach import known_word
@@ -122,7 +122,6 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
 
 def box_iou(a: Box, b: Box) -> float:
     """Compute intersection over union of two boxes' volumes; 0 if both are flat."""
-    low, high = np.maximum(a.low, b.low), np.minimum(a.high, b.high)
-    both = float(np.prod((high - low).clip(0)))
-    whole = sum(float(np.prod(np.subtract(box.high, box.low))) for box in (a, b)) - both
+    both = shared_volume(a, b)
+    whole = shared_volume(a, a) + shared_volume(b, b) - both
     return both / whole if whole > 0 else 0.0

@@ -18,15 +18,17 @@ _OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
 STRONG = 0.5
 """Fraction of the way from the threshold to the highest relevancy from which Gaussians are the match."""
-BOXED = 0.85
-"""The same for a box, which is to hold one thing: with half-way some hold a spire and its tower."""
+CORE = 0.9
+"""The same for the core of the match that a box is drawn around."""
+JOINED = 2.0
+"""Factor by which a group may exceed its core; a larger one joins several things, as spire and tower."""
 PEAK = 1e-3
 """Share of a view over which its peak is averaged, so that one stray Gaussian does not decide."""
 LARGE = 0.2
 """Share of a view above which larger matches score no higher."""
 RIM = 0.25
 """Weight of a match at a view's rim, where it is likely cut off; it is 1 in the middle half."""
-_CORE = 0.002
+_DENSE = 0.002
 """Share of a match's weight that a neighborhood must hold to belong to a group."""
 _MOST_POINTS = 20_000
 """Most Gaussians that are grouped, the heaviest ones: DBSCAN keeps all their neighborhoods in memory."""
@@ -80,9 +82,9 @@ def strongest_match(
 ) -> Box | None:
     """Find the box of the connected Gaussians that match best; None if none does.
 
-    Only Gaussians `BOXED` of the way from the threshold to the best, or nearer, count, so that weaker
-    matches beside the strongest don't widen its box. DBSCAN separates groups that are more than `gap` world
-    units apart.
+    The core is the heaviest group of Gaussians that match nearly as well as the best. The box holds the group
+    of good matches around it, or the core alone if the group joins it with other things. DBSCAN separates
+    groups that are more than `gap` world units apart.
 
     scores: relevancy of each Gaussian, 0…1. mass: pixels that each Gaussian fills, over all views.
     """
@@ -93,9 +95,23 @@ def strongest_match(
     # The highest relevancy apart from stray Gaussians: 2 % of the matching mass exceed it.
     order = rows[scores[rows].argsort(descending=True)]
     beyond = (mass[order].cumsum(0) < _OUTLIERS * mass[order].sum()).sum()
-    level = threshold + BOXED * (scores[order[beyond.clamp_max(len(order) - 1)]] - threshold)
-    strong = rows[scores[rows] >= level]
-    return max(groups(means[strong], weights[strong], gap), key=lambda box: box.share)
+    best = scores[order[beyond.clamp_max(len(order) - 1)]]
+
+    def things(closeness: float) -> list[Box]:
+        near = rows[scores[rows] >= threshold + closeness * (best - threshold)]
+        return groups(means[near], weights[near], gap)
+
+    core = max(things(CORE), key=lambda box: box.share)
+    around = max(things(STRONG), key=lambda box: shared_volume(box, core, gap))
+    size = shared_volume(around, around, gap)
+    return around if size <= JOINED * shared_volume(core, core, gap) else core
+
+
+def shared_volume(a: Box, b: Box, margin: float = 0.0) -> float:
+    """Compute the volume of two boxes' intersection. A margin widens each of its sides, so that points have a
+    volume too."""
+    sides = np.minimum(a.high, b.high) - np.maximum(a.low, b.low) + margin
+    return float(np.prod(sides.clip(0)))
 
 
 def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
@@ -104,7 +120,7 @@ def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float)
     points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
     from sklearn.cluster import DBSCAN  # imported here, since the import takes a second
 
-    found = DBSCAN(eps=gap, min_samples=1).fit_predict(points, sample_weight=share / (share.sum() * _CORE))
+    found = DBSCAN(eps=gap, min_samples=1).fit_predict(points, sample_weight=share / (share.sum() * _DENSE))
     if (found < 0).all():  # no place is dense: take the heaviest Gaussian
         found = np.where(np.arange(len(found)) == share.argmax(), 0, -1)
     totals = np.bincount(found[found >= 0], weights=share[found >= 0]) / share.sum()

@@ -49,3 +49,14 @@ def test_one_point_is_a_box_and_none_is_not():
     box = box_of(torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([0.9]), gap=0.1)
     assert box.low == box.high == (1.0, 2.0, 3.0) and box.share == 1.0
     assert box_of(clouds(0.0), torch.full((500,), 0.5)) is None
+
+
+def test_a_tall_thing_that_matches_less_towards_its_foot_is_boxed_whole_and_what_it_stands_on_is_not():
+    """A minaret is sure at its top and likely further down; the mosque below it merely resembles one."""
+    minaret = clouds(0.0, count=1_000) * torch.tensor([0.2, 0.2, 1.5])
+    mosque = clouds(0.0, count=4_000) * torch.tensor([2.0, 2.0, 1.0]) - torch.tensor([0.0, 0.0, 1.0])
+    scores = torch.cat([0.85 + 0.1 * minaret[:, 2] / 1.5, torch.full((4_000,), 0.6)])
+    box = box_of(torch.cat([minaret, mosque]), scores)
+    assert box.low[2] == pytest.approx(0.0, abs=0.1) and box.high[2] == pytest.approx(1.5, abs=0.1)
+    scores[1_000:] = 0.74  # good matches now, joined with the minaret
+    assert box_of(torch.cat([minaret, mosque]), scores).low[2] > 0.5

@@ -1,7 +1,7 @@
 // Location of a match: the views that show it best, and a box around its strongest part, as in Python's query/.
 
-const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, BOXED = 0.85;
-const OUTLIERS = 0.02, CORE = 0.002, BINS = 1000;
+const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, CORE = 0.9, JOINED = 2;
+const OUTLIERS = 0.02, DENSE = 0.002, BINS = 1000;
 
 /** Read views with the Gaussians that they show, and the share of the view that each fills: sizes[codes[k]]. */
 export function readViews(about, buffer) {
@@ -82,18 +82,33 @@ export function boxAround(centers, relevancy, mass, threshold, gap) {
   const total = matching.reduce((sum, i) => sum + mass[i], 0);
   let before = 0;
   const high = relevancy[matching.find((i) => (before += mass[i]) >= OUTLIERS * total) ?? matching.at(-1)];
-  const strong = matching.filter((i) => relevancy[i] >= threshold + BOXED * (high - threshold));
-  const group = heaviestGroup(strong, centers, (i) => (relevancy[i] - threshold) * mass[i], gap);
+  const things = (closeness) => {
+    const near = matching.filter((i) => relevancy[i] >= threshold + closeness * (high - threshold));
+    return groupsOf(near, centers, (i) => (relevancy[i] - threshold) * mass[i], gap);
+  };
+  const most = (values, measure) => values.reduce((best, value) => (measure(value) > measure(best) ? value : best));
+  const core = boxOf(most(things(CORE), ({ weight }) => weight).rows, centers);
+  const boxes = things(STRONG).map(({ rows }) => boxOf(rows, centers));
+  const around = most(boxes, (box) => sharedVolume(box, core, gap));
+  return sharedVolume(around, around, gap) <= JOINED * sharedVolume(core, core, gap) ? around : core;
+}
+
+function boxOf(rows, centers) {
   const ends = [0, 1, 2].map((axis) => {
-    const sorted = Float32Array.from(group, (i) => centers[3 * i + axis]).sort(), last = sorted.length - 1;
+    const sorted = Float32Array.from(rows, (i) => centers[3 * i + axis]).sort(), last = sorted.length - 1;
     return [sorted[Math.round(OUTLIERS * last)], sorted[Math.round((1 - OUTLIERS) * last)]];
   });
   return { low: ends.map(([low]) => low), high: ends.map(([, high]) => high) };
 }
 
-/** Group Gaussians in touching cells of this size, and return the heaviest group. Cells with hardly any weight
- * separate groups. */
-function heaviestGroup(rows, centers, weightOf, size) {
+/** Compute the volume of two boxes' intersection, widened by a margin. */
+function sharedVolume(a, b, margin) {
+  const side = (axis) => Math.min(a.high[axis], b.high[axis]) - Math.max(a.low[axis], b.low[axis]) + margin;
+  return [0, 1, 2].reduce((volume, axis) => volume * Math.max(side(axis), 0), 1);
+}
+
+/** Group Gaussians in touching cells of this size. Cells with hardly any weight separate groups. */
+function groupsOf(rows, centers, weightOf, size) {
   const cells = new Map();
   for (const i of rows) {
     const place = [0, 1, 2].map((axis) => Math.floor(centers[3 * i + axis] / size)), key = place.join();
@@ -103,8 +118,8 @@ function heaviestGroup(rows, centers, weightOf, size) {
     cell.weight += weightOf(i);
   }
   const total = [...cells.values()].reduce((sum, cell) => sum + cell.weight, 0);
-  for (const [key, cell] of cells) if (cells.size > 1 && cell.weight < CORE * total) cells.delete(key);
-  let best = { weight: -1, rows };
+  for (const [key, cell] of cells) if (cells.size > 1 && cell.weight < DENSE * total) cells.delete(key);
+  const groups = [];
   while (cells.size) {
     const group = { weight: 0, rows: [] }, [first] = cells.values(), waiting = [first];
     cells.delete(first.place.join());
@@ -118,7 +133,7 @@ function heaviestGroup(rows, centers, weightOf, size) {
         cells.delete(key);
       }
     }
-    if (group.weight > best.weight) best = group;
+    groups.push(group);
   }
-  return best.rows;
+  return groups.length ? groups : [{ weight: 0, rows }];
 }
