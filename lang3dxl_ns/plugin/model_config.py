@@ -21,7 +21,7 @@ from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
 SHORT_FIELD_RUN = 5_000
 """Iterations below which a run that trains the field with the scene uses its `short` preset, since the
 published grid has learned no words after 300. `auto` of `codes_from` and of the looks' grid use this too."""
-START_OF_CODES = 0.4
+START_OF_CODES = 0.25
 """Fraction of the run after which codes start from photos; the paper's densification is over by then."""
 
 
@@ -63,7 +63,7 @@ class ModelSettings(SplatfactoModelConfig):
     """Fraction of the run that trains only colors, before the semantic losses start."""
     codes_from: Literal["auto", "noise", "photos"] = "noise"
     """Start of codes and field when the warm-up is over. `noise`: random, as published. `photos`: the photos'
-    features, gathered onto the Gaussians; a warm-up of 0 then becomes 0.4 of the run. `auto`: `photos`
+    features, gathered onto the Gaussians; a warm-up of 0 then becomes a quarter of the run. `auto`: `photos`
     in runs of under 5,000 iterations."""
     feature_gradient_to_geometry: bool = False
     """Let the semantic losses also move Gaussians, as in the authors' code; opacities still follow the colors

@@ -82,7 +82,7 @@ def test_the_field_is_as_printed_in_runs_that_are_long_enough_for_it(iterations,
 @pytest.mark.parametrize(
     ("iterations", "start", "warm_up", "crops", "grid"),
     [
-        (4_999, "photos", 0.4, "fine", "coarse"),
+        (4_999, "photos", 0.25, "fine", "coarse"),
         (5_000, "noise", 0.0, "pyramid", "paper"),
         (ITERATIONS, "noise", 0.0, "pyramid", "paper"),
     ],
