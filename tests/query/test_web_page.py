@@ -411,7 +411,7 @@ def test_a_slow_machine_draws_drafts_until_nothing_changes(page):
     picture(page)
     width = page.evaluate("document.querySelector('#frame canvas').width")
     draft = page.evaluate("""async () => {
-      lang3dxl.view.cost = 1e5;
+      lang3dxl.view.cost = 2e4;
       lang3dxl.view.wake();
       await new Promise(requestAnimationFrame);
       await new Promise(requestAnimationFrame);
