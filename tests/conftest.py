@@ -12,6 +12,7 @@
   has one.
 """
 
+import gc
 import inspect
 import os
 import subprocess
@@ -56,7 +57,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Commands get their server where tests are run that may need it."""
+    """Commands get their server where tests are run that may need it. What is imported by now stays, so the
+    garbage collector leaves it alone: millions of objects, which take it a second or two each time."""
+    gc.collect()
+    gc.freeze()
     if session.items and "processes" in sys.modules and not session.config.option.collectonly:
         sys.modules["processes"].start_server()
 
