@@ -191,8 +191,10 @@ def page(desk):
     """The page, without prompts and at the overview."""
     desk.keyboard.press("Escape")
     desk.evaluate("document.getElementById('near').replaceChildren()")
+    desk.emulate_media(reduced_motion="reduce")  # no second of flight
     desk.get_by_role("button", name="Overview").click()
     rest(desk)
+    desk.emulate_media(reduced_motion="no-preference")
     return desk
 
 
