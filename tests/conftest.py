@@ -12,6 +12,8 @@
   has one.
 """
 
+import gc
+import inspect
 import os
 import subprocess
 import sys
@@ -34,6 +36,20 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 torch.set_num_threads(min(torch.get_num_threads(), 2))
 
 
+def callers(context: int = 0) -> list[inspect.FrameInfo]:
+    """`inspect.stack` without the lines of code. nerfstudio asks for the stack 26 times when it is imported,
+    to read one name, and among thousands of modules the search for those lines takes seconds."""
+    frame, found = sys._getframe(1), []
+    while frame is not None:
+        code = frame.f_code
+        found.append(inspect.FrameInfo(frame, code.co_filename, frame.f_lineno, code.co_name, None, None))
+        frame = frame.f_back
+    return found
+
+
+inspect.stack = callers
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files with slow tests first: at the end, a slow test would leave the other process idle."""
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
@@ -41,7 +57,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Commands get their server where tests are run that may need it."""
+    """Commands get their server where tests are run that may need it. What is imported by now stays, so the
+    garbage collector leaves it alone: millions of objects, which take it a second or two each time."""
+    gc.collect()
+    gc.freeze()
     if session.items and "processes" in sys.modules and not session.config.option.collectonly:
         sys.modules["processes"].start_server()
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
@@ -22,7 +22,6 @@ import torch
 import torch._dynamo  # looks at torch.cuda when it is imported, so before that is patched
 import transformers
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
-from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 from lang3dxl_ns.rendering.torch_rasterizer import Compositing
 
@@ -138,8 +137,8 @@ def cpu_copy(tensor: torch.Tensor) -> torch.Tensor:
 
 def _run(func: Any, args: tuple, kwargs: dict) -> Any:
     """Check an operation, compute it on the CPU, and put the result where CUDA would put it."""
-    leaves, spec = tree_flatten((args, kwargs))
-    tensors = [leaf for leaf in leaves if isinstance(leaf, torch.Tensor)]
+    tensors: list[torch.Tensor] = []
+    _find_tensors((args, kwargs), tensors)
     on_gpu = _result_on_gpu(func, kwargs, tensors)
     _check(func, args, kwargs, tensors, on_gpu)
     _count(func, args, kwargs, tensors, on_gpu)
@@ -159,7 +158,7 @@ def _run(func: Any, args: tuple, kwargs: dict) -> Any:
             return originals[id(leaf)][0]
         return GpuTensor.of(leaf) if on_gpu else leaf
 
-    args, kwargs = tree_unflatten([lowered(leaf) for leaf in leaves], spec)
+    args, kwargs = _changed(lowered, args), _changed(lowered, kwargs)
     if kwargs.get("pin_memory"):
         kwargs["pin_memory"] = False
     result = func(*args, **kwargs)
@@ -167,7 +166,30 @@ def _run(func: Any, args: tuple, kwargs: dict) -> Any:
         if original.shape != plain.shape:
             with torch._C._DisableTorchDispatch():
                 original.set_(plain.untyped_storage(), plain.storage_offset(), plain.size(), plain.stride())
-    return tree_map(lifted, result)
+    return _changed(lifted, result)
+
+
+def _find_tensors(value: Any, found: list[torch.Tensor]) -> None:
+    """Append the tensors in lists, tuples and dictionaries, in their order."""
+    if isinstance(value, torch.Tensor):
+        found.append(value)
+    elif isinstance(value, list | tuple):
+        for each in value:
+            _find_tensors(each, found)
+    elif isinstance(value, dict):
+        for each in value.values():
+            _find_tensors(each, found)
+
+
+def _changed(change: Callable[[Any], Any], value: Any) -> Any:
+    """The value with all that is in its lists, tuples and dictionaries changed. An operation's arguments have
+    no other containers, and torch's trees take half of the time."""
+    if isinstance(value, list | tuple):
+        kind = list if isinstance(value, list) else tuple
+        return kind([_changed(change, each) for each in value])
+    if isinstance(value, dict):
+        return {name: _changed(change, each) for name, each in value.items()}
+    return change(value)
 
 
 def _result_on_gpu(func: Any, kwargs: dict, tensors: list) -> bool:
@@ -314,6 +336,11 @@ _METHODS = {
 
 
 class _Mode(TorchDispatchMode):
+    @classmethod
+    def _should_skip_dynamo(cls):
+        """Nothing is compiled here, and to tell dynamo so takes time in every operation."""
+        return False
+
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         return _run(func, args, kwargs or {})
 

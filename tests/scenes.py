@@ -26,13 +26,15 @@ def write_scene(
     image_ext: str = "jpg",
     shuffled: bool = False,
     duplicates: int = 0,
+    coarseness: int = 1,
 ) -> Path:
     """Write `folder`/images/photo_000.jpg … and `folder`/sparse/0/*.bin; returns `folder`.
 
     The cameras stand on an arc in front of the box, 3.5 to 4.5 units away. `mixed` gives every photo its own
     size, focal length and principal point, every third one portrait; otherwise all share one camera.
     `distortion` is OpenCV's k1 k2 p1 p2. `shuffled` lists the photos in another order in the model. The last
-    `duplicates` photos are the first once more. Every point has a track of at least two photos that see it
+    `duplicates` photos are the first once more. Squares of `coarseness` pixels have one color: a ray for
+    each pixel of a large photo takes long. Every point has a track of at least two photos that see it
     unhidden.
     """
     import pycolmap
@@ -54,7 +56,7 @@ def write_scene(
     (folder / "images").mkdir(parents=True)
     for i, (camera, pose, (pixels, visible)) in enumerate(zip(cameras, poses, seen, strict=True)):
         name = f"photo_{i:03d}.{image_ext}"
-        Image.fromarray(_render(camera, pose)).save(folder / "images" / name, quality=95)
+        Image.fromarray(_render(camera, pose, coarseness)).save(folder / "images" / name, quality=95)
         image = pycolmap.Image(
             name=name,
             keypoints=pixels[visible & tracked],
@@ -127,9 +129,9 @@ def _project(camera, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, 
     return pixels, inside & (np.abs(reach - 1) < 1e-6)
 
 
-def _render(camera, pose: np.ndarray) -> np.ndarray:
-    """[h, w, 3] uint8 photo: one ray through the middle of every pixel."""
-    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+def _render(camera, pose: np.ndarray, step: int) -> np.ndarray:
+    """[h, w, 3] uint8 photo: one ray through the middle of every square of `step` pixels a side."""
+    rows, columns = np.mgrid[: camera.height : step, : camera.width : step] + step / 2
     plane = camera.cam_from_img(np.column_stack([columns.ravel(), rows.ravel()]))
     directions = np.column_stack([plane, np.ones(len(plane))]) @ pose[:, :3]
     position = -pose[:, :3].T @ pose[:, 3]
@@ -138,7 +140,8 @@ def _render(camera, pose: np.ndarray) -> np.ndarray:
     up = directions[:, 2] / np.linalg.norm(directions, axis=1)
     colors = np.array([0.75, 0.8, 0.9]) + 0.3 * up[:, None] * [-1, -0.6, 0.2]  # the sky
     colors[hit] = texture(position + reach[hit, None] * directions[hit])
-    return np.round(colors.clip(0, 1) * 255).astype(np.uint8).reshape(camera.height, camera.width, 3)
+    photo = np.round(colors.clip(0, 1) * 255).astype(np.uint8).reshape(*rows.shape, 3)
+    return photo.repeat(step, 0).repeat(step, 1)[: camera.height, : camera.width]
 
 
 def _hit_box(position: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -37,7 +37,7 @@ def of_large_photos(folder, clip, dense) -> None:
     from conftest import make_trainer
     from scenes import write_scene
 
-    data = write_scene(folder / "scene", photos=3, points=200, size=(4000, 3000))
+    data = write_scene(folder / "scene", photos=3, points=200, size=(4000, 3000), coarseness=4)
     scale = {"pipeline__datamanager__camera_res_scale_factor": 0.4}
     trainer = make_trainer(data, clip, dense, folder / "runs", 3, **scale)
     trainer.setup()
@@ -55,11 +55,11 @@ def of_a_million_gaussians() -> None:
     from lang3dxl_ns.query.relevancy import Queries
 
     count, channels, draw = 1_000_000, 24, torch.Generator().manual_seed(0)
-    kinds = torch.randn(40, channels, generator=draw)
-    owner = torch.arange(count) % 40
+    kinds = torch.randn(16, channels, generator=draw)
+    owner = torch.arange(count) % 16
     features = kinds[owner] + 0.1 * torch.randn(count, channels, generator=draw)
-    field = CompressedField(SemanticFieldConfig("short"), channels, CompressionConfig(300, 512, sample=1_000))
-    seen = torch.rand(count, generator=draw) < 0.25  # a code is searched for each of these alone
+    field = CompressedField(SemanticFieldConfig("short"), channels, CompressionConfig(100, 512, sample=1_000))
+    seen = torch.rand(count, generator=draw) < 0.1  # a code is searched for each of these alone
     codes = field.learn_gaussians(Gathered(features, seen.float()))
     assert bool((codes.isfinite().all(1) == seen).all())
     assert centered_cosine(Gathered(features[seen], seen[seen].float()), field, codes[seen]) > 0.95

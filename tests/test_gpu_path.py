@@ -363,6 +363,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
 def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, width, memory):
     """Wide features as principal components, a few channels at a time, sums on the CPU."""
     monkeypatch.setattr(CompressedField, "gathered_channels", 5)
+    monkeypatch.setattr("lang3dxl_ns.components.learn_codes.DENSE_AXES", 3)
     monkeypatch.setattr("lang3dxl_ns.rendering.gathering.MEMORY", memory)
     model = trained(iterations=3, pipeline__model__decoder__name=name).pipeline.model
     codes = model.gauss_params["codes"]
@@ -373,6 +374,8 @@ def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, wid
 def test_the_gpu_benchmark_writes_a_file_and_keeps_finished_parts(tmp_path, monkeypatch, gpu):
     from lab.benchmarks import gpu as benchmark
 
+    # Of these few steps three numbers are never enough, and six take ten times as long.
+    monkeypatch.setattr("lang3dxl_ns.components.compression.CODE_DIMS", (3,))
     once = partial(benchmark.times_of_parts, repeats=1), lambda work, repeats: interleaved_times(work, 1)
     for name, measured in zip(("times_of_parts", "interleaved_times"), once, strict=True):
         monkeypatch.setattr(benchmark, name, measured)

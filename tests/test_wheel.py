@@ -8,6 +8,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from build import ProjectBuilder
+from build.env import DefaultIsolatedEnv
 from conftest import build_wheel
 from scenes import write_scene
 
@@ -16,11 +18,11 @@ pytestmark = pytest.mark.slow
 
 
 def test_the_sdist_is_reproducible_and_makes_the_same_wheel(wheel, tmp_path):
-    sources = []
-    for name in ("one", "two"):
-        words = [sys.executable, "-m", "build", "--sdist", "--outdir", tmp_path / name, ROOT]
-        subprocess.run(words, check=True, timeout=500, capture_output=True)
-        sources += (tmp_path / name).glob("*.tar.gz")
+    with DefaultIsolatedEnv() as environment:  # as of `python -m build`, for both
+        builder = ProjectBuilder.from_isolated_env(environment, ROOT)
+        environment.install(builder.build_system_requires)
+        environment.install(builder.get_requires_for_build("sdist"))
+        sources = [Path(builder.build("sdist", tmp_path / name)) for name in ("one", "two")]
     assert sources[0].read_bytes() == sources[1].read_bytes()
     assert build_wheel(tmp_path / "wheel", sources[0]).read_bytes() == wheel.read_bytes()
 

@@ -164,6 +164,7 @@ class Demo:
         config.pipeline.datamanager.camera_res_scale_factor = 0.5  # words are scored at half the size
         if self.quick:
             config.pipeline.datamanager.dense_tokens = 32
+            config.pipeline.model.decoder.compression.steps = 300
         config.logging.steps_per_log = 50
         if self.ns_train:
             config = with_flags(config, self.ns_train)

@@ -28,8 +28,8 @@ SETTINGS = AttachConfig(views=6, up="z", clip="builtin", dense="builtin", dense_
 def quick_codes():
     """Learning codes takes 15 seconds otherwise."""
     with pytest.MonkeyPatch.context() as patch:
-        steps, *others = CompressionConfig.__init__.__defaults__
-        patch.setattr(CompressionConfig.__init__, "__defaults__", (steps // 10, *others))
+        steps, batch, *others = CompressionConfig.__init__.__defaults__
+        patch.setattr(CompressionConfig.__init__, "__defaults__", (steps // 10, batch // 6, *others))
         yield
 
 

@@ -2,16 +2,18 @@
 
 import json
 import signal
+from functools import partial
 
 import pytest
 
+from lab.landmark import scene_writer
 from lab.landmark.demo import Demo
 from lang3dxl_ns.common.errors import UserError
 
 pytestmark = pytest.mark.slow
 
 
-SCENE = {"photos": 8, "test_views": 6, "quick": True, "wild": False}
+SCENE = {"photos": 8, "test_views": 3, "quick": True, "wild": False}
 FEW = "--pipeline.model.decoder.compression.steps 40"
 """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
@@ -20,7 +22,10 @@ FEW = "--pipeline.model.decoder.compression.steps 40"
 def demo(tiny_clip, tiny_dense, tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
     settings = Demo(out=out, clip=str(tiny_clip), dense=str(tiny_dense), steps=6, ns_train=FEW, **SCENE)
-    settings.main()
+    with pytest.MonkeyPatch.context() as patch:
+        small = partial(scene_writer.DemoScene, width=240, height=180)
+        patch.setattr(scene_writer, "DemoScene", small)
+        settings.main()
     return settings
 
 
@@ -31,7 +36,7 @@ def run(demo):
 
 def test_the_report_holds_precision_quality_time_and_memory(run):
     report = json.loads((run / "report.json").read_text())
-    assert [split["protocol"]["photos"] for split in report["splits"].values()] == [6, 1]
+    assert [split["protocol"]["photos"] for split in report["splits"].values()] == [3, 1]
     for split in report["splits"].values():
         for who in ("", "teacher_", "limit_", "chance_"):
             values = [v for name, v in split.items() if name.startswith(f"{who}ap_") and "photos" not in name]

@@ -8,9 +8,13 @@ import pytest
 from PIL import Image
 from processes import output as command
 from processes import run as attempt
+from scenes import write_scene
 
 pytestmark = pytest.mark.slow
-FEW = ("--pipeline.model.decoder.compression.steps", 40)
+FEW = (
+    *("--pipeline.model.decoder.compression.steps", 40),
+    *("--pipeline.model.decoder.compression.batch", 512),
+)
 """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
 
@@ -20,10 +24,16 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    """Ten photos of mixed sizes, of which two are held out."""
+    return write_scene(tmp_path_factory.mktemp("scene"), photos=10, points=100, mixed=True)
+
+
+@pytest.fixture(scope="module")
 def run(scene, tiny_clip, tiny_dense, folder) -> Path:
     """A run folder made by ns-train."""
     command(
-        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 30, "--vis", "tensorboard"),
+        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 8, "--vis", "tensorboard"),
         *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
         *("--output-dir", folder / "outputs", "--timestamp", "first"),
         cwd=folder,
@@ -35,7 +45,7 @@ def run(scene, tiny_clip, tiny_dense, folder) -> Path:
 def test_prepare_alone(scene, tiny_clip, tiny_dense, folder):
     words = ("lang3dxl", "prepare", "--data", scene, "--clip", tiny_clip, "--dense", tiny_dense)
     words += ("--cache-dir", folder / "cache")
-    assert "preparing 12 photos" in command(*words, cwd=folder)
+    assert "preparing 10 photos" in command(*words, cwd=folder)
     assert "preparing" not in command(*words, cwd=folder)
 
 
@@ -48,7 +58,7 @@ def test_eval(run, folder):
 
 def test_resume(run, scene, tiny_clip, tiny_dense, folder):
     output = command(
-        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 40, "--vis", "tensorboard"),
+        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 12, "--vis", "tensorboard"),
         *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
         *(
             "--output-dir",
@@ -60,7 +70,7 @@ def test_resume(run, scene, tiny_clip, tiny_dense, folder):
         ),
         cwd=folder,
     )
-    assert "Resuming at iteration 30 of 40" in output
+    assert "Resuming at iteration 8 of 12" in output
 
 
 @pytest.fixture

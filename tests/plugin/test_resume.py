@@ -103,20 +103,37 @@ FROM_PHOTOS = EVERYTHING | {"pipeline__model__codes_from": "photos", "pipeline__
 """Codes start at iteration 9.6 of 24."""
 
 
+@pytest.fixture(scope="module")
+def starts():
+    """The pipelines that started codes from photos, in their order."""
+    found: list[Lang3DXLPipeline] = []
+    learn = Lang3DXLPipeline.learn_words
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Lang3DXLPipeline, "learn_words", lambda self: found.append(self) or learn(self))
+        yield found
+
+
+@pytest.fixture(scope="module")
+def whole_from_photos(starts, scene, tiny_clip, tiny_dense, tmp_path_factory):
+    """An uninterrupted run of 24 steps whose codes start from photos, with a checkpoint every five."""
+    changes = FROM_PHOTOS | {"steps_per_save": 5, "save_only_latest_checkpoint": False}
+    folder = tmp_path_factory.mktemp("from_photos")
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 24, **changes)
+    trainer.setup()
+    trainer.train()
+    assert starts == [trainer.pipeline]
+    return trainer
+
+
 @pytest.mark.parametrize("step", [5, 10])
 def test_codes_start_from_photos_once_also_if_the_run_is_interrupted(
-    train, scene, tmp_path, monkeypatch, step
+    train, scene, whole_from_photos, starts, step
 ):
-    changes = FROM_PHOTOS | {"steps_per_save": 5, "save_only_latest_checkpoint": False}
-    starts = []
-    learn = Lang3DXLPipeline.learn_words
-    monkeypatch.setattr(Lang3DXLPipeline, "learn_words", lambda self: starts.append(self) or learn(self))
-    whole = train(scene, iterations=24, output_dir=tmp_path / "whole", **changes)
-    assert len(starts) == 1
-    middle = whole.checkpoint_dir / f"step-{step:09d}.ckpt"
+    starts.clear()
+    middle = whole_from_photos.checkpoint_dir / f"step-{step:09d}.ckpt"
     resumed = train(scene, iterations=24, load_checkpoint=middle, **FROM_PHOTOS)
-    assert len(starts) == (2 if step < 9.6 else 1)
-    assert same(last_checkpoint(whole), last_checkpoint(resumed)) == []
+    assert len(starts) == (1 if step < 9.6 else 0)
+    assert same(last_checkpoint(whole_from_photos), last_checkpoint(resumed)) == []
 
 
 def test_codes_that_were_trained_do_not_start_again_in_a_longer_run(train, scene, monkeypatch):

@@ -191,8 +191,10 @@ def page(desk):
     """The page, without prompts and at the overview."""
     desk.keyboard.press("Escape")
     desk.evaluate("document.getElementById('near').replaceChildren()")
+    desk.emulate_media(reduced_motion="reduce")  # no second of flight
     desk.get_by_role("button", name="Overview").click()
     rest(desk)
+    desk.emulate_media(reduced_motion="no-preference")
     return desk
 
 
@@ -411,7 +413,7 @@ def test_a_slow_machine_draws_drafts_until_nothing_changes(page):
     picture(page)
     width = page.evaluate("document.querySelector('#frame canvas').width")
     draft = page.evaluate("""async () => {
-      lang3dxl.view.cost = 1e5;
+      lang3dxl.view.cost = 2e4;
       lang3dxl.view.wake();
       await new Promise(requestAnimationFrame);
       await new Promise(requestAnimationFrame);

@@ -45,7 +45,7 @@ def check_float32(cloud: Cloud):
 
 @pytest.mark.slow
 def test_float32_agrees_with_the_reference_on_five_thousand_gaussians():
-    check_float32(make_cloud(5000, 160, 120, size=0.03))
+    check_float32(make_cloud(5000, 112, 84, size=0.03))
 
 
 @pytest.mark.slow
@@ -56,12 +56,12 @@ def test_float32_agrees_with_the_reference_on_a_real_scene():
     file = np.load(Path(os.environ["LANG3DXL_REAL_SCENES"]) / "garden" / "test_garden.npz")
     means = torch.from_numpy(file["means3d"]).double()
     means = means[(means.abs() < 2).all(1)]
-    cloud = make_cloud(5000, 160, 120, size=0.01)
+    cloud = make_cloud(5000, 112, 84, size=0.01)
     cloud.tensors["means"] = means[
         torch.randperm(len(means), generator=torch.Generator().manual_seed(0))[:5000]
     ]
     cloud.tensors["view_matrix"] = torch.from_numpy(file["viewmats"][0]).double()
-    scale = torch.tensor([160 / int(file["width"]), 120 / int(file["height"]), 1.0], dtype=torch.float64)
+    scale = torch.tensor([112 / int(file["width"]), 84 / int(file["height"]), 1.0], dtype=torch.float64)
     cloud.intrinsics = scale[:, None] * torch.from_numpy(file["Ks"][0]).double()
     check_float32(cloud)
 
