@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -68,11 +67,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         return super().get_base_dir()
 
     def print_to_terminal(self) -> None:
-        """Print where the settings are; with LANG3DXL_VERBOSE=1 print all of them, as other methods do."""
-        if os.environ.get("LANG3DXL_VERBOSE") == "1":
-            super().print_to_terminal()
-        else:
-            say(f"Settings: {self.get_base_dir() / 'config.yml'} (LANG3DXL_VERBOSE=1 prints them)")
+        """Print where the settings are, which other methods print in full."""
+        say(f"Settings: {self.get_base_dir() / 'config.yml'}")
 
     def set_timestamp(self) -> None:
         """Resolve what depends on the run, and check that the encoders are available before a folder is made

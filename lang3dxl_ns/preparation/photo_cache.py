@@ -43,7 +43,8 @@ class PhotoCache:
         data = self._kept[index] if index in self._kept else self._patiently(index)
         for i in self._ahead.keys() - set(upcoming):
             self._ahead.pop(i).cancel()
-        if index not in self._kept and (size := _bytes(data)) <= self._free:
+        size = sum(value.nbytes for value in data.values() if isinstance(value, Tensor))
+        if index not in self._kept and size <= self._free:
             self._kept[index], self._free = data, self._free - size
         return dict(data)
 
@@ -59,10 +60,6 @@ class PhotoCache:
             time.sleep(seconds)
             self._ahead[index] = self._pool.submit(self._read, index)
         return self._ahead[index].result()
-
-
-def _bytes(data: dict[str, Any]) -> int:
-    return sum(value.nbytes for value in data.values() if isinstance(value, Tensor))
 
 
 def has_vanished(reason: UserError) -> bool:

@@ -67,7 +67,8 @@ def region_source(config: PreparationConfig, data: Path, device: torch.device | 
         return FelzenszwalbRegions()
     if choice == "sam":
         files = find_sam(config.sam)
-        return MaskRegions(partial(_sam_masks, files, device), level, regions="sam", model=files.identity)
+        sam = partial(AutomaticSam, files, device)
+        return MaskRegions(lambda: sam().masks, level, regions="sam", model=files.identity)
     if choice == "text":
         found = find_text_segmenter(config.foreground_model, config.sam)
         prompts = sorted(config.region_prompts)
@@ -121,10 +122,6 @@ class MaskRegions:
         size = label_size(*small.shape[:2])
         masks = [_nearest(mask, size) for mask in self._masks(small)]
         return label_map(torch.stack(masks), self._level) if masks else torch.full(size, -1)
-
-
-def _sam_masks(files: ModelFiles, device: torch.device | str) -> FindMasks:
-    return AutomaticSam(files, device).masks
 
 
 def _masks_of_instances(files: ModelFiles, prompts: Sequence[str], device: torch.device | str) -> FindMasks:

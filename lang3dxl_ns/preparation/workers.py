@@ -99,9 +99,6 @@ def _do(item: Any) -> Any:
     return _work(item)
 
 
-# --- a Ray cluster -----------------------------------------------------------------------------------------
-
-
 class _Actor:
     """Worker on a Ray cluster. If it dies, Ray starts another and repeats its item."""
 

@@ -103,15 +103,13 @@ def strongest_match(
 
     core = max(things(CORE), key=lambda box: box.share)
     around = max(things(STRONG), key=lambda box: shared_volume(box, core, gap))
-    size = shared_volume(around, around, gap)
-    return around if size <= JOINED * shared_volume(core, core, gap) else core
+    one_thing = shared_volume(around, around, gap) <= JOINED * shared_volume(core, core, gap)
+    return around if one_thing else core
 
 
 def shared_volume(a: Box, b: Box, margin: float = 0.0) -> float:
-    """Compute the volume of two boxes' intersection. A margin widens each of its sides, so that points have a
-    volume too."""
-    sides = np.minimum(a.high, b.high) - np.maximum(a.low, b.low) + margin
-    return float(np.prod(sides.clip(0)))
+    """Compute the volume of two boxes' intersection, widened so that points have volumes too."""
+    return float(np.prod((np.minimum(a.high, b.high) - np.maximum(a.low, b.low) + margin).clip(0)))
 
 
 def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float) -> list[Box]:
