@@ -70,7 +70,7 @@ def test_words_of_field_teacher_and_bounds_stand_in_their_own_rows():
     rows = [line.strip("| ").split(" | ") for line in seen.splitlines() if line.startswith("|")]
     assert rows[0] == ["windows", "mean"]
     assert [row[:2] for row in rows[2:]] == [
-        ["Lang3D-XL", "0.70"],
+        ["lang3dxl, the default", "0.70"],
         ["2-D teacher", "0.40"],
         ["limit of the geometry", "0.95"],
         ["chance", "0.05"],

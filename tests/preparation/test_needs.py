@@ -122,10 +122,11 @@ def test_needs_are_written_and_read_back(scene, tmp_path):
     assert read_needs(tmp_path / "elsewhere") == {}
 
 
-def test_components_left_out_are_absent(train, scene):
+def test_components_left_out_are_absent(train, scene, tmp_path):
     trainer = train(
         scene,
         iterations=2,
+        pipeline__datamanager__cache_dir=tmp_path,
         pipeline__model__appearance__use="off",
         pipeline__model__view_dependence="off",
         pipeline__model__camera_optimization="off",
