@@ -43,9 +43,10 @@ class PhotoCache:
         data = self._kept[index] if index in self._kept else self._patiently(index)
         for i in self._ahead.keys() - set(upcoming):
             self._ahead.pop(i).cancel()
-        size = sum(value.nbytes for value in data.values() if isinstance(value, Tensor))
-        if index not in self._kept and size <= self._free:
-            self._kept[index], self._free = data, self._free - size
+        if index not in self._kept:
+            size = sum(value.nbytes for value in data.values() if isinstance(value, Tensor))
+            if size <= self._free:
+                self._kept[index], self._free = data, self._free - size
         return dict(data)
 
     def _patiently(self, index: int) -> dict[str, Any]:

@@ -67,8 +67,9 @@ def region_source(config: PreparationConfig, data: Path, device: torch.device | 
         return FelzenszwalbRegions()
     if choice == "sam":
         files = find_sam(config.sam)
-        sam = partial(AutomaticSam, files, device)
-        return MaskRegions(lambda: sam().masks, level, regions="sam", model=files.identity)
+        return MaskRegions(
+            lambda: AutomaticSam(files, device).masks, level, regions="sam", model=files.identity
+        )
     if choice == "text":
         found = find_text_segmenter(config.foreground_model, config.sam)
         prompts = sorted(config.region_prompts)

@@ -48,8 +48,6 @@ def run(
             yield item, work(item)
 
 
-# --- processes of this machine ----------------------------------------------------------------------------
-
 _work: Any = None
 """Work function of this worker process."""
 

@@ -98,6 +98,14 @@ def test_codes_start_crops_and_looks_are_as_printed_in_runs_that_are_long_enough
     assert config.pipeline.datamanager.crops == crops
 
 
+@pytest.mark.parametrize(("iterations", "sides"), [(600, (56, 72)), (30_000, (80, 120))])
+def test_short_runs_decode_smaller_maps(iterations, sides):
+    config = deepcopy(lang3dxl_paper.config)
+    config.max_num_iterations = iterations
+    config.fit_to_run()
+    assert config.pipeline.model.decode_size == sides
+
+
 def test_the_default_is_another_method_with_settings_of_its_own():
     default = METHODS["lang3dxl"].config
     assert default.method_name == "lang3dxl" and lang3dxl_paper.config.method_name == "lang3dxl-paper"
