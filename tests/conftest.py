@@ -29,9 +29,11 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 # No test may contact a model hub.
 os.environ["HF_HUB_OFFLINE"] = "1"
-# A thread per process where several test at a time: more would wait for each other. Commands inherit it.
+# A thread per process where several test at a time: more would wait for each other. Commands inherit it. Numba
+# is told as well: the first of its parallel functions (gsply has some) sets the number for torch, too.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     torch.set_num_threads(1)
 torch.set_num_threads(min(torch.get_num_threads(), 2))
 
