@@ -1,9 +1,9 @@
 """What tests share: small scenes, tiny encoders, and short training runs.
 
 - `scene`, `tiny_clip`, `tiny_dense`: read-only, made once per process that tests.
-- `train`: a short training with settings of your own, which learns codes in 40 small steps. It takes half a
-  second and 15 ms per step: take as few as the law needs, and a module's fixture where several tests only
-  look at the same run.
+- `train`: a short training with settings of your own, a small sky, and 40 small steps of learning codes. It
+  takes a second and 15 ms per step: take as few as the law needs, and a module's fixture where several tests
+  only look at the same run.
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
   `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
   told `--pipeline.model.decoder.compression.steps 40`.
@@ -29,8 +29,8 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 # No test may contact a model hub.
 os.environ["HF_HUB_OFFLINE"] = "1"
-# A thread per process where several test at a time: more would wait for each other. Commands inherit it. Numba
-# is told as well: the first of its parallel functions (gsply has some) sets the number for torch, too.
+# A thread per process where several test at a time: more would wait for each other. Commands inherit it.
+# Numba is told as well: the first of its parallel functions (gsply has some) sets the number for torch, too.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
@@ -152,6 +152,7 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, meth
     config.pipeline.datamanager.clip = str(clip) if semantics else "none"
     config.pipeline.datamanager.dense = str(dense) if semantics else "none"
     config.viewer.quit_on_train_completion = True
+    config.pipeline.model.sky_gaussians = 400
     compression = config.pipeline.model.decoder.compression
     compression.steps, compression.batch = 40, 512
     for path, value in changes.items():

@@ -19,7 +19,12 @@ def real_scene(request, real_scenes, tmp_path):
 
 @pytest.mark.slow
 def test_a_short_run_shows_the_facade_and_beats_the_mean_feature(train, real_scene):
-    trainer = train(real_scene, iterations=150, pipeline__datamanager__camera_res_scale_factor=0.2)
+    trainer = train(
+        real_scene,
+        iterations=150,
+        pipeline__datamanager__camera_res_scale_factor=0.2,
+        pipeline__model__sky_gaussians=2_000,
+    )
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert all(map(math.isfinite, metrics.values()))
     if real_scene.name == "sceaux":

@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -137,12 +138,14 @@ def _check(scene: DemoScene, out: Path) -> None:
 
 
 def _taken(orders: list[_Order], workers: int | None) -> Iterator[TakenPhoto]:
-    """Yield photos in order, taken by a process pool, with a progress bar."""
+    """Yield photos in order, taken by a process pool, or by this process if it is the only worker, with a
+    progress bar."""
     workers = min(workers or os.cpu_count() or 1, len(orders))
     # Processes are spawned, because forked ones would inherit this one's threads and loaded libraries.
     context = multiprocessing.get_context("spawn")
-    with progress("taking photos", len(orders)) as advance, ProcessPoolExecutor(workers, context) as pool:
-        for photo in pool.map(_take, orders):
+    pool = ProcessPoolExecutor(workers, context) if workers > 1 else nullcontext()
+    with progress("taking photos", len(orders)) as advance, pool:
+        for photo in (pool.map if isinstance(pool, ProcessPoolExecutor) else map)(_take, orders):
             yield photo
             advance()
 

@@ -9,6 +9,7 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
+    "pipeline__model__decode_size": (24, 32),
     "pipeline__model__densify_grad_thresh": 1e-7,  # at every second step, with random splits
     "pipeline__model__densify_until": 0.75,
     "pipeline__model__appearance__use": "on",

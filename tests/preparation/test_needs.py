@@ -34,7 +34,7 @@ def verdicts(folder, **settings):
 @pytest.fixture(scope="module")
 def landmarks(tmp_path_factory):
     folder = tmp_path_factory.mktemp("landmarks")
-    sizes = {"photos": 24, "test_views": 0, "width": 240, "height": 180}
+    sizes = {"photos": 24, "test_views": 0, "width": 240, "height": 180, "workers": 1}
     return {
         wild: write_scene(DemoScene(out=folder / f"wild-{wild}", seed=4, wild=wild, **sizes))
         for wild in (True, False)
