@@ -62,7 +62,7 @@ Commands of `lab` are available only in a checkout."""
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the `lang3dxl` command (its entry point)."""
-    words = asked_for_all(sys.argv[1:] if arguments is None else arguments)
+    words = asked_for_all(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     silence_libraries()
     accept_any_console()
     if words[:1] == ["--version"]:

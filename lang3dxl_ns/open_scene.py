@@ -48,7 +48,7 @@ def load_scene(
     silence_libraries()  # nerfstudio's imports print warnings that a user can do nothing about
     from lang3dxl_ns.plugin.load_scene import load_run
 
-    return load_run(path, device, settings)
+    return load_run(path, device, settings, clip)
 
 
 def find_scene_file(path: str | Path | None = None) -> Path | None:

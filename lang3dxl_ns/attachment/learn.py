@@ -102,6 +102,7 @@ def scene_file(
             lens=photo.lens.scaled(min(1.0, LONGER_SIDE / max(photo.width, photo.height))),
             mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
             size=(photo.width, photo.height),
+            quarter_turns=photo.quarter_turns,
         )
         for photo in collection.photos
     ]

@@ -57,5 +57,5 @@ def _show(scene: Scene, texts: list[str], out: Path) -> None:
     for match, slug in zip(matches, slugs([match.prompt.text for match in matches]), strict=True):
         picture = match.save(out.with_name(f"{out.stem}.{slug}.png"))
         say(f"{match.prompt.text}, in the view of {match.view.name}: {picture}")
-        if advice := doubtful(match.prompt.text, match.doubt):
+        if advice := doubtful(match.prompt.text, match.doubt, match.prompt.taught is not None):
             say(f"  {advice}")

@@ -274,8 +274,10 @@ class Export:
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:
         """Return the words of the CLIP's tokenizer; empty on a machine without that CLIP."""
+        if (name := self.clip or clip) is None:  # a scene of colors alone
+            return ()
         try:
-            return whole_words(self.clip or clip or "")
+            return whole_words(name)
         except UserError as error:
             say(f"The page knows the shipped words alone: {error}")
             return ()

@@ -307,6 +307,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 lens=photo.lens.scaled(dataset.scale),
                 mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
                 size=(photo.lens.width, photo.lens.height),
+                quarter_turns=photo.quarter_turns,
             )
             for photo, pose in zip((photos[p.name] for p in dataset.photos), poses, strict=True)
         ]

@@ -27,6 +27,7 @@ def load_run(
     run: str | Path | None = None,
     device: torch.device | str | None = None,
     config: QueryConfig | None = None,
+    clip: str | None = None,
 ) -> Scene:
     """Load the scene of a run from its latest checkpoint.
 
@@ -36,6 +37,7 @@ def load_run(
             such as ns-eval, do trust it).
         device: default: a GPU if there is one.
         config: defaults of queries.
+        clip: name or folder of the run's CLIP, if it is not where the run says.
 
     Raises:
         UserError: the folder has no checkpoint, or the run is damaged or of another method.
@@ -64,6 +66,7 @@ def load_run(
     if model.semantic_field is not None and model.carried is None:
         raise UserError(NOT_FINISHED)
     model.to(worker).eval()
+    file = replace(file, clip=clip or file.clip)
     return model.scene(file, config=config, cache=folder / "lang3dxl_visible.safetensors")
 
 

@@ -38,6 +38,7 @@ from lang3dxl_ns.preparation.encoders import (
     load_image_text_encoder,
     patch_reading,
 )
+from lang3dxl_ns.preparation.families import input_side
 from lang3dxl_ns.preparation.model_files import (
     BUILTIN,
     CLIP_OPTION,
@@ -46,7 +47,7 @@ from lang3dxl_ns.preparation.model_files import (
     read_config,
     spoken,
 )
-from lang3dxl_ns.preparation.pyramid import THIRD, USUAL_INPUT, Crops, build_clip_target, choose_crops
+from lang3dxl_ns.preparation.pyramid import THIRD, Crops, build_clip_target, choose_crops
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -175,7 +176,7 @@ def _plan(
     """Plan a task per photo, and collect the reasons for photos that cannot be read."""
     clip_model = find_model(config.clip, CLIP_OPTION)
     patches = patch_reading(config.clip, config.clip_features)
-    input_pixels = getattr(read_config(clip_model).vision_config, "image_size", USUAL_INPUT)
+    input_pixels = input_side(read_config(clip_model).vision_config)
     dense_model = find_model(config.dense, DENSE_OPTION).identity if config.makes_dense else None
     tasks, left_out = [], {}
     for photo, content in zip(photos, store.photo_hashes(photos).values(), strict=True):

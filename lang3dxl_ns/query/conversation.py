@@ -169,7 +169,8 @@ class Conversation:
             best = max((view.score for view in found.views), default=0.0)
             where = f"{count} good views, best {best:.2f}" if count else "nothing in the scene looks like it"
             lines.append(f"**{plain(text)}**: {where}")
-            warnings = (None if found.prompt.taught else caution(text), doubtful(text, found.doubt))
+            taught = found.prompt.taught is not None
+            warnings = (None if taught else caution(text), doubtful(text, found.doubt, taught))
             lines += [plain(line) for line in warnings if line]
         return "  \n".join(lines)
 

@@ -53,6 +53,8 @@ class ScenePhoto:
     """Foreground mask of the photo: its file, or the bytes of a PNG with the undistorted mask."""
     size: tuple[int, int] | None = None
     """Width and height of the file; None: the lens's."""
+    quarter_turns: int = 0
+    """Clockwise quarter turns that bring the file's pixels as stored upright."""
 
     def __repr__(self) -> str:
         width, height = self.file_size
@@ -83,7 +85,7 @@ class ScenePhoto:
         """Return the photo in its folder, without its mask if the mask's file is gone."""
         mask = Path(self.mask) if isinstance(self.mask, str) else None
         mask = mask if mask is not None and mask.is_file() else None
-        return Photo(self.name, folder / self.name, mask, self.lens)
+        return Photo(self.name, folder / self.name, mask, self.lens, self.quarter_turns)
 
     def foreground(self, size: tuple[int, int] | None = None) -> Bool[Tensor, "h w"] | None:
         """Read the photo's undistorted foreground; None if it has no mask, or the mask is gone.
@@ -167,6 +169,7 @@ def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
     expect(is_name(photo.name), f"a photo is called {photo.name!r}")
     expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
     expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
+    expect(photo.quarter_turns in range(4), f"{photo.name} is turned {photo.quarter_turns!r} quarters")
     expect(len(photo.camera_to_world) == 3, f"{photo.name} has no pose")
     check_pose(photo.camera_to_world)
     photo.lens.check()

@@ -29,6 +29,12 @@ def test_the_version_is_told(capsys):
     assert capsys.readouterr().out[0].isdigit()
 
 
+def test_without_words_the_help_is_shown(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([])
+    assert "query" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("words", "hint"),
     [

@@ -14,6 +14,7 @@ from conftest import make_trainer
 from PIL import Image
 from plyfile import PlyData
 from scenes import view_of, write_scene
+from tiny_models import make_tiny_clip
 
 import lang3dxl_ns
 from lang3dxl_ns.common.errors import UserError
@@ -66,6 +67,14 @@ def test_it_answers_without_its_photos(scene):
     assert match.relevancy.min() >= 0 and match.relevancy.max() <= 1
     assert len(scene.relevancy("dome")) == len(scene.splats)
     assert scene.find("dome").relevancy.shape == (len(scene.splats),)
+
+
+def test_a_clip_named_for_a_run_is_the_one_that_reads_its_texts(config, tiny_clip, tmp_path):
+    moved = shutil.copytree(tiny_clip, tmp_path / "moved")
+    assert lang3dxl_ns.load_scene(config, clip=str(moved)).query("dome", "photo_002.jpg").relevancy.any()
+    other = make_tiny_clip(tmp_path / "other", seed=1)
+    with pytest.raises(UserError, match="other is not the one"):
+        lang3dxl_ns.load_scene(config, clip=str(other)).query("dome", "photo_002.jpg")
 
 
 def test_the_loaded_model_renders_as_the_trained_one(scene, trainer):

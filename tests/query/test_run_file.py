@@ -3,13 +3,15 @@
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
 from painted_scene import painted_scene
+from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.run_file import SceneFile, read_camera_path
-from lang3dxl_ns.scene.camera import camera_to_world, posed, resized, view_matrix
+from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
+from lang3dxl_ns.scene.camera import Lens, camera_to_world, posed, resized, view_matrix
 
 
 @pytest.fixture
@@ -20,6 +22,24 @@ def file():
 def test_it_reads_what_it_wrote(file, tmp_path):
     file.write(tmp_path / "scene.json")
     assert SceneFile.read(tmp_path / "scene.json") == file
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_a_mask_of_a_turned_photo_is_that_of_training(quarters, tmp_path):
+    """Drawn on the pixels as they are stored."""
+    upright = np.zeros((20, 30), np.uint8)
+    upright[3:9, 4:6] = 255
+    stored = np.rot90(upright, quarters) if quarters % 2 else upright
+    Image.fromarray(np.ascontiguousarray(stored)).save(tmp_path / "mask.png")
+    pose = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
+    photo = ScenePhoto(
+        "a", "train", pose, Lens(30, 20, 30, 30, 15, 10), f"{tmp_path}/mask.png", None, quarters
+    )
+    about = SceneFile([photo], None, None, 1.0, [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]], "data")
+    about.write(tmp_path / "scene.json")
+    (found,) = SceneFile.read(tmp_path / "scene.json").photos
+    assert found == photo
+    assert np.array_equal(found.foreground(), upright > 0)
 
 
 def test_a_missing_file_is_explained(tmp_path):
