@@ -14,8 +14,8 @@ from lab.benchmarks.ablation_rows import BOUNDS, FULL, IN_PICTURES, Row, choose_
 from lab.benchmarks.landmarks import Landmarks, landmark_scenes
 from lab.benchmarks.scored_runs import Run, RunSettings, ScoredRuns, scene_labels
 from lab.reports import command_line
+from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.common.settings_help import showing
 
 Found = TypeVar("Found")
@@ -138,8 +138,7 @@ def make_all(
     failed: dict[Run, str] = {}
     missing = [run for run in runs if run not in figures]
     report(figures, failed)
-    with progress_bar() as bar, ThreadPoolExecutor(workers) as threads:
-        task = bar.add_task("training", total=len(missing))
+    with progress("training", len(missing)) as advance, ThreadPoolExecutor(workers) as threads:
         made: dict[Future, Run] = {threads.submit(store.make, run): run for run in missing}
         try:
             for future in as_completed(made):
@@ -148,7 +147,7 @@ def make_all(
                     figures[run] = future.result()
                 except UserError as reason:
                     failed[run] = str(reason)
-                bar.update(task, advance=1, description=run.name)
+                advance()
                 report(figures, failed)
         except (KeyboardInterrupt, SystemExit):
             for process in active_children():  # Ctrl-C reaches them, but other signals do not

@@ -12,7 +12,7 @@ import tyro
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.frames import camera_in
-from lang3dxl_ns.common.console import progress, say
+from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import markdown_table
 from lang3dxl_ns.common.settings_help import showing
@@ -109,10 +109,8 @@ def _labeled(data: Path, scene: Scene) -> tuple[GroundTruth, list[Labeled]]:
 def _scores(scene: Scene, scorer: LanguageScorer, views: list[Labeled]) -> Iterator[dict[str, float]]:
     queries = scorer.queries.to(scene.device)
     channels = scene.engine.channels(queries)
-    with progress("scoring", len(views)) as advance:
-        for name, camera, size in views:
-            rendered = scene.draw(camera, channels).channels
-            assert rendered is not None
-            maps = scorer.named(scene.engine.maps(rendered, queries), size)
-            yield scorer.scores(name, {"": scorer.variants(maps)[""]})
-            advance()
+    for name, camera, size in tracked(views, "scoring"):
+        rendered = scene.draw(camera, channels).channels
+        assert rendered is not None
+        maps = scorer.named(scene.engine.maps(rendered, queries), size)
+        yield scorer.scores(name, {"": scorer.variants(maps)[""]})

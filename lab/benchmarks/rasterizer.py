@@ -36,10 +36,11 @@ from lab.benchmarks.rasterizer_scenes import (
     make_problem,
 )
 from lab.reports import command_line
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.kernels import takes_kernels
-from lang3dxl_ns.common.reports import describe_machine, markdown_table, progress_bar, write_report
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.rasterize import Backend
 
@@ -207,16 +208,11 @@ def _measure(plan: RasterizerBenchmark) -> dict[str, Any]:
     # Features: from few Gaussians on a small image to many on a large one, not every combination.
     diagonal = trained[:: len(plan.image_sizes) + 1]
     results: dict[str, list] = {"cases": [], "passes": []}
-    with progress_bar() as bar:
-        weights = [3e9 + case.gaussians * case.width * case.height for case in cases]  # roughly the time
-        task = bar.add_task("rasterizer", total=sum(weights) + 3e9 * len(diagonal))
-        for case, weight in zip(cases, weights, strict=True):
-            results["cases"].append(_measure_case(case, plan))
-            bar.advance(task, weight)
-        for case in diagonal:
-            problem = make_problem(case, plan.scene, plan.device, seed=plan.seed)
-            results["passes"].append({**vars(case), "ms": _median_ms(pass_costs(problem), plan)})
-            bar.advance(task, 3e9)
+    for case in tracked(cases, "rasterizer"):
+        results["cases"].append(_measure_case(case, plan))
+    for case in tracked(diagonal, "passes"):
+        problem = make_problem(case, plan.scene, plan.device, seed=plan.seed)
+        results["passes"].append({**vars(case), "ms": _median_ms(pass_costs(problem), plan)})
     return results
 
 

@@ -18,7 +18,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from lab.reports import command_line
-from lang3dxl_ns.common.reports import describe_machine, markdown_table, progress_bar, write_report
+from lang3dxl_ns.common.console import tracked
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import average_precision, overlap
@@ -61,10 +62,9 @@ class TeachingBenchmark:
         scene = load_scene(self.scene).with_words(())
         truth = GroundTruth(self.ground_truth)
         figures: dict[str, dict[str, dict[str, float]]] = {}
-        with progress_bar() as bar:
-            for word in bar.track(truth.categories, description="teaching"):
-                if found := self._word(scene, truth, word):
-                    figures[word] = found
+        for word in tracked(truth.categories, "teaching"):
+            if found := self._word(scene, truth, word):
+                figures[word] = found
         figures_of_time = {"teach_seconds": seconds_of_a_click(scene)}
         command = command_line("lang3dxl benchmark teaching", self)
         text = report(figures, command, describe_machine(scene.device), figures_of_time["teach_seconds"])

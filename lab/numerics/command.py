@@ -13,9 +13,10 @@ from lab.numerics import optimization
 from lab.numerics.catalog import all_cases
 from lab.numerics.measure import Case, Row, measure
 from lab.reports import as_png, command_line
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.common.reports import describe_machine, markdown_table, progress_bar
+from lang3dxl_ns.common.reports import describe_machine, markdown_table
 
 HEADER = "component", "case", "mode", "output", "gradient", "bounds", "flipped", "ms", "verdict"
 SMALLEST = 1e-18
@@ -69,9 +70,7 @@ def measure_all(cases: Sequence[Case], quick: bool, device: str, repeats: int = 
         for mode in case.bounds
         if not (quick and mode == "float64" and len(case.bounds) > 1)
     ]
-    with progress_bar() as bar:
-        watched = bar.track(pairs, description="numerics")
-        return [measure(case, mode, device, repeats) for case, mode in watched]
+    return [measure(case, mode, device, repeats) for case, mode in tracked(pairs, "numerics")]
 
 
 def _markdown(rows: Sequence[Row], runs: Sequence[optimization.Run], heading: str, verdict: str) -> str:

@@ -14,7 +14,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, registered_frames
-from lang3dxl_ns.common.console import progress
+from lang3dxl_ns.common.console import progress, tracked
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes
 from lang3dxl_ns.rendering.rasterize import rasterize
@@ -111,13 +111,11 @@ def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
 
 
 def _best(splats: Splats, photos: Sequence[_Compared], frames: Mapping[str, Similarity]) -> list[Fit]:
-    with progress("comparing with the photos", len(frames)) as advance:
-        fits = []
-        for name, frame in frames.items():
-            fits.append(_fit(splats, photos, name, frame))
-            advance()
-            if fits[-1].score >= _CLOSE:
-                break
+    fits = []
+    for name, frame in tracked(frames.items(), "comparing with the photos"):
+        fits.append(_fit(splats, photos, name, frame))
+        if fits[-1].score >= _CLOSE:
+            break
     return sorted(fits, key=lambda fit: fit.score, reverse=True)
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from lang3dxl_ns.common.console import progress, say
+from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.preparation.segmentation import TextSegmenter
 from lang3dxl_ns.query.learn_word import MARK_SIDE
 from lang3dxl_ns.query.scene import Scene
@@ -39,15 +39,13 @@ def segmented(
     masks: dict[str, Bool[Tensor, "h w"]] = {}
 
     def views() -> Iterator[tuple[Composite, Pixels]]:
-        with progress(f"looking for {word}", len(photos)) as advance:
-            for photo in photos:
-                masks[photo.name] = segmenter.segment(photo.read_file(_SIDE), [word])
-                marked = photo.undistort_labels(masks[photo.name].int()) == 1
-                camera, values = resized(cameras[photo.name], _SIDE), marked[..., None].to(like)
-                foreground = photo.read_mask(camera.width / photo.width)
-                drawn = partial(composite, scene.splats, camera, backend=scene.backend)
-                yield drawn, Pixels.of([values], (camera.height, camera.width), foreground)
-                advance()
+        for photo in tracked(photos, f"looking for {word}"):
+            masks[photo.name] = segmenter.segment(photo.read_file(_SIDE), [word])
+            marked = photo.undistort_labels(masks[photo.name].int()) == 1
+            camera, values = resized(cameras[photo.name], _SIDE), marked[..., None].to(like)
+            foreground = photo.read_mask(camera.width / photo.width)
+            drawn = partial(composite, scene.splats, camera, backend=scene.backend)
+            yield drawn, Pixels.of([values], (camera.height, camera.width), foreground)
 
     like = scene.splats.means
     chosen = gather(len(scene.splats), views(), 1, like)[0][:, 0].to(like) > 0.5

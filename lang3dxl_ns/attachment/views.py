@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from lang3dxl_ns.attachment import Up
-from lang3dxl_ns.common.console import progress, say
+from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
@@ -144,20 +144,18 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCol
     background = splats.means.new_tensor(BACKGROUND)
     names = [f"{i:04d}.png" for i in range(len(cameras))]
     make_folder(folder)
-    tracked, chosen = {}, np.random.default_rng(0)
-    with progress("rendering views", len(cameras)) as advance:
-        for name, camera in zip(names, cameras, strict=True):
-            view = render(splats, camera, background=background)
-            path = folder / "images" / name
-            if kept is None or not path.is_file():
-                save_picture(as_bytes(view.rgb), path)
-            tracked[name] = _tracked(name, view, chosen)
-            advance()
+    seen, chosen = {}, np.random.default_rng(0)
+    for name, camera in tracked(zip(names, cameras, strict=True), "rendering views", len(cameras)):
+        view = render(splats, camera, background=background)
+        path = folder / "images" / name
+        if kept is None or not path.is_file():
+            save_picture(as_bytes(view.rgb), path)
+        seen[name] = _tracked(name, view, chosen)
     content = {"of": stamp, "views": [camera.view_matrix.tolist() for camera in cameras]}
     write_atomically(folder / "views.json", json.dumps(content))
     photos = [Photo(name, folder / "images" / name, None, LENS) for name in names]
-    points = np.concatenate([photo.points for photo in tracked.values()])
-    reconstruction = Reconstruction(tracked, points, np.zeros(points.shape, np.uint8))
+    points = np.concatenate([photo.points for photo in seen.values()])
+    reconstruction = Reconstruction(seen, points, np.zeros(points.shape, np.uint8))
     return PhotoCollection(folder, photos, reconstruction, {})
 
 
@@ -194,11 +192,10 @@ def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
     sample = torch.linspace(0, len(splats) - 1, min(_SAMPLE, len(splats)), dtype=torch.float64).long()
     free = _FreeSpace(solids(splats), extent)
     views = list[tuple[Camera, Float[Tensor, " sample"], float]]()
-    with progress("choosing views", _CANDIDATES * count) as advance:
-        for camera in candidates(extent, free, _CANDIDATES * count):
-            if (judged := _judged(splats, camera, extent)) is not None:
-                views.append((camera, judged[0][sample.to(judged[0].device)].cpu(), judged[1]))
-            advance()
+    placed = candidates(extent, free, _CANDIDATES * count)
+    for camera in tracked(placed, "choosing views", _CANDIDATES * count):
+        if (judged := _judged(splats, camera, extent)) is not None:
+            views.append((camera, judged[0][sample.to(judged[0].device)].cpu(), judged[1]))
     if not views:
         raise UserError("no view shows this splat well: give its photos (--data)")
     blurred = _BLURRED * float(torch.tensor([size for *_, size in views]).median())

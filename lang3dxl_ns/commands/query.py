@@ -16,10 +16,9 @@ from PIL import Image
 from scipy.ndimage import find_objects, label
 
 from lang3dxl_ns import __version__
-from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomically
-from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.doubt import doubtful
@@ -91,23 +90,22 @@ class Query:
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
         labels, views = CocoLabels([prompt.text for prompt in prompts]), []
         best = [(-1.0, "")] * len(prompts)
-        with progress_bar() as bar:
-            for name, place, asked in bar.track(self._places(scene, question), description="rendering"):
-                wanted = question if len(asked) == len(prompts) else scene.ask([prompts[i] for i in asked])
-                matches = scene.matches(wanted, place)
-                for i, match in zip(asked, matches, strict=True):
-                    match.save(folders[i] / f"{name}.overlay.png")
-                    match.save(folders[i] / f"{name}.npy")
-                    save_picture(match.mask * np.uint8(255), folders[i] / f"{name}.mask.png")
-                    where = f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
-                    best[i] = max(best[i], (match.score, where), key=lambda found: found[0])
-                if self.coco is not None and isinstance(place, str):
-                    size = scene.file.photo(place).file_size
-                    masks = [Image.fromarray(match.mask).resize(size, _NEAREST) for match in matches]
-                    labels.add(place, [np.asarray(mask) for mask in masks])
-                if len(matches) > 1:
-                    save_picture(together(matches), shared / f"{name}.png")
-                views.append(_view_report(name, matches))
+        for name, place, asked in tracked(self._places(scene, question), "rendering"):
+            wanted = question if len(asked) == len(prompts) else scene.ask([prompts[i] for i in asked])
+            matches = scene.matches(wanted, place)
+            for i, match in zip(asked, matches, strict=True):
+                match.save(folders[i] / f"{name}.overlay.png")
+                match.save(folders[i] / f"{name}.npy")
+                save_picture(match.mask * np.uint8(255), folders[i] / f"{name}.mask.png")
+                where = f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
+                best[i] = max(best[i], (match.score, where), key=lambda found: found[0])
+            if self.coco is not None and isinstance(place, str):
+                size = scene.file.photo(place).file_size
+                masks = [Image.fromarray(match.mask).resize(size, _NEAREST) for match in matches]
+                labels.add(place, [np.asarray(mask) for mask in masks])
+            if len(matches) > 1:
+                save_picture(together(matches), shared / f"{name}.png")
+            views.append(_view_report(name, matches))
         if self.coco is not None:
             write_atomically(self.coco, json.dumps(labels.content) + "\n")
         texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))

@@ -7,11 +7,13 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager
+from typing import TypeVar
 
 from lang3dxl_ns.common.errors import printable
 
+Item = TypeVar("Item")
 QUIET_S = 5.0
 """Seconds before a progress bar appears. Shorter work shows none."""
 
@@ -37,6 +39,14 @@ def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
     finally:
         if bar.live.is_started:  # otherwise it would print an empty line
             bar.stop()
+
+
+def tracked(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
+    """Yield the items one by one under `progress`. `total` is their number, for those without a length."""
+    with progress(what, len(items) if isinstance(items, Sized) else total or 0) as advance:
+        for item in items:
+            yield item
+            advance()
 
 
 def say(*lines: str) -> None:

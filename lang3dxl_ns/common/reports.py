@@ -1,4 +1,4 @@
-"""Reports: machine description, peak memory, progress, and atomic JSON and markdown."""
+"""Reports: machine description, peak memory, and atomic JSON and markdown."""
 
 from __future__ import annotations
 
@@ -6,19 +6,15 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
-
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from typing import TYPE_CHECKING, Any
 
 from lang3dxl_ns.common.files import write_atomically
 
 if TYPE_CHECKING:  # imported where it is used, because --help does not need it
     import torch
-
-Result = TypeVar("Result")
 
 
 def describe_machine(device: torch.device | str = "cpu") -> str:
@@ -62,23 +58,6 @@ def host_peak(reset: bool = False) -> int:
     import resource  # absent on Windows
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
-
-
-def progress_bar() -> Progress:
-    """Make a rich progress bar with the time left. Add one task per kind of work."""
-    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-    return Progress(*columns, speed_estimate_period=600)  # steps vary: a short window would make it jump
-
-
-def watched(items: Collection[Result], what: str, watch: Callable[[str], None] | None) -> Iterator[Result]:
-    """Yield the items one by one. `watch` is called with a message for each; None shows a progress bar."""
-    if watch is None:
-        with progress_bar() as bar:
-            yield from bar.track(items, description=what)
-        return
-    for number, item in enumerate(items, start=1):
-        watch(f"{what}: view {number} of {len(items)}")
-        yield item
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

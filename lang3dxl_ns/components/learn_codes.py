@@ -15,8 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.reports import progress_bar
+from lang3dxl_ns.common.console import progress, say, tracked
 from lang3dxl_ns.components.feature_decoder import Decoder, Gathered
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
@@ -81,18 +80,17 @@ def learn_codes(
         channels += fine_basis.axes.shape[1]
 
     def targets():
-        for view in bar.track(views, total=count, description="gathering features"):
+        for view in tracked(views, "gathering features", count):
             maps = [view.clip if basis is None else basis.to(view.clip).coordinates(view.clip)]
             if fine_basis is not None and view.dense is not None:
                 maps.append(fine_basis.to(view.clip).coordinates(_unit(view.dense)))
             yield view.composite, Pixels.of(maps, view.size, view.mask)
 
-    with progress_bar() as bar:
-        learning = bar.add_task("learning codes", total=decoder.learning_steps(len(means)) or None)
-        features, mass = gather(len(means), targets(), channels, means)
-        if fine_basis is not None:
-            features = sharpen(features[:, :width], features[:, width:], mass)
-        codes = decoder.learn_gaussians(Gathered(features, mass, basis), lambda: bar.advance(learning))
+    features, mass = gather(len(means), targets(), channels, means)
+    if fine_basis is not None:
+        features = sharpen(features[:, :width], features[:, width:], mass)
+    with progress("learning codes", decoder.learning_steps(len(means))) as advance:
+        codes = decoder.learn_gaussians(Gathered(features, mass, basis), advance)
     if decoder.learned is not None:
         say(decoder.learned)
     # Many features are kept on the CPU, so codes that are features themselves come from there.

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_array, slugs
-from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.evaluation.annotations import PICTURES, check_shape, read_gray
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest_level
@@ -52,12 +52,11 @@ def score_predictions(
     keys = truth.labeled if photos is None else [_key(truth, photo) for photo in photos]
     keeps = {key: None if masks is None else _read_mask(masks, key) for key in keys}
     figures: dict[str, dict[str, float]] = {}
-    with progress_bar() as bar:
-        for key in bar.track(keys, description="scoring"):
-            size = truth.scoring_size(*truth.size(key))
-            truths = truth.truths(key, size)
-            found: Maps = {c: _read_map(maps, (c, folders[c]), key, size) for c in truths}
-            figures[key] = scorer.scores(key, scorer.variants(found, keeps[key], temperature), truths)
+    for key in tracked(keys, "scoring"):
+        size = truth.scoring_size(*truth.size(key))
+        truths = truth.truths(key, size)
+        found: Maps = {c: _read_map(maps, (c, folders[c]), key, size) for c in truths}
+        figures[key] = scorer.scores(key, scorer.variants(found, keeps[key], temperature), truths)
     masked = sum(keep is not None for keep in keeps.values())
     statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"
     protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import progress_bar
 from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.label_limit import Masks, lifted_labels
@@ -42,18 +42,17 @@ def score_scene(
     words = [scene.words.get(known_word(category)) for category in truth.categories]
     queries_shown = scorer.queries.taught(words)
     figures: dict[str, dict[str, float]] = {}
-    with progress_bar() as bar:
-        for photo in bar.track(photos, description="evaluating"):
-            width, height = photo.file_size
-            size, keep = truth.scoring_size(height, width), photo.foreground()
-            keep = None if keep is None else keep.to(scene.device)
-            raw, published = (
-                scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
-                for queries in (queries_shown, scorer.published_queries)
-            )
-            variants = scorer.variants(raw, keep, scene.engine.temperature, published)
-            truths = truths_of(truth, photo.photo(), map_size(raw))
-            figures[photo.name] = scorer.scores(photo.name, variants, truths)
+    for photo in tracked(photos, "evaluating"):
+        width, height = photo.file_size
+        size, keep = truth.scoring_size(height, width), photo.foreground()
+        keep = None if keep is None else keep.to(scene.device)
+        raw, published = (
+            scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
+            for queries in (queries_shown, scorer.published_queries)
+        )
+        variants = scorer.variants(raw, keep, scene.engine.temperature, published)
+        truths = truths_of(truth, photo.photo(), map_size(raw))
+        figures[photo.name] = scorer.scores(photo.name, variants, truths)
     masked = sum(photo.mask is not None for photo in photos)
     mask = f"predictions are 0 outside the foreground masks of {masked} of {len(photos)} photos"
     protocol = {

@@ -16,9 +16,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch import Tensor
 
-from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.console import some, tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import host_peak, progress_bar, synchronize
+from lang3dxl_ns.common.reports import host_peak, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
 from lang3dxl_ns.evaluation.half_image import PROTOCOL, HalfImageProtocol
@@ -127,19 +127,17 @@ class Evaluation:
             score = partial(self._score_words, scorer, self._label_limit(scorer, photos))
         views = self._data.test_views if split == "test" else None
         hidden = () if views is None or views.same_light else _COLORS_OF_LIGHT
-        with progress_bar() as bar:
-            shown = bar.track(photos, total=len(photos), description="evaluating")
-            for number, (camera, batch) in enumerate(shown):
-                photo = photos.dataset.photos[batch["image_idx"]]
-                if number == 0:  # warm-up, excluded from timing
-                    self._evaluate_photo(camera, batch, photo, score)
-                evaluated = self._evaluate_photo(camera, batch, photo, score)
-                for name in hidden:
-                    evaluated.metrics.pop(name, None)
-                if self._fits_looks(split):
-                    evaluated.images["fitted"], figures = self._half_image(camera, batch)
-                    evaluated.metrics = figures | evaluated.metrics
-                yield evaluated
+        for number, (camera, batch) in enumerate(tracked(photos, "evaluating", len(photos))):
+            photo = photos.dataset.photos[batch["image_idx"]]
+            if number == 0:  # warm-up, excluded from timing
+                self._evaluate_photo(camera, batch, photo, score)
+            evaluated = self._evaluate_photo(camera, batch, photo, score)
+            for name in hidden:
+                evaluated.metrics.pop(name, None)
+            if self._fits_looks(split):
+                evaluated.images["fitted"], figures = self._half_image(camera, batch)
+                evaluated.metrics = figures | evaluated.metrics
+            yield evaluated
         self._model.train()
 
     def _fits_looks(self, split: Split) -> bool:

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 
 import torch
 
-from lang3dxl_ns.common.console import progress, some
+from lang3dxl_ns.common.console import some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
@@ -84,11 +84,8 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
     names them all; with `skip`, they are logged, and their photos count whole. Raises UserError if all masks
     are black."""
     masked = [photo for photo in photos if photo.mask_path is not None]
-    with ThreadPoolExecutor(_READERS) as pool, progress("checking masks", len(masked)) as advance:
-        states = []
-        for state in pool.map(_state, masked):
-            states.append(state)
-            advance()
+    with ThreadPoolExecutor(_READERS) as pool:
+        states = list(tracked(pool.map(_state, masked), "checking masks", len(masked)))
     damaged = {p.name: state for p, state in zip(masked, states, strict=True) if isinstance(state, str)}
     black = [photo.name for photo, state in zip(masked, states, strict=True) if state is False]
     if damaged and not skip:
@@ -151,18 +148,16 @@ def _prompted(
         log(f"looking for {', '.join(config.foreground_prompts)} in {len(missing)} of {len(photos)} photos")
         segmenter, empty = load_text_segmenter(files, device), []
         store.remove_leftovers()
-        with progress("finding the foreground", len(missing)) as advance:
-            for photo, path, settings in missing:
-                advance()
-                try:
-                    image = photo.read_file(_LONGER_SIDE)
-                except UserError:
-                    continue  # reading it later reports the reason
-                mask = segmenter.segment(image, config.foreground_prompts)
-                if not mask.any():
-                    empty.append(photo.name)
-                    mask = torch.ones_like(mask)
-                store.write_bytes(path, mask_png(mask, settings), f"the mask of {photo.name}")
+        for photo, path, settings in tracked(missing, "finding the foreground"):
+            try:
+                image = photo.read_file(_LONGER_SIDE)
+            except UserError:
+                continue  # reading it later reports the reason
+            mask = segmenter.segment(image, config.foreground_prompts)
+            if not mask.any():
+                empty.append(photo.name)
+                mask = torch.ones_like(mask)
+            store.write_bytes(path, mask_png(mask, settings), f"the mask of {photo.name}")
         if empty:
             log(f"found nothing in {len(empty)} photos, which are used whole: {some(empty)}")
     return masked

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from lang3dxl_ns.common.console import progress, say, some
+from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation import workers
@@ -147,11 +147,10 @@ def prepare(
         maker = _Maker(config, store, regions, missing)
         store.remove_leftovers()
         maker.announce(len(tasks), str(device))
-        with progress("encoding photos", len(missing)) as advance:
-            for task, trouble in workers.run(config, maker, missing, str(device)):
-                if trouble:
-                    left_out[task.photo.name] = trouble
-                advance()
+        made = workers.run(config, maker, missing, str(device))
+        for task, trouble in tracked(made, "encoding photos", len(missing)):
+            if trouble:
+                left_out[task.photo.name] = trouble
     names = [task.photo.name for task in tasks if task.photo.name not in left_out]
     if not names:
         raise UserError("no photo can be prepared: " + ("; ".join(left_out.values()) or "the scene has none"))

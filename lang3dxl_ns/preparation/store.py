@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.common.console import progress
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.scene.photo import Photo
@@ -144,12 +144,12 @@ class FeatureStore:
                 return error, None
 
         hashes, found = {}, {}
-        with ThreadPoolExecutor(_READERS) as pool, progress("checking photos", len(photos)) as advance:
-            for photo, (result, recorded) in zip(photos, pool.map(look, photos), strict=True):
+        with ThreadPoolExecutor(_READERS) as pool:
+            looked = tracked(pool.map(look, photos), "checking photos", len(photos))
+            for photo, (result, recorded) in zip(photos, looked, strict=True):
                 hashes[photo.name] = result
                 if recorded:
                     found[photo.name] = recorded
-                advance()
         if any(known.get(name) != entry for name, entry in found.items()):
             with contextlib.suppress(OSError):  # a store that can't be written to can still be read
                 write_atomically(path, json.dumps({**known, **found}))

@@ -10,8 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.encoders import CLIP_OPTION, ImageTextEncoder
 from lang3dxl_ns.preparation.store import FeatureStore
 
 CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
@@ -93,18 +91,6 @@ class TargetReader:
     def regions(self, name: str) -> Int[Tensor, "h w"] | None:
         """Read the photo's region labels, −1 for none; None (no file is read) for one without regions."""
         return self._store.read(REGIONS, name)["labels"] if name in self._with_regions else None
-
-    def check(self, encoder: ImageTextEncoder) -> None:
-        """Raise UserError if a photo's target is missing or was made by another CLIP than `encoder`."""
-        for name in self.names:
-            width = self._store.shapes(self._clip_kind(name), name)["features"][-1]
-            made_with = self._store.settings(self._clip_kind(name), name)["encoder"]
-            if (width, made_with) != (encoder.dim, encoder.identity):
-                raise UserError(
-                    f"the target of {name} has {width} channels and was made with another CLIP ({made_with}) "
-                    f"than the one in use, which has {encoder.dim} ({encoder.identity}): run "
-                    f"`lang3dxl prepare` again, or give {CLIP_OPTION} the model that made the targets"
-                )
 
     def feature_statistics(
         self, names: Sequence[str] | None = None, with_dense: bool = True, sample: int = 100

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -151,8 +151,6 @@ class Found:
     """Share of unrelated words that match the scene as well, see `Match.doubt`."""
     threshold: float
     """Relevancy above which Gaussians match."""
-    closest: list[Viewpoint] = field(default_factory=list)
-    """Best-ranked training views, including views in which nothing matches."""
 
     def __repr__(self) -> str:
         best = f"best {self.views[0].name!r}" if self.views else "nothing matches"

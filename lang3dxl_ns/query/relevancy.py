@@ -77,9 +77,6 @@ class Queries:
         rows = [word.vector.to(self.vectors)[None] for word in learned.values()]
         return replace(self, vectors=torch.cat([self.vectors, *rows]), learned=learned)
 
-    def __len__(self) -> int:
-        return len(self.positive)
-
     def to(self, device: torch.device | str) -> Queries:
         """Return a copy on another device."""
         return replace(self, vectors=self.vectors.to(device))

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import watched
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
@@ -335,12 +335,11 @@ class Scene:
         found = []
         for row, prompt in enumerate(question.prompts):
             scores, threshold = question.relevancy[row], question.thresholds[row]
-            closest, box = self._ranked(question, row), None
-            if views := [view for view in closest if view.shown][:most]:
+            views, box = [view for view in self._ranked(question, row) if view.shown][:most], None
+            if views:
                 box = strongest_match(self.splats.means, scores, self.mass, threshold, self.gap)
             relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
-            answer = (views, box, relevancy, matching, question.doubts[row], threshold, closest[:most])
-            found.append(Found(prompt, *answer))
+            found.append(Found(prompt, views, box, relevancy, matching, question.doubts[row], threshold))
         return found
 
     def best_views(self, question: Question) -> list[str]:
@@ -411,8 +410,11 @@ class Scene:
             key = fingerprint(vars(self.splats.gaussians), [asdict(self.file), count, side])
             if (kept := load_visible(self.cache, key, cameras, self.device)) is not None:
                 return kept
-        shown = watched(cameras.items(), "measuring which Gaussians the photos show, once", self.watch)
-        views = {name: self._visible(name, camera) for name, camera in shown}
+        views, what = dict[str, VisibleGaussians](), "measuring which Gaussians the photos show, once"
+        for name, camera in tracked(cameras.items(), what):
+            if self.watch is not None:
+                self.watch(f"{what}: view {len(views) + 1} of {len(cameras)}")
+            views[name] = self._visible(name, camera)
         if self.cache is not None:
             save_visible(self.cache, views, key)
         return views

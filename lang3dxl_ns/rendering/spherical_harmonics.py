@@ -68,22 +68,3 @@ def spherical_harmonics(
         )
     basis = _basis(degree, F.normalize(directions, dim=1))
     return torch.einsum("nk,nkc->nc", basis, coefficients[:, :count])
-
-
-def rotated_harmonics(
-    coefficients: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]
-) -> Float[Tensor, "n k 3"]:
-    """Compute the coefficients of the same colors after the world has been turned by a rotation. Harmonics of
-    one degree mix only with each other. The turned function is therefore solved for, degree by degree, from
-    its values at a few directions."""
-    degree = math.isqrt(coefficients.shape[1]) - 1
-    generator = torch.Generator().manual_seed(0)
-    directions = F.normalize(torch.randn(32, 3, generator=generator, dtype=torch.float64), dim=1)
-    turn = rotation.double().cpu()
-    before, after = _basis(degree, directions @ turn), _basis(degree, directions)
-    parts = []
-    for band in range(degree + 1):
-        rows = slice(band**2, (band + 1) ** 2)
-        mixing = torch.linalg.lstsq(after[:, rows], before[:, rows]).solution.to(coefficients)
-        parts.append(torch.einsum("jk,nkc->njc", mixing, coefficients[:, rows]))
-    return torch.cat(parts, dim=1)

@@ -13,10 +13,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.rendering.gaussians import Gaussians
-from lang3dxl_ns.rendering.spherical_harmonics import BAND_0, rotated_harmonics, spherical_harmonics
-
-_TO_SCIPY, _FROM_SCIPY = [1, 2, 3, 0], [3, 0, 1, 2]
-"""Columns of quaternions w, x, y, z in scipy's order, and of scipy's in ours."""
+from lang3dxl_ns.rendering.spherical_harmonics import BAND_0, spherical_harmonics
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,10 +55,6 @@ class Splats:
         directions = self.means - to_device(center.to(self.means.dtype), self.means.device)
         return (spherical_harmonics(self.degree, directions, self.harmonics) + 0.5).clamp_min(0.0)
 
-    def with_colors(self, colors: Float[Tensor, "n 3"]) -> Splats:
-        """Return the same Gaussians in colors (0 and above) that do not depend on the viewing direction."""
-        return replace(self, harmonics=harmonics_of(colors))
-
     def to(self, device: torch.device | str) -> Splats:
         """Return the same Gaussians on a device."""
         return self._mapped(lambda tensor: tensor.to(device))
@@ -74,29 +67,6 @@ class Splats:
         """Return some of the Gaussians, chosen by a mask or by their indices (tensors or NumPy arrays)."""
         rows = torch.as_tensor(which, device=self.means.device)
         return self._mapped(lambda tensor: tensor[rows])
-
-    def transformed(self, similarity: Float[Tensor, "4 4"]) -> Splats:
-        """Transform the Gaussians to another frame by [[s·R, t], [0, 1]], with a rotation R, a scale s > 0
-        and a translation t. Raises ValueError for another matrix."""
-        from scipy.spatial.transform import Rotation
-
-        turned = similarity[:3, :3].double().cpu()
-        scale = float(turned.det().clamp_min(0) ** (1 / 3))
-        rotation = turned / max(scale, 1e-30)
-        if not torch.allclose(rotation @ rotation.T, torch.eye(3, dtype=rotation.dtype), atol=1e-3):
-            raise ValueError("the matrix is not a rotation, a uniform scale and a translation")
-        like = self.means
-        means = scale * (like @ rotation.T.to(like)) + similarity[:3, 3].to(like)
-        identity = self.quats.new_tensor([1.0, 0, 0, 0])
-        quats = torch.where(self.quats.norm(dim=1, keepdim=True) > 0, self.quats, identity).double().cpu()
-        turns = Rotation.from_matrix(rotation.numpy()) * Rotation.from_quat(quats[:, _TO_SCIPY].numpy())
-        return replace(
-            self,
-            means=means,
-            quats=torch.from_numpy(turns.as_quat()[:, _FROM_SCIPY]).to(self.quats),
-            scales=scale * self.scales,
-            harmonics=rotated_harmonics(self.harmonics, rotation),
-        )
 
     def sound(self) -> Bool[Tensor, " n"]:
         """Return which Gaussians have no NaN or infinite value."""

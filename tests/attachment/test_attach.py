@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from box_splat import box_splat
+from moved_splats import transformed, with_colors
 from scenes import write_scene
 
 from lang3dxl_ns.attachment import AttachConfig
@@ -40,7 +41,7 @@ def place(tmp_path_factory):
     write_scene(folder / "photos", size=(120, 90), photos=8, points=400)
     photos = read_collection(folder / "photos")
     frame = known_frames(photos.reconstruction, folder / "box.ply")["nerfstudio's, with z up"]
-    write_splats(folder / "box.ply", box_splat(0.1).transformed(torch.from_numpy(frame)))
+    write_splats(folder / "box.ply", transformed(box_splat(0.1), torch.from_numpy(frame)))
     attach(folder / "box.ply", folder / "photos", folder / "box.scene", SETTINGS)
     return folder
 
@@ -130,7 +131,7 @@ def test_a_segmenter_that_is_not_there_is_told_before_any_work(place, tmp_path):
 def test_photos_of_something_else_are_refused_with_a_picture(place):
     splats = read_splats(place / "box.ply")
     noise = torch.rand(len(splats), 3, generator=torch.Generator().manual_seed(0))
-    write_splats(place / "other.ply", splats.with_colors(noise))
+    write_splats(place / "other.ply", with_colors(splats, noise))
     with pytest.raises(UserError, match="don't show this splat"):
         attach(place / "other.ply", place / "photos", place / "other.scene", SETTINGS)
     assert (place / "other.frame.png").is_file()

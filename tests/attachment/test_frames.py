@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from box_splat import box_splat
+from moved_splats import transformed, with_colors
 from scenes import write_scene
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +24,7 @@ def collection(tmp_path_factory):
 
 
 def moved(similarity):
-    return box_splat().transformed(torch.from_numpy(similarity))
+    return transformed(box_splat(), torch.from_numpy(similarity))
 
 
 def similarity(turn=(0.3, -0.2, 0.5), scale=0.4, shift=(1.0, -2.0, 0.5)) -> np.ndarray:
@@ -108,7 +109,7 @@ def test_a_run_tells_its_frame(collection, tmp_path):
 def test_photos_of_something_else_fit_nowhere(collection, tmp_path):
     g = torch.Generator().manual_seed(0)
     other = box_splat()
-    other = other.with_colors(torch.rand(len(other), 3, generator=g))
+    other = with_colors(other, torch.rand(len(other), 3, generator=g))
     assert not find_frame(other, collection, tmp_path / "a.ply").fits
 
 

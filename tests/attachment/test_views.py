@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from box_splat import box_splat
+from moved_splats import transformed
 from scenes import CENTER, HALF_SIZES
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +24,7 @@ SPLATS = box_splat(0.1, ground=True)
 def turned(matrix: np.ndarray):
     whole = torch.eye(4, dtype=torch.float64)
     whole[:3, :3] = torch.from_numpy(matrix)
-    return SPLATS.transformed(whole)
+    return transformed(SPLATS, whole)
 
 
 @pytest.mark.parametrize("axis", range(6))

@@ -88,7 +88,7 @@ def test_a_scene_without_known_gaussians_doubts_everything():
 )
 def test_what_fits_nowhere_is_doubted_though_unrelated_words_fit_even_less(level, expected):
     nothing = Doubts(
-        lambda queries: torch.zeros(len(queries), GAUSSIANS),
+        lambda queries: torch.zeros(len(queries.positive), GAUSSIANS),
         lambda texts: Queries.of([torch.ones(1, 2)] * len(texts), torch.ones(1, 2)),
     )
     assert nothing.of(torch.full((1, GAUSSIANS), level)) == pytest.approx([expected])

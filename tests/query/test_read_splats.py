@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from moved_splats import with_colors
 from numpy.lib import recfunctions
 
 from lang3dxl_ns.common.errors import UserError
@@ -182,7 +183,7 @@ def test_a_checkpoint_that_holds_numpy_scalars_is_read(tmp_path):
 def test_a_splatfacto_of_one_color_per_gaussian_stores_logits_of_it(tmp_path):
     splats = some_splats(bands=1)
     colors = (splats.harmonics[:, 0] * 0.28209479 + 0.5).clamp(0.01, 0.99)
-    state = splatfacto_state(splats.with_colors(colors))
+    state = splatfacto_state(with_colors(splats, colors))
     state["pipeline"]["_model.gauss_params.features_dc"] = colors.logit()
     torch.save(state, tmp_path / "step-1.ckpt")
     torch.testing.assert_close(read_splats(tmp_path / "step-1.ckpt").colors(torch.zeros(3)), colors)

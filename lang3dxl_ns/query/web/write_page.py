@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, write_atomically
-from lang3dxl_ns.common.reports import watched
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.question import EVEN, SHARE
@@ -182,7 +182,7 @@ class Page:
 
     def _encoded(self, meaning: PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
         parts = [texts[row : row + _TEXTS] for row in range(0, len(texts), _TEXTS)]
-        for part in watched(parts, "encoding words", None) if len(parts) > 4 else parts:
+        for part in tracked(parts, "encoding words"):
             yield meaning.of_texts(self.scene.text.vectors(part).to(self.scene.device)).cpu()
 
     # ── what a live server adds ─────────────────────────────────────────────────────────────────────────
