@@ -205,6 +205,13 @@ def test_photos_whose_names_are_not_utf8_are_left_out_and_named(folder, capsys):
     assert "its name is not UTF-8" in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_placeholder_of_one_pixel_is_left_out_and_named(tmp_path, capsys):
+    folder = write_scene(tmp_path / "scene", photos=4, points=60, size=(40, 40))
+    Image.new("RGB", (1, 1)).save(folder / "images" / "photo_001.jpg")
+    assert set(used(folder)) == {"photo_000.jpg", "photo_002.jpg", "photo_003.jpg"}
+    assert "1 × 1 pixels, too few" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("name", [b"a\x1b[2J\r\n_.jpg", b"\x1b]0;title\x07.jpg"])
 def test_names_of_photos_can_not_command_the_terminal(folder, capsys, name):
     path = folder / "sparse" / "0" / "images.bin"
