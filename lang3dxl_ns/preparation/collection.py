@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,13 +51,14 @@ def plan_crops(
     """Choose crop sizes, which are configured or proposed from the scene. Crops have one size in the world,
     unless relative sizes are configured, the scene has no 3D points to measure with, or (under "auto") its
     photos are so similar in scale that one size in the photo is equivalent (`SCALE_RATIO`). Raises UserError
-    for physical sizes without 3D points."""
+    for physical sizes without 3D points, also where a configured range can be nothing else."""
     if config.scale_mode == "physical" and not len(reconstruction.points):
         raise UserError(
             "crops of physical size need 3D points, and the scene has none: reconstruct it with COLMAP, or "
             "pass --pipeline.datamanager.scale-mode auto"
         )
     if config.scale_mode == "relative" or not len(reconstruction.points):
+        replace(config, scale_mode="relative").check()  # a configured range may be meant in world units
         scales = _resampled(relative_scales(7, *(config.scale_range or ())), config)
         reasons = [f"crops of {_listed(scales)} of the photo's width"]
         if config.scale_mode != "relative":

@@ -101,6 +101,14 @@ def test_a_number_of_crop_sizes_divides_the_same_range_evenly(scene):
         PreparationConfig(scales=0).check()
 
 
+def test_a_range_in_the_world_is_refused_without_points_to_measure_it_by(scene):
+    photos, reconstruction = collection(scene)
+    no_points = replace(reconstruction, points=reconstruction.points[:0])
+    assert plan_crops(photos, no_points, PreparationConfig(scale_range=(0.1, 0.6))).scales[-1] == 0.6
+    with pytest.raises(UserError, match="a relative crop is at most 1 photo wide"):
+        plan_crops(photos, no_points, PreparationConfig(scale_range=(0.5, 12.0)))
+
+
 def seen_from_afar(reconstruction):
     """The reconstruction with all cameras so far away, at one angle, that every photo is as wide."""
     photos = {}
