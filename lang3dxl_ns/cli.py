@@ -73,8 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
             sys.stdout.flush()
     except UserError as error:
         # Messages name the options of ns-train; these commands have the same ones without the prefix.
-        prefix = "--pipeline.datamanager." if words[0] in ("prepare", "needs") else "--"
-        sys.exit(f"Error: {str(error).replace(prefix, '--')}")
+        sys.exit(f"Error: {str(error).replace('--pipeline.datamanager.', '--')}")
     except BrokenPipeError:  # the reader closed the pipe, as in `lang3dxl … | head`
         _leave_output()
         sys.exit(1)

@@ -68,6 +68,8 @@ def attach(
     with stages.stage("splat"):
         path = find_splats(splat)
         splats = read_splats(path).to(worker)
+        if not float((splats.means - splats.means.median(0).values).abs().median()):
+            raise UserError(f"the Gaussians of {path} lie in one place: export the splat again")
         say(f"{path}: {splats}")
     with stages.stage("frame"):
         if data is None:

@@ -77,6 +77,8 @@ class Query:
     def main(self) -> None:
         if self.coco is not None and not self.all:
             raise UserError("--coco labels all photos: give --all too")
+        if self.coco is not None and (self.coco.suffix != ".json" or self.coco.is_dir()):
+            raise UserError(f"--coco writes labels as JSON: {self.coco} is not the name of a .json file")
         if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
             raise UserError("--image, --all and --camera-path exclude each other: give one of them")
         prompts = parse_texts(self.text, self.not_)  # fail now rather than after the work

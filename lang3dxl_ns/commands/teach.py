@@ -41,13 +41,15 @@ class Teach:
     """Point on something else: X,Y. Repeat the flag for more."""
 
     def main(self) -> None:
-        from lang3dxl_ns.query.scene_file import keep_words
+        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words
         from lang3dxl_ns.query.teach import known_word
 
         (scene, file), name = opened(self.scene), known_word(self.word)
         before = scene.words[name].examples if name in scene.words else ()
         taught = scene.teach(self.word, [*before, self._example()])
-        keep_words(file, taught.words.values())
+        # Another command may have taught the file a word meanwhile.
+        others = [w for w in describe_scene_file(file)["taught"] if known_word(w.name) != name]
+        keep_words(file, [*others, taught.words[name]])
         say(*described(taught.words[name]))
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
 
@@ -115,7 +117,7 @@ def forgotten(scene: Scene, which: str) -> Scene:
     from lang3dxl_ns.query.teach import known_word
 
     name, _, number = which.rpartition("/")
-    if not number.isdecimal():
+    if known_word(which) in scene.words or not number.isdecimal():
         name, number = which, ""
     word = scene.words.get(known_word(name))
     if word is None or (number and not 1 <= int(number) <= len(word.examples)):
@@ -141,9 +143,10 @@ def described(word: TaughtWord) -> list[str]:
 
 
 def _marks(example: Example) -> str:
-    counts = {"point": len(example.points), "point elsewhere": len(example.not_points)}
+    counts = {"": len(example.points), " elsewhere": len(example.not_points)}
     marked = "outline" if example.mask is not None else "box" if example.box is not None else ""
-    return ", ".join(filter(None, [marked, *(f"{count} {what}" for what, count in counts.items() if count)]))
+    points = (f"{n} point{'s' if n > 1 else ''}{where}" for where, n in counts.items() if n)
+    return ", ".join(filter(None, [marked, *points]))
 
 
 def _numbers(text: str, count: int, usage: str) -> tuple[float, ...]:

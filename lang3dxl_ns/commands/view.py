@@ -68,4 +68,4 @@ class Info:
             "words": words,
             "size": f"{told['bytes'] / 1e6:.2f} MB, {told['bytes'] / max(count, 1):.0f} bytes a Gaussian",
         }
-        say(*(f"{name:10} {value}" for name, value in lines.items() if value))
+        say(*(f"{name:10} {' '.join(str(value).split())}" for name, value in lines.items() if value))

@@ -46,7 +46,12 @@ class PhotoDataset(InputDataset):
         return data
 
     def get_data(self, image_idx: int, image_type: str = "float32") -> dict:
-        data = self.read(image_idx)
+        try:
+            data = self.read(image_idx)
+        except UserError as reason:  # ns-render draws what the camera sees, with or without its photo
+            CONSOLE.log(escape(f"{self.photos[image_idx].name} is shown black: {reason}"))
+            lens = self.photos[image_idx].lens.scaled(self.scale)
+            data = {"image": torch.zeros(lens.height, lens.width, 3, dtype=torch.uint8)}
         if image_type == "float32":
             data["image"] = data["image"].float() / 255
         return {"image_idx": image_idx, **data}

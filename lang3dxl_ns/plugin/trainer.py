@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from time import perf_counter
 from types import FrameType
 from typing import Any, Literal
@@ -72,6 +73,17 @@ def _disk_kept_out_of_training() -> Iterator[None]:
         yield
     finally:
         writer.write_out_storage = write
+
+
+def requested_checkpoint(config: Any) -> Path | None:
+    """Find the checkpoint that a run's settings resume. Raises UserError if it doesn't exist."""
+    folder, path = config.load_dir, config.load_checkpoint
+    if folder is not None:
+        step = "*" if config.load_step is None else f"{config.load_step:09d}"
+        path = max(folder.glob(f"step-{step}.ckpt"), default=folder / f"step-{step}.ckpt")
+    if path is not None and not path.is_file():
+        raise UserError(f"there is no checkpoint {path}: pass the folder nerfstudio_models of a run")
+    return path
 
 
 class Lang3DXLTrainer(Trainer):
@@ -148,14 +160,8 @@ class Lang3DXLTrainer(Trainer):
     def _load_checkpoint(self) -> None:
         """Load the requested checkpoint, if any, as nerfstudio does, but keep the run state until everything
         is set up. Raises UserError if it doesn't exist, is damaged, or is another file."""
-        folder, path = self.config.load_dir, self.config.load_checkpoint
-        if folder is not None:
-            step = "*" if self.config.load_step is None else f"{self.config.load_step:09d}"
-            path = max(folder.glob(f"step-{step}.ckpt"), default=folder / f"step-{step}.ckpt")
-        if path is None:
+        if (path := requested_checkpoint(self.config)) is None:
             return
-        if not path.is_file():
-            raise UserError(f"there is no checkpoint {path}: pass the folder nerfstudio_models of a run")
         check_checkpoint(path)
         state = read_checkpoint(path)
         try:
@@ -199,7 +205,8 @@ class Lang3DXLTrainer(Trainer):
     def is_finished(self) -> bool:
         """Whether the loaded checkpoint has all iterations, and the words if they are learned after them."""
         words = self.words_are_learned or not self.pipeline.has_words_to_learn
-        return self._start_step >= self.config.max_num_iterations and words
+        beyond = self._start_step - self.config.max_num_iterations
+        return beyond > 0 or (beyond == 0 and words)
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run), then
@@ -221,6 +228,7 @@ class Lang3DXLTrainer(Trainer):
             self.words_are_learned = False  # the checkpoint's words will be out of date
         try:
             self._announce_time()
+            writer.GLOBAL_BUFFER.setdefault("step", self.step)  # the end reads it, also without any step
             self.stages.begin("train")
             with self._stoppable(), _disk_kept_out_of_training():
                 super().train()

@@ -24,7 +24,7 @@ from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, check
 from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
-from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer
+from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer, requested_checkpoint
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.query.run_checkpoint import check_checkpoint, latest_checkpoint
@@ -83,6 +83,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             check_address(self.viewer.websocket_host, self.viewer.websocket_port)
         fresh = self.timestamp == "{timestamp}"
         if fresh:  # a run's config.yml contains resolved values
+            requested_checkpoint(self)
             check_inert(self.pipeline.model, self.pipeline.datamanager)
         super().set_timestamp()
         self.fit_to_run()

@@ -13,6 +13,7 @@ import torch
 from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import load_preset
+from lang3dxl_ns.preparation.model_files import spoken
 from lang3dxl_ns.preparation.physical_scale import (
     ScaleRange,
     physical_scales,
@@ -68,7 +69,8 @@ def plan_crops(
     chosen = _scale_range(config, reconstruction, sizes)
     scales = _resampled(physical_scales(chosen.smallest, chosen.largest), config)
     reasons = [
-        f"{chosen.reason}; crop sides: {_listed(scales)} (--pipeline.datamanager.scale-range overrides)"
+        f"{chosen.reason}; crop sides: {_listed(scales)} "
+        f"({spoken('--pipeline.datamanager.scale-range')} overrides)"
     ]
     if untracked:
         reasons.append(

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +16,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.dense_map import mean_of_sizes
 from lang3dxl_ns.preparation.families import (
@@ -229,8 +228,6 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
     from transformers import AutoModel
 
     files = find_model(name_or_dir, CLIP_OPTION)
-    if files.name == BUILTIN:
-        _say_what_builtin_knows()
     _family(files)
     model = load_weights(AutoModel, files, device)
     processor = _image_processor(files)
@@ -294,14 +291,6 @@ def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, toke
             f'{spoken(files.option)} a vision transformer such as facebook/dinov2-small, or "none"'
         )
     return DenseEncoder(model, tokens, files.identity)
-
-
-@lru_cache(maxsize=1)  # log once
-def _say_what_builtin_knows() -> None:
-    say(
-        "The built-in CLIP knows landmarks and street façades and nothing else; a real one knows more: "
-        f"{spoken(CLIP_OPTION)} openai/clip-vit-base-patch32"
-    )
 
 
 def in_known_light(photo: Float[Tensor, "h w 3"], brightness: float) -> Float[Tensor, "h w 3"]:

@@ -146,6 +146,11 @@ def prepare(
     if missing:
         maker = _Maker(config, store, regions, missing)
         store.remove_leftovers()
+        if config.clip == BUILTIN:
+            say(
+                "The built-in CLIP knows landmarks and street façades and nothing else; a real one knows "
+                f"more: {spoken(CLIP_OPTION)} openai/clip-vit-base-patch32"
+            )
         maker.announce(len(tasks), str(device))
         made = workers.run(config, maker, missing, str(device))
         for task, trouble in tracked(made, "encoding photos", len(missing)):

@@ -108,7 +108,9 @@ def learn(
     # Each photo is judged by a word that the others teach.
     judges = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))] if len(photos) > 1 else [word]
     judged = zip(photos, judges, strict=True)
-    precision = {photo.name: photo.precision(judge.margins(sample, text)) for photo, judge in judged}
+    precision = {  # where a click is all that is known, the rest of the thing would count as an error
+        photo.name: photo.precision(judge.margins(sample, text)) for photo, judge in judged if photo.complete
+    }
     doubt = fmean(1 - photo.separation(word.margins(sample, text)) for photo in photos)
     return replace(word, doubt=doubt, precision=precision, examples=tuple(examples))
 

@@ -33,9 +33,9 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, overview
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
-from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, searched, texts_of
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, texts_of
 from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
-from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, searched, shipped_vocabulary
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.render import Rendering, composite
@@ -528,9 +528,12 @@ class Scene:
             selection: the Gaussians that are the word, if known; default: those that the marks show.
 
         Raises:
-            UserError: the marks show nothing or everything, or lie outside their photos.
+            UserError: the marks show nothing or everything, or lie outside their photos; or a prompt of this
+                word would mean something else.
         """
-        (prompt,) = parse_prompts(f'"{word}"')
+        prompt, *more = parse_prompts(word)
+        if more or known_word(prompt.text) != known_word(word):
+            raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")
         listed = [examples] if isinstance(examples, Example) else list(examples)
         photos = [self.file.photo(example.photo) for example in listed]
         pairs = zip(listed, photos, strict=True)

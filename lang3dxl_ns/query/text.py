@@ -19,7 +19,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.teach import TaughtWord
-from lang3dxl_ns.query.vocabulary import NEGATIVES, competitors, synonyms_of
+from lang3dxl_ns.query.vocabulary import NEGATIVES, competitors, searched, synonyms_of
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
@@ -93,21 +93,11 @@ def tidy(text: str) -> str:
 
 # ── what CLIP can't tell ────────────────────────────────────────────────────────────────────────────────
 
-_PLACES = "left|right|front|back|rear|top|bottom|upper|lower|middle|central|nearest|farthest|first|last"
-_SIZES = "main|big|large|huge|small|tiny|biggest|largest|smallest"
 _COLORS = "red|orange|yellow|green|blue|purple|pink|brown|black|white|gray|grey|golden"
-_WHERE = re.compile(
-    rf"\s+(?:on|at|in|to|of|from|above|below|under|beside|behind|near)\s+(?:the\s+)?(?:{_PLACES})\b.*$"
-    rf"|^(?:(?:the|a)\s+)?(?:{_PLACES}|{_SIZES})\s+(?!of\b)(?=\S)",
-    re.IGNORECASE,
-)
 _COLOR = re.compile(rf"\b(?:{_COLORS})\b(?=\s+\S)", re.IGNORECASE)
+_MOST_WORDS = 50
+"""Number of words that fit CLIP's 77 tokens."""
 _NO_NAME = re.compile(r"an?|the|and|or|of|in|on|at|to|it|is|are|this|that|these|those|what|where|\d+")
-
-
-def searched(text: str) -> str:
-    """Remove words that select by place or size: *windows on the left tower* becomes *windows*."""
-    return _WHERE.sub("", text).strip() or text
 
 
 def caution(text: str) -> str | None:
@@ -117,6 +107,8 @@ def caution(text: str) -> str | None:
         return f"{text} names nothing that can be seen: what follows is chance"
     if (found := searched(text)) != text:
         return f"places and sizes are not told apart: {found} is searched for everywhere"
+    if len(text.split()) > _MOST_WORDS:
+        return f"CLIP reads about {_MOST_WORDS} words: the rest of this prompt is ignored"
     if color := _COLOR.search(text):
         return f"colors are hardly told apart: {color[0]} is likely to be ignored"
     return None

@@ -99,8 +99,20 @@ _COMMON = (
     "fence", "sign", "lamp", "bench", "flag", "water", "mountain", "flower",
 )  # fmt: skip
 """Things around buildings that the table of architectural terms doesn't list."""
+_PLACES = "left|right|front|back|rear|top|bottom|upper|lower|middle|central|nearest|farthest|first|last"
+_SIZES = "main|big|large|huge|small|tiny|biggest|largest|smallest"
+_WHERE = re.compile(
+    rf"\s+(?:on|at|in|to|of|from|above|below|under|beside|behind|near)\s+(?:the\s+)?(?:{_PLACES})\b.*$"
+    rf"|^(?:(?:the|a)\s+)?(?:{_PLACES}|{_SIZES})\s+(?!of\b)(?=\S)",
+    re.IGNORECASE,
+)
 _WHOLE = re.compile(r"(?P<end>[a-z]{3,})</w>|[▁Ġ](?P<start>[a-z]{3,})")
 """Pattern of tokens that are whole words: CLIP's tables mark their end, others mark their start."""
+
+
+def searched(text: str) -> str:
+    """Remove words that select by place or size: *windows on the left tower* becomes *windows*."""
+    return _WHERE.sub("", text).strip() or text
 
 
 @cache
@@ -112,11 +124,12 @@ def shipped_vocabulary() -> tuple[str, ...]:
 
 
 def common_words() -> tuple[str, ...]:
-    """Return the words that a scene file can search for without its CLIP: the shipped vocabulary, its single
-    words in the plural too, and the phrases that every query needs."""
+    """Return the words that a scene file can search for without its CLIP: the shipped vocabulary, also as it
+    is searched for, its single words in the plural too, and the phrases that every query needs."""
     words = shipped_vocabulary()
     plurals = [_plural(word) for word in words if " " not in word]
-    return tuple(dict.fromkeys([*NEGATIVES, *CANONICAL, *UNRELATED, *words, *plurals]))
+    needed = [*NEGATIVES, *CANONICAL, *UNRELATED]
+    return tuple(dict.fromkeys([*needed, *words, *map(searched, words), *plurals]))
 
 
 def _plural(word: str) -> str:

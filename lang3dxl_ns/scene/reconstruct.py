@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded, write_atomically
@@ -101,6 +102,7 @@ def reconstruct_scene(
 ) -> tuple[Path, Path]:
     """Reconstruct a folder of photos or a video, and return the scene's folder and model: sparse/0 in it or,
     if sparse is taken or the folder is read-only, in the cache. Raises UserError as `reconstruct` does."""
+    check_numbers(settings or ReconstructionSettings(), {"max_size": (100, 1e5), "features": (100, 1e6)})
     data = expanded(data).absolute()
     if is_video(data):
         data = extract_frames(data)

@@ -103,6 +103,15 @@ def test_without_photos_the_splat_is_its_own(place):
     assert float(scene.codes.isfinite().all(1).float().mean()) > 0.5
 
 
+def test_a_splat_in_one_place_is_refused(tmp_path):
+    splats = box_splat(0.1)
+    write_splats(
+        tmp_path / "one.ply", replace(splats, means=splats.means[:1].expand_as(splats.means).clone())
+    )
+    with pytest.raises(UserError, match="lie in one place"):
+        attach(tmp_path / "one.ply", None, tmp_path / "one.scene", SETTINGS)
+
+
 class Upper:
     """A segmenter that finds the upper half of every picture."""
 

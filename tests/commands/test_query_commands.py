@@ -23,6 +23,15 @@ def run(monkeypatch):
     return lambda *words: cli.main([str(word) for word in words])
 
 
+@pytest.mark.parametrize("name", ["wall.scene", "labels", "folder.json"])
+def test_labels_are_written_to_a_json_file_alone(run, tmp_path, name):
+    (tmp_path / "wall.scene").write_text("a scene")
+    (tmp_path / "folder.json").mkdir()
+    with pytest.raises(SystemExit, match=r"is not the name of a \.json file"):
+        run("query", "c", "--text", "dome", "--all", "--out", tmp_path / "o", "--coco", tmp_path / name)
+    assert (tmp_path / "wall.scene").read_text() == "a scene" and not (tmp_path / "o").exists()
+
+
 def test_query_writes_pictures_map_and_report(run, tmp_path, capsys):
     words = ("query", "c", "--text", 'dome not "window"', "--text", "window;oculus")
     run(*words, "--image", "all/0003.jpg", "--out", tmp_path)

@@ -12,8 +12,9 @@ from PIL import Image
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands.query import CocoLabels
+from lang3dxl_ns.commands.teach import Teach
 from lang3dxl_ns.query.scene_file import read_scene, write_scene
-from lang3dxl_ns.query.teach import mask_of, run_lengths
+from lang3dxl_ns.query.teach import Example, mask_of, run_lengths
 
 DOME = "61,61,77,77"
 """Box of the dome in all/0003.jpg, a little large."""
@@ -155,6 +156,38 @@ def test_wrong_marks_are_one_sentence_and_leave_the_file(place, flags, message):
     with pytest.raises(SystemExit, match=message):
         teach(place, *flags)
     assert place.read_bytes() == before
+
+
+def test_a_word_with_a_slash_and_a_number_can_be_forgotten(place):
+    main(["teach", str(place), "--word", "doors/2", "--photo", "0003.jpg", "--box", DOME])
+    main(["words", str(place), "--forget", "doors/2"])
+    assert not words(place)
+
+
+def test_a_word_taught_meanwhile_is_kept(place, monkeypatch):
+    def slow(self):
+        monkeypatch.undo()
+        monkeypatch.setattr("lang3dxl_ns.query.scene.text_encoder", lambda file, device: encode_texts)
+        main(["teach", str(place), "--word", "other", "--photo", "0003.jpg", "--box", DOME])
+        return Example("0003.jpg", box=(61, 61, 77, 77))
+
+    monkeypatch.setattr(Teach, "_example", slow)
+    teach(place)
+    assert words(place).keys() == {"gizmo", "other"}
+
+
+@pytest.mark.parametrize("name", ['"a" not "b"', "a;b", "“dome”", " ; "])
+def test_a_name_that_no_prompt_means_is_refused_before_anything_is_written(place, name):
+    before = place.read_bytes()
+    with pytest.raises(SystemExit, match=r"no prompt means|the prompt is empty"):
+        main(["teach", str(place), "--word", name, "--photo", "0003.jpg", "--box", DOME])
+    assert place.read_bytes() == before
+
+
+def test_clicks_have_no_average_precision(place, capsys):
+    teach(place, "--at", "69,69", "--at", "68,70")
+    said = capsys.readouterr().out
+    assert "2 points in" in said and "average precision" not in said
 
 
 def test_forgetting_what_was_not_taught_is_one_sentence(place):

@@ -87,8 +87,12 @@ def test_truncated_photo_does_not_end_the_run(start, folder, capsys, semantics):
     photo.write_bytes(photo.read_bytes()[:-400])
     trainer = start(folder, semantics, iterations=24)
     assert photo.name in capsys.readouterr().out
-    index = [p.name for p in trainer.pipeline.datamanager.train_dataset.photos].index(photo.name)
+    dataset = trainer.pipeline.datamanager.train_dataset
+    index = [p.name for p in dataset.photos].index(photo.name)
     assert trainer.pipeline.datamanager._left_out == {index}
+    camera = dataset.cameras[index]  # ns-render draws its view
+    assert dataset.get_data(index)["image"].shape == (int(camera.height), int(camera.width), 3)
+    assert f"{photo.name} is shown black" in " ".join(capsys.readouterr().out.split())
 
 
 def test_truncated_held_out_photo_does_not_end_the_evaluation(start, folder, capsys):

@@ -1,6 +1,7 @@
 """Learning words after the last iteration loses nothing: it is saved before, stopped cleanly, and resumed."""
 
 import signal
+import sys
 
 import pytest
 import torch
@@ -42,6 +43,7 @@ def test_a_run_that_dies_while_it_learns_words_resumes_with_words_only(trained, 
     assert not before["words"] and "_model.gauss_params.codes" not in before["pipeline"]
     monkeypatch.setattr(Lang3DXLPipeline, "learn_words", learn)
     monkeypatch.setattr(Lang3DXLTrainer, "train_iteration", lambda *_: pytest.fail("trained again"))
+    monkeypatch.delitem(sys.modules["nerfstudio.utils.writer"].GLOBAL_BUFFER, "step")  # as in a new process
     run(load_dir=folders[0])
     after = saved(folders[1])
     assert after["words"] and "_model.gauss_params.codes" in after["pipeline"]
@@ -50,6 +52,13 @@ def test_a_run_that_dies_while_it_learns_words_resumes_with_words_only(trained, 
         assert torch.equal(before["pipeline"][key], after["pipeline"][key])
     with pytest.raises(UserError, match="max-num-iterations"):
         run(load_dir=folders[1])
+
+
+def test_a_run_of_fewer_iterations_than_its_checkpoint_is_refused(trained, train, scene):
+    run, folders = trained
+    run(semantics=False)
+    with pytest.raises(UserError, match=f"already has {STEPS} iterations, and the run has {STEPS - 1}"):
+        train(scene, iterations=STEPS - 1, load_dir=folders[0], semantics=False)
 
 
 def test_words_of_a_run_that_is_prolonged_are_learned_anew(trained, train, scene, monkeypatch):

@@ -10,9 +10,24 @@ from lang3dxl_ns.query.text import (
     TextEncoder,
     caution,
     parse_prompts,
-    searched,
 )
-from lang3dxl_ns.query.vocabulary import synonym_table, synonyms_of
+from lang3dxl_ns.query.vocabulary import (
+    common_words,
+    searched,
+    shipped_vocabulary,
+    synonym_table,
+    synonyms_of,
+)
+
+
+def test_a_scene_file_knows_what_its_words_are_searched_as():
+    """The page asks for all of them, and has to be written without the CLIP too."""
+    assert {searched(word) for word in shipped_vocabulary()} <= set(common_words())
+
+
+def test_a_prompt_longer_than_clip_reads_is_said_to_be():
+    assert "the rest of this prompt is ignored" in caution("sky " * 60 + "rose window")
+    assert caution("a tower with four clocks and a bell") is None
 
 
 @pytest.mark.parametrize(

@@ -452,6 +452,15 @@ def test_at_the_width_of_a_phone_everything_is_in_reach(browser, address):
     page.close()
 
 
+def test_a_page_of_other_people_is_not_replaced(scene, tmp_path):
+    (tmp_path / "index.html").write_text("mine")
+    with pytest.raises(UserError, match=r"index\.html of another page"):
+        write_page(Page(scene), tmp_path)
+    assert (tmp_path / "index.html").read_text() == "mine"
+    for _ in range(2):  # the second over its own
+        write_page(Page(scene), tmp_path / "page")
+
+
 @pytest.mark.slow
 def test_from_a_folder_it_says_what_it_needs(browser, scene, tmp_path):
     write_page(Page(scene), tmp_path)

@@ -16,6 +16,7 @@ from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
+from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +222,12 @@ def test_what_makes_no_scene_is_told_in_words(tmp_path, count, paint, message):
     with pytest.raises(UserError, match=message):
         reconstruct_scene(picture(tmp_path / "data", count, paint))
     assert not (tmp_path / "data" / "sparse").exists()
+
+
+@pytest.mark.parametrize("changes", [{"max_size": 5}, {"features": 0}])
+def test_sizes_that_crash_colmap_are_refused(tmp_path, changes):
+    with pytest.raises(UserError, match="give a number from 100"):
+        reconstruct_scene(tmp_path, None, ReconstructionSettings(**changes))
 
 
 def test_a_still_camera_is_told_from_a_walk(photos, tmp_path):

@@ -216,8 +216,11 @@ def _distinct(phrases: Sequence[str]) -> list[str]:
 
 
 def write_page(page: Page, folder: Path) -> int:
-    """Write a page's files into a folder for any static web server; return the number of bytes."""
+    """Write a page's files into a folder for any static web server; return the number of bytes. Raises
+    UserError for a folder with the index.html of another page."""
     make_folder(folder)
+    if (folder / "index.html").exists() and not (folder / "scene.json").exists():
+        raise UserError(f"{folder} holds the index.html of another page: name a folder of its own")
     files = page.files()
     for name, content in files.items():
         write_atomically(folder / name, content)
