@@ -30,6 +30,8 @@ from lang3dxl_ns.rendering.splats import Splats
 
 _LIGHT = 0.15
 """Deviation of the photos' brightness (natural logarithm) above which a message reports it."""
+_SMALLEST = 1e-3
+"""Size of a splat in its units, below which it lies before the near plane of every camera that shows it."""
 _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
 
 
@@ -68,8 +70,12 @@ def attach(
     with stages.stage("splat"):
         path = find_splats(splat)
         splats = read_splats(path).to(worker)
-        if not float((splats.means - splats.means.median(0).values).abs().median()):
-            raise UserError(f"the Gaussians of {path} lie in one place: export the splat again")
+        spread = float((splats.means - splats.means.median(0).values).norm(dim=1).median())
+        if spread < _SMALLEST:
+            raise UserError(
+                f"half of the Gaussians of {path} lie within {spread:.1g} units of one place, too close to be "
+                "seen: export the splat again, larger"
+            )
         say(f"{path}: {splats}")
     with stages.stage("frame"):
         if data is None:

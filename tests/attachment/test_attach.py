@@ -108,7 +108,7 @@ def test_a_splat_in_one_place_is_refused(tmp_path):
     write_splats(
         tmp_path / "one.ply", replace(splats, means=splats.means[:1].expand_as(splats.means).clone())
     )
-    with pytest.raises(UserError, match="lie in one place"):
+    with pytest.raises(UserError, match="lie within 0 units of one place"):
         attach(tmp_path / "one.ply", None, tmp_path / "one.scene", SETTINGS)
 
 
