@@ -76,10 +76,10 @@ def parse_prompts(typed: str) -> list[Prompt]:
 def _parse_prompt(part: str) -> Prompt:
     negatives = [tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
     text = tidy(_NEGATIVES.sub(" ", part))
-    if found := re.fullmatch(r"(.+) not (.+)", text, re.IGNORECASE):
+    if found := re.fullmatch(r"(.+) not(?: (.+))?", text, re.IGNORECASE):
         say(
             f"{text} is searched for as it stands. To tell one thing from another: "
-            f'"{found[1]}" not "{found[2]}"'
+            f'"{found[1]}" not "{found[2] or "…"}"'
         )
     if not text:
         raise UserError(f"{part.strip()!r} has only negatives: put what to find first")
