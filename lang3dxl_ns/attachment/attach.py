@@ -73,8 +73,8 @@ def attach(
         spread = float((splats.means - splats.means.median(0).values).norm(dim=1).median())
         if spread < _SMALLEST:
             raise UserError(
-                f"half of the Gaussians of {path} lie within {spread:.1g} units of one place, too close to be "
-                "seen: export the splat again, larger"
+                f"half of the Gaussians of {path} lie within {spread:.1g} units of one place, too close to "
+                "be seen: export the splat again, larger"
             )
         say(f"{path}: {splats}")
     with stages.stage("frame"):

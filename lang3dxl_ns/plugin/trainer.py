@@ -57,8 +57,12 @@ class _Stopped(BaseException):
 @contextmanager
 def _disk_kept_out_of_training() -> Iterator[None]:
     """Let training continue if its log (tensorboard's events) can't be written, as on a full disk.
-    tensorboard's own thread keeps such an error, and raises it in the step that adds to the log."""
-    write = writer.write_out_storage
+    tensorboard's own thread prints such an error, keeps it, and raises it in the step that next logs."""
+    write, ends_badly = writer.write_out_storage, threading.excepthook
+
+    def told_once(thread: threading.ExceptHookArgs) -> None:
+        if not isinstance(thread.exc_value, OSError):
+            ends_badly(thread)
 
     def guarded() -> None:
         try:
@@ -68,11 +72,11 @@ def _disk_kept_out_of_training() -> Iterator[None]:
             CONSOLE.log(escape(f"The log can't be written ({error}). Training continues without it."))
             write()
 
-    writer.write_out_storage = guarded
+    writer.write_out_storage, threading.excepthook = guarded, told_once
     try:
         yield
     finally:
-        writer.write_out_storage = write
+        writer.write_out_storage, threading.excepthook = write, ends_badly
 
 
 def requested_checkpoint(config: Any) -> Path | None:

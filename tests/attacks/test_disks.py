@@ -17,7 +17,7 @@ from lang3dxl_ns.common import files
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import slugs
 from lang3dxl_ns.open_scene import load_scene
-from lang3dxl_ns.plugin.trainer import writer
+from lang3dxl_ns.plugin.trainer import _disk_kept_out_of_training, writer
 from lang3dxl_ns.preparation import workers
 from lang3dxl_ns.preparation.prepare import _gigabytes
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -74,6 +74,19 @@ def test_a_log_that_can_not_be_written_does_not_end_training(train, scene, monke
     assert trainer.step == 2 and list(trainer.checkpoint_dir.glob("*.ckpt"))
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("The log can't be written") == 1 and "lang3dxl view" in said
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_the_logs_own_thread_does_not_print_the_error_again(monkeypatch, capsys):
+    monkeypatch.setattr(threading, "excepthook", threading.__excepthook__)
+    with _disk_kept_out_of_training():
+        for raised in (refuse(errno.ENOSPC), lambda: 1 / 0):
+            thread = threading.Thread(target=raised)
+            thread.start()
+            thread.join()
+    said = capsys.readouterr().err
+    assert "No space left" not in said and "ZeroDivisionError" in said
+    assert threading.excepthook is threading.__excepthook__
 
 
 def test_a_run_that_could_not_begin_leaves_no_folder(train, tmp_path):
