@@ -106,9 +106,9 @@ def crop_sides(
     scales: Sequence[float], pixel_size: float, width: int, smallest: float = SMALLEST_CROP
 ) -> list[int]:
     """Convert scales to crop sides in pixels of a photo of `width` pixels, ascending. Sides are clipped to
-    `smallest` … `width` pixels. Duplicates are dropped, so a photo can have fewer sides than there are
-    scales. For relative scales, the pixel size is 1 / width."""
-    sides = (min(max(scale / pixel_size, smallest), width) for scale in sorted(scales))
+    `smallest` … `width` pixels, and 2 at least. Duplicates are dropped, so a photo can have fewer sides than
+    there are scales. For relative scales, the pixel size is 1 / width."""
+    sides = (min(max(scale / pixel_size, smallest), max(width, 2)) for scale in sorted(scales))
     return list(dict.fromkeys(math.floor(side + 1e-6) for side in sides))  # 0.47 / 0.01 is 46.99…
 
 

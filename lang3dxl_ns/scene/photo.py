@@ -226,11 +226,8 @@ def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) ->
 
 
 def _check_shape(name: str, path: Path, size: tuple[int, int], camera: tuple[int, int]) -> None:
-    """Raise UserError unless a photo has its camera's aspect ratio, which cropped or rotated ones lack, and
-    more pixels than a line."""
+    """Raise UserError unless a photo has its camera's aspect ratio, which cropped or rotated ones lack."""
     (width, height), (camera_width, camera_height) = size, camera
-    if min(size) < 2:
-        raise UserError(f"photo {name}: {path} has {width} × {height} pixels, too few: replace it")
     if abs(width * camera_height / (height * camera_width) - 1) > 0.01:
         raise UserError(
             f"photo {name}: {path} has {width} × {height} pixels, but its COLMAP camera {camera_width} × "

@@ -13,6 +13,7 @@ from conftest import make_trainer
 from PIL import Image
 from scenes import write_scene
 
+from lang3dxl_ns import cli
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS, NoPictureError, open_picture
@@ -205,11 +206,11 @@ def test_photos_whose_names_are_not_utf8_are_left_out_and_named(folder, capsys):
     assert "its name is not UTF-8" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_placeholder_of_one_pixel_is_left_out_and_named(tmp_path, capsys):
+def test_a_placeholder_of_one_pixel_is_prepared(tmp_path, tiny_clip, tiny_dense, capsys):
     folder = write_scene(tmp_path / "scene", photos=4, points=60, size=(40, 40))
     Image.new("RGB", (1, 1)).save(folder / "images" / "photo_001.jpg")
-    assert set(used(folder)) == {"photo_000.jpg", "photo_002.jpg", "photo_003.jpg"}
-    assert "1 × 1 pixels, too few" in " ".join(capsys.readouterr().out.split())
+    cli.main(["prepare", "--data", str(folder), "--clip", str(tiny_clip), "--dense", str(tiny_dense)])
+    assert "Targets of 4 photos" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", [b"a\x1b[2J\r\n_.jpg", b"\x1b]0;title\x07.jpg"])
