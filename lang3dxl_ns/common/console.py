@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
-import time
+import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager
@@ -24,19 +24,22 @@ def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
     seconds, it shows a progress bar with the time left."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    start = time.monotonic()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     bar = Progress(*columns, speed_estimate_period=600)  # items come in batches: a short window would jump
     shown = bar.add_task(what, total=total)
 
+    timer = threading.Timer(QUIET_S, bar.start)  # a first item of minutes shows the bar, too
+    timer.daemon = True
+    timer.start()
+
     def advance(count: int = 1) -> None:
         bar.advance(shown, count)
-        if time.monotonic() - start > QUIET_S:
-            bar.start()  # repeated calls have no effect
 
     try:
         yield advance
     finally:
+        timer.cancel()
+        timer.join()
         if bar.live.is_started:  # otherwise it would print an empty line
             bar.stop()
 

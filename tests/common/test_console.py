@@ -1,12 +1,14 @@
 """What the console shows, and what it doesn't."""
 
+import time
 import warnings
 
 import pytest
 import rich.progress
 import torch
 
-from lang3dxl_ns.common.console import progress, silence_libraries
+from lang3dxl_ns.common import console
+from lang3dxl_ns.common.console import progress, silence_libraries, tracked
 from lang3dxl_ns.evaluation.photo_metrics import Lpips
 
 
@@ -33,6 +35,14 @@ def test_alexnet_is_not_downloaded_unasked(monkeypatch, tmp_path, capsys):
     picture, lpips = torch.rand(1, 3, 64, 64), Lpips()
     assert lpips(picture, picture) is None and lpips(picture, picture) is None
     assert capsys.readouterr().out.count("LPIPS is skipped") == 1  # said once
+
+
+def test_a_first_item_of_minutes_shows_the_bar_and_quick_work_shows_none(monkeypatch, capsys):
+    for quiet, shown in ((60.0, False), (0.01, True)):
+        monkeypatch.setattr(console, "QUIET_S", quiet)
+        for item in tracked([1], "one long item"):
+            time.sleep(0.3 * item)
+        assert ("one long item" in capsys.readouterr().out) is shown
 
 
 def test_the_time_left_is_that_of_equal_lots(monkeypatch):

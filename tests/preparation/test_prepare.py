@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shutil
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -475,6 +476,8 @@ def test_a_long_run_shows_a_bar(photos, config, store, monkeypatch, capsys):
     run(photos[:1], config, store)
     assert "encoding photos" not in capsys.readouterr().out
     monkeypatch.setattr(progress, "QUIET_S", 0.0)
+    stamp = Photo.stamp
+    monkeypatch.setattr(Photo, "stamp", lambda *given: time.sleep(0.05) or stamp(*given))
     run(photos, config, store)
     printed = capsys.readouterr().out
     assert "checking photos" in printed
