@@ -72,8 +72,9 @@ def main(arguments: list[str] | None = None) -> None:
             copy_context().run(_parsed(words).main)  # undoes the command's message settings
             sys.stdout.flush()
     except UserError as error:
-        # Messages name the options of ns-train; these commands have the same ones without the prefix.
-        sys.exit(f"Error: {str(error).replace('--pipeline.datamanager.', '--')}")
+        # Messages name the options of ns-train, which these two pass on; others have them without the prefix.
+        prefix = "--" if words[0] in ("demo", "benchmark") else "--pipeline.datamanager."
+        sys.exit(f"Error: {str(error).replace(prefix, '--')}")
     except BrokenPipeError:  # the reader closed the pipe, as in `lang3dxl … | head`
         _leave_output()
         sys.exit(1)
