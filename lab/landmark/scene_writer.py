@@ -37,7 +37,7 @@ from lab.landmark.sparse_model import (
     sample_points,
     write_model,
 )
-from lang3dxl_ns.common.console import progress
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.scene.camera import Lens
@@ -143,11 +143,9 @@ def _taken(orders: list[_Order], workers: int | None) -> Iterator[TakenPhoto]:
     workers = min(workers or os.cpu_count() or 1, len(orders))
     # Processes are spawned, because forked ones would inherit this one's threads and loaded libraries.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context) if workers > 1 else nullcontext()
-    with progress("taking photos", len(orders)) as advance, pool:
-        for photo in (pool.map if isinstance(pool, ProcessPoolExecutor) else map)(_take, orders):
-            yield photo
-            advance()
+    with ProcessPoolExecutor(workers, context) if workers > 1 else nullcontext() as pool:
+        take = map if pool is None else pool.map
+        yield from tracked(take(_take, orders), "taking photos", len(orders))
 
 
 @lru_cache(maxsize=1)
