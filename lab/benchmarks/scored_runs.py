@@ -16,11 +16,12 @@ from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from lab.benchmarks.ablation_rows import CLIPSEG, FINE_TEACHER, LANGSAM, SAM3, SEGMENTERS, Row
+from lab.landmark.novel_views import read_novel_views
 from lab.reports import in_own_process, with_flags
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
@@ -260,15 +261,18 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
 def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     """Compute the figures of test views (`test_…`) and of labeled training photos (`seen_…`), if there are
     any. Both are far more numerous than the held-out photos."""
+    from lab.landmark.novel_views_of_runs import evaluate_novel_views
     from lang3dxl_ns.evaluation.aggregate import PREFIXES, average
 
     scorer, photos = pipeline.evaluation.scorer, pipeline.datamanager.train_dataset.photos
-    splits: list[Literal["test", "seen"]] = [] if pipeline.datamanager.test_views is None else ["test"]
+    splits = {}
+    if read_novel_views(pipeline.datamanager.data_folder) is not None:
+        splits["test"] = evaluate_novel_views(pipeline)
     if scorer is not None and any(scorer.truth.key(photo.name) is not None for photo in photos):
-        splits.append("seen")
+        splits["seen"] = pipeline.evaluation.evaluate("seen")
     found = {}
-    for split in splits:
-        for name, value in average([photo.metrics for photo in pipeline.evaluation.evaluate(split)]).items():
+    for split, evaluated in splits.items():
+        for name, value in average([photo.metrics for photo in evaluated]).items():
             plain = next((name.removeprefix(p) for p in PREFIXES if p and name.startswith(p)), name)
             if plain in _BESIDE or plain.startswith("ap_"):
                 found[f"{split}_{name}"] = value
@@ -337,6 +341,7 @@ def _segmenter_maps(
 
 def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
     """Score the pictures' own fine targets, made in the way that training photos' targets are."""
+    from lab.landmark.novel_views_of_runs import novel_pixel_sizes
     from lang3dxl_ns.evaluation.language import open_scorer
     from lang3dxl_ns.preparation.prepare import prepare
     from lang3dxl_ns.preparation.store import FeatureStore
@@ -347,7 +352,8 @@ def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, 
     found: dict[str, float] = {}
     plan, store = data.crop_plan, FeatureStore(work / "targets")
     for prefix, truth, photos in _pictures(run, data):
-        sizes = data.test_pixel_sizes(photos) if prefix else plan.pixel_sizes
+        views = read_novel_views(data.data_folder) if prefix else None
+        sizes = plan.pixel_sizes if views is None else novel_pixel_sizes(data, views, photos)
         names = [photo.name for photo in photos]
         targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names).reader
         scorer = open_scorer(truth, config.clip, "cpu")
@@ -369,12 +375,12 @@ def _colors_alone(config: Lang3DXLTrainerConfig) -> Lang3DXLDataManager:
 
 def _pictures(run: Run, data: Lang3DXLDataManager) -> Iterator[tuple[str, GroundTruth, list[Photo]]]:
     """Yield held-out photos and test views, each with the prefix of their figures and their truth."""
+    from lab.landmark.novel_views_of_runs import novel_dataset
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
     yield "", GroundTruth(run.scene / "ground_truth"), data.eval_dataset.photos
-    if data.test_views is not None:
-        truth = GroundTruth(data.test_views.folder / "ground_truth", "plain")
-        yield "test_", truth, data.test_dataset.photos
+    if (views := read_novel_views(data.data_folder)) is not None:
+        yield "test_", views.truth, novel_dataset(data, views).photos
 
 
 def _score_pictures(

@@ -98,8 +98,10 @@ class Demo:
         with stages.stage("evaluate"):
             photos = list(trainer.pipeline.evaluation.evaluate("held-out"))
             splits = {"Held-out photos": photos}
-            if trainer.pipeline.datamanager.test_views is not None:
-                splits = {"Test views": list(trainer.pipeline.evaluation.evaluate("test")), **splits}
+            if (scene / "test_views").is_dir():
+                from lab.landmark.novel_views_of_runs import evaluate_novel_views
+
+                splits = {"Test views": list(evaluate_novel_views(trainer.pipeline)), **splits}
             report = self._report(splits, trainer)
         report |= stages.figures()
         folder = config.get_base_dir()
