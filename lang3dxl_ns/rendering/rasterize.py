@@ -123,14 +123,15 @@ def _without_broken(
         return torch.where(sound.view(-1, *[1] * (values.dim() - 1)), values, 0.0)
 
     features = None if features is None else clean(features)
-    return Gaussians(*map(clean, vars(g).values())), clean(channels), features
+    return gaussians.mapped(clean), clean(channels), features
 
 
 def _check_sizes(
     gaussians: Gaussians, channels: Tensor, background: Tensor | None, features: Tensor | None
 ) -> None:
     count = len(gaussians.means)
-    sizes = {name: len(value) for name, value in vars(gaussians).items()} | {"channels": len(channels)}
+    parts = {"channels": channels, **vars(gaussians)}
+    sizes = {name: len(part) for name, part in parts.items() if isinstance(part, Tensor)}
     if features is not None:
         sizes["features"] = len(features)
     wrong = {name: size for name, size in sizes.items() if size != count}
