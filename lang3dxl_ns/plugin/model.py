@@ -183,10 +183,8 @@ class Lang3DXLModel(RenderingModel):
                 difference = losses.dense_loss(dense, batch["dense_target"], shown, c.dense_compare)
                 loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
-                labels = _resized(batch["regions"], clip.shape[:2])
-                loss["regions"] = c.region_weight * losses.region_variance_loss(
-                    clip, labels.long(), small_mask
-                )
+                labels = resize_nearest(batch["regions"], (clip.shape[0], clip.shape[1]))
+                loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
             own = self.semantic_field.own_losses(clip, dense)
         return loss | {name: ramp * value for name, value in own.items()}
 
@@ -195,7 +193,7 @@ class Lang3DXLModel(RenderingModel):
         assert self.semantic_field is not None
         with part("decode"):
             clip, dense = self.semantic_field(resize_nearest(codes, size))
-        return clip, dense, _resized(mask, size)
+        return clip, dense, None if mask is None else resize_nearest(mask, size)
 
     def _random_size(self) -> int:
         """Draw the longer side at which this iteration decodes. It is one of a few, since a GPU's libraries
@@ -280,7 +278,8 @@ class Lang3DXLModel(RenderingModel):
         size = fitted_size(maps, longer_side)
         maps = resize_nearest(maps, size)
         clip, head = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3), decoder.clip_head()
-        return clip if head is None else F.linear(clip, *head), None, _resized(mask, size)
+        small_mask = None if mask is None else resize_nearest(mask, size)
+        return clip if head is None else F.linear(clip, *head), None, small_mask
 
     # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────
 
@@ -301,8 +300,3 @@ class Lang3DXLModel(RenderingModel):
                 )
             parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super(SplatfactoModel, self).load_state_dict(state, **kwargs)
-
-
-def _resized(values: Tensor | None, size: tuple[int, int]) -> Any:
-    """Resize a mask or labels [h, w] to a size (nearest), as floats; None stays None."""
-    return None if values is None else resize_nearest(values[..., None].float(), size)[..., 0]

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
@@ -107,8 +108,7 @@ class Question:
         assert rendering.channels is not None
         keep, size = rendering.alpha >= self.min_alpha, (rendering.camera.height, rendering.camera.width)
         if foreground is not None:
-            there = F.interpolate(foreground[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
-            keep = keep & there.to(keep.device)
+            keep = keep & resize_nearest(foreground, size).to(keep.device)
         count = len(self.prompts)
         values, covered = rendering.channels.tensor_split([-count], dim=2)
         maps = torch.cat([self._confined(self.engine.maps(values, self.queries)), covered.permute(2, 0, 1)])

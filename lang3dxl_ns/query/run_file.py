@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float64
 from numpy import ndarray as Array
 from PIL import Image
@@ -25,6 +24,7 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
+from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.photo import Photo
@@ -95,9 +95,7 @@ class ScenePhoto:
         mask = None if isinstance(self.mask, bytes) else self.photo().read_mask()
         if isinstance(self.mask, bytes):
             mask = torch.from_numpy(np.array(Image.open(io.BytesIO(self.mask)).convert("1")))
-        if mask is None or size is None:
-            return mask
-        return F.interpolate(mask[None, None].float(), size, mode="nearest-exact")[0, 0].bool()
+        return mask if mask is None or size is None else resize_nearest(mask, size)
 
 
 @dataclass(frozen=True)
