@@ -13,7 +13,6 @@ from torch import Tensor
 
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
@@ -92,23 +91,16 @@ def scene_file(
     config: PreparationConfig,
 ) -> SceneFile:
     """Describe what a scene keeps of its photos and of the frame, where splat's = similarity · photos'."""
-    known, local = find_model(config.clip, CLIP_OPTION), expanded(config.clip)
+    known = find_model(config.clip, CLIP_OPTION)
     scale = float(torch.from_numpy(similarity[:3, :3]).double().det().pow(1 / 3))
-    photos = [
-        ScenePhoto(
-            name=photo.name,
-            split="train",
-            camera_to_world=camera_to_world(cameras[photo.name].view_matrix.double()).tolist(),
-            lens=photo.lens.scaled(min(1.0, LONGER_SIDE / max(photo.width, photo.height))),
-            mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
-            size=(photo.width, photo.height),
-            quarter_turns=photo.quarter_turns,
-        )
-        for photo in collection.photos
-    ]
+    photos = []
+    for photo in collection.photos:
+        pose = camera_to_world(cameras[photo.name].view_matrix.double()).tolist()
+        size = min(1.0, LONGER_SIDE / max(photo.width, photo.height))
+        photos.append(ScenePhoto.of(photo, "train", pose, size))
     return SceneFile(
         photos=photos,
-        clip=str(local.absolute()) if local.is_dir() else config.clip,
+        clip=known.address,
         clip_identity=known.identity,
         scale=scale,
         transform=(similarity[:3] / scale).tolist(),

@@ -247,12 +247,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Describe the scene for the run's folder: photos, cameras and CLIP."""
         outputs, clip = self.train_dataparser_outputs, self.config.clip
         known = None if clip == "none" else find_model(clip, CLIP_OPTION)
-        local, trained = expanded(clip), self._described(self.train_dataset, "train")
+        trained = self._described(self.train_dataset, "train")
         names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are also held out
         held_out = self._described(self.eval_dataset, "eval")
         return SceneFile(
             photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
-            clip=None if known is None else str(local.absolute()) if local.is_dir() else clip,
+            clip=None if known is None else known.address,
             clip_identity=None if known is None else known.identity,
             scale=float(outputs.dataparser_scale),
             transform=outputs.dataparser_transform.tolist(),
@@ -261,18 +261,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def _described(self, dataset: PhotoDataset, split: Literal["train", "eval"]) -> list[ScenePhoto]:
         poses, photos = dataset.cameras.camera_to_worlds.tolist(), self.photos
-        return [
-            ScenePhoto(
-                name=photo.name,
-                split=split,
-                camera_to_world=pose,
-                lens=photo.lens.scaled(dataset.scale),
-                mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
-                size=(photo.lens.width, photo.lens.height),
-                quarter_turns=photo.quarter_turns,
-            )
-            for photo, pose in zip((photos[p.name] for p in dataset.photos), poses, strict=True)
-        ]
+        named = zip((photo.name for photo in dataset.photos), poses, strict=True)
+        return [ScenePhoto.of(photos[name], split, pose, dataset.scale) for name, pose in named]
 
     @property
     def data_folder(self) -> Path:

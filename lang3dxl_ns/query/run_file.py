@@ -56,6 +56,16 @@ class ScenePhoto:
     quarter_turns: int = 0
     """Clockwise quarter turns that bring the file's pixels as stored upright."""
 
+    @classmethod
+    def of(
+        cls, photo: Photo, split: Literal["train", "eval"], camera_to_world: list[list[float]], scale: float
+    ) -> ScenePhoto:
+        """Describe a photo that is used at `scale` and seen from a pose."""
+        mask = None if photo.mask_path is None else str(photo.mask_path.absolute())
+        size = photo.width, photo.height
+        lens, turns = photo.lens.scaled(scale), photo.quarter_turns
+        return cls(photo.name, split, camera_to_world, lens, mask, size, turns)
+
     def __repr__(self) -> str:
         width, height = self.file_size
         held_out = ", held out" if self.split == "eval" else ""
