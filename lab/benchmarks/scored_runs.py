@@ -19,10 +19,13 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from lab.benchmarks.ablation_rows import CLIPSEG, FINE_TEACHER, LANGSAM, SAM3, SEGMENTERS, Row
 from lab.landmark.novel_views import read_novel_views
-from lab.reports import in_own_process, with_flags
+from lab.reports import in_own_process, reset_host_peak, with_flags
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.reports import host_peak
@@ -280,7 +283,7 @@ def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
 
 
 def _reset_peak() -> None:
-    host_peak(reset=True)
+    reset_host_peak()
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
 
@@ -335,8 +338,26 @@ def _segmenter_maps(
 ) -> Maps:
     from lang3dxl_ns.evaluation.scores import resize_map
 
-    found = resize_map(segmenter.probabilities(photo.read_uint8(), words), size)
+    found = resize_map(probabilities(segmenter, photo.read_uint8(), words), size)
     return dict(zip(words, found, strict=True))
+
+
+@torch.no_grad()
+def probabilities(
+    segmenter: Any, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]
+) -> Float[Tensor, "q h w"]:
+    """Compute a segmenter's confidence in every prompt at every pixel, 0…1, at the image's size, on the CPU:
+    of a SAM 3, the highest instance score × mask, without a threshold."""
+    from lang3dxl_ns.preparation.segmentation import Sam3
+
+    if not isinstance(segmenter, Sam3):
+        return segmenter.probabilities(image, prompts)
+    maps = []
+    for output in segmenter.outputs(image, prompts):
+        scores = (output.pred_logits.sigmoid() * output.presence_logits.sigmoid())[0]
+        maps.append((scores[:, None, None] * output.pred_masks[0].sigmoid()).amax(dim=0))
+    size = tuple(image.shape[:2])
+    return F.interpolate(torch.stack(maps)[None].float(), size, mode="bilinear")[0].cpu()
 
 
 def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
