@@ -13,8 +13,8 @@ from numpy import ndarray as Array
 from scipy.ndimage import gaussian_filter, uniform_filter
 from torch import Tensor
 
-from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.layouts import Truth
 
 Maps = dict[str, Float[Tensor, "h w"]]
 """Relevancy maps by category, 0…1, above 0.5 at matches."""
