@@ -11,9 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 import lang3dxl_ns.rendering.gsplat_build as gsplat_build
-from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.common.device import in_full_precision, to_device
 from lang3dxl_ns.common.kernels import takes_kernels
-from lang3dxl_ns.common.precision import in_full_precision
 from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Ellipses, Gaussians, Raster
 from lang3dxl_ns.rendering.projection import project
 from lang3dxl_ns.rendering.torch_rasterizer import Compositing
