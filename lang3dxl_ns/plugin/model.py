@@ -23,7 +23,7 @@ from torch.nn import Parameter
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
-from lang3dxl_ns.components import losses, schedules
+from lang3dxl_ns.components import losses
 from lang3dxl_ns.components.initialization import (
     EVERY,
     FREE,
@@ -36,6 +36,7 @@ from lang3dxl_ns.components.initialization import (
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
+from lang3dxl_ns.plugin.optimizers import semantic_ramp
 from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
@@ -166,7 +167,7 @@ class Lang3DXLModel(RenderingModel):
     ) -> dict[str, Tensor]:
         c = self.config
         assert c.dense_weight is not None
-        ramp = schedules.semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
+        ramp = semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
         size = fitted_size(codes, self._random_size())
         clip, dense, small_mask = self._decode_small(codes, mask, size)
         assert self.semantic_field is not None and self.downsampler is not None
