@@ -376,7 +376,7 @@ def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, 
         views = read_novel_views(data.data_folder) if prefix else None
         sizes = plan.pixel_sizes if views is None else novel_pixel_sizes(data, views, photos)
         names = [photo.name for photo in photos]
-        targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names).reader
+        targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names)
         scorer = open_scorer(truth, config.clip, "cpu")
         maps = partial(_crop_maps, scorer, targets)
         found |= _score_pictures(prefix, scorer, photos, maps)

@@ -45,11 +45,11 @@ def prepare_photos(
     training also finds them. Photos that cannot be read are left out."""
     masked = with_foreground(collection.photos, config, collection.folder, cache, device, say)
     names = [photo.name for photo in masked]
-    made = prepare_collection(
+    reader = prepare_collection(
         masked, collection.reconstruction, config, cache, device, log=say, regions=None, fine=names
     )
-    kept = set(made.reader.names)
-    return replace(collection, photos=[photo for photo in masked if photo.name in kept]), made.reader
+    kept = set(reader.names)
+    return replace(collection, photos=[photo for photo in masked if photo.name in kept]), reader
 
 
 def learn(

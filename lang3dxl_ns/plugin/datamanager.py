@@ -201,7 +201,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return prepare_collection(
             photos, self.reconstruction, self.config, self.cache_dir, self.device,
             log=_log, regions=self._region_source, fine=fine,
-        ).reader  # fmt: skip
+        )  # fmt: skip
 
     def clean_store(self) -> tuple[int, int]:
         """Delete targets that this configuration and the scene's photos don't use; count files and bytes."""

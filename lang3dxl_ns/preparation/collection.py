@@ -21,10 +21,11 @@ from lang3dxl_ns.preparation.physical_scale import (
     propose_scale_range,
     relative_scales,
 )
-from lang3dxl_ns.preparation.prepare import PreparedTargets, prepare
+from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
 
@@ -98,7 +99,7 @@ def prepare_collection(
     log: Callable[[str], None] = print,
     regions: RegionSource | None = None,
     fine: Collection[str] = (),
-) -> PreparedTargets:
+) -> TargetReader:
     """Choose crops, log the reasons, and make missing targets in `cache_dir`; for `fine`, see `prepare`."""
     plan = plan_crops(photos, reconstruction, config)
     for reason in plan.reasons:
