@@ -32,8 +32,7 @@ from lang3dxl_ns.common.reports import host_peak
 
 if TYPE_CHECKING:
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-    from lang3dxl_ns.evaluation.language import LanguageScorer
-    from lang3dxl_ns.evaluation.scores import Maps, MapScorer
+    from lang3dxl_ns.evaluation.scores import LanguageScorer, Maps, MapScorer
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
     from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
@@ -363,7 +362,7 @@ def probabilities(
 def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
     """Score the pictures' own fine targets, made in the way that training photos' targets are."""
     from lab.landmark.novel_views_of_runs import novel_pixel_sizes
-    from lang3dxl_ns.evaluation.language import open_scorer
+    from lang3dxl_ns.evaluation.scores import open_scorer
     from lang3dxl_ns.preparation.prepare import prepare
     from lang3dxl_ns.preparation.store import FeatureStore
 

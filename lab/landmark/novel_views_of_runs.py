@@ -12,8 +12,8 @@ from torch import Tensor
 
 from lab.landmark.novel_views import NovelViews, read_novel_views
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.evaluation.language import open_scorer
 from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
+from lang3dxl_ns.evaluation.scores import open_scorer
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.preparation.foreground import find_mask

@@ -15,9 +15,8 @@ from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.label_limit import Masks, lifted_labels
-from lang3dxl_ns.evaluation.language import LanguageScorer
 from lang3dxl_ns.evaluation.layouts import Truth
-from lang3dxl_ns.evaluation.scores import map_size, overlap
+from lang3dxl_ns.evaluation.scores import LanguageScorer, map_size, overlap
 from lang3dxl_ns.query.places import Box, groups, shared_volume
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene

@@ -23,10 +23,9 @@ from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
 from lang3dxl_ns.evaluation.half_image import PROTOCOL, HalfImageProtocol
 from lang3dxl_ns.evaluation.label_limit import label_limit
-from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
 from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
 from lang3dxl_ns.evaluation.score_scene import truths_of
-from lang3dxl_ns.evaluation.scores import bounds, inside, map_size
+from lang3dxl_ns.evaluation.scores import LanguageScorer, bounds, inside, map_size, open_scorer
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
