@@ -87,6 +87,8 @@ class Demo:
 
                 settings = {"family": self.family, **self._wanted}
                 write_scene(DemoScene(out=scene, **settings))
+        from lab.judging import judge
+
         config = self._config(scene, out)
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
         trainer.stages = stages
@@ -95,6 +97,7 @@ class Demo:
             trainer.train()
         else:
             say("train: skipped, the run is finished")
+        judge(trainer.pipeline)
         with stages.stage("evaluate"):
             photos = list(trainer.pipeline.evaluation.evaluate("held-out"))
             splits = {"Held-out photos": photos}

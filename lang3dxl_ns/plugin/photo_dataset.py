@@ -73,19 +73,15 @@ class EvalPhotos:
     ):
         self.dataset, self._ready = dataset, ready
         photos = enumerate(dataset.photos)
-        self._wanted = [index for index, photo in photos if names is None or photo.name in names]
+        self.indices = [index for index, photo in photos if names is None or photo.name in names]
+        """Indices of these photos in the dataset."""
 
     def __len__(self) -> int:
-        return len(self._wanted)
-
-    def cameras(self) -> Iterator[tuple[Cameras, Photo]]:
-        """Yield every photo's camera and the photo, without reading files."""
-        for index in self._wanted:
-            yield self.dataset.cameras[index : index + 1], self.dataset.photos[index]
+        return len(self.indices)
 
     def __iter__(self) -> Iterator[tuple[Cameras, Batch]]:
         read, usable = self._ready(), False
-        for index in self._wanted:
+        for index in self.indices:
             try:
                 item = read(index)
             except UserError as reason:
