@@ -17,11 +17,13 @@ from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.preparation.collection import prepare_collection
+from lang3dxl_ns.preparation.crop_plan import plan_crops
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.rendering.render import composite
@@ -44,10 +46,9 @@ def prepare_photos(
     """Prepare the photos' foreground and targets with `settled` settings, in the folder `cache`, where
     training also finds them. Photos that cannot be read are left out."""
     masked = with_foreground(collection.photos, config, collection.folder, cache, device, say)
-    names = [photo.name for photo in masked]
-    reader = prepare_collection(
-        masked, collection.reconstruction, config, cache, device, log=say, regions=None, fine=names
-    )
+    plan, names = plan_crops(masked, collection.reconstruction, config), [photo.name for photo in masked]
+    say(*plan.reasons)
+    reader = prepare(masked, plan.pixel_sizes, config, plan.scales, FeatureStore(cache), device, fine=names)
     kept = set(reader.names)
     return replace(collection, photos=[photo for photo in masked if photo.name in kept]), reader
 

@@ -34,12 +34,13 @@ from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parse
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
-from lang3dxl_ns.preparation.collection import CropPlan, plan_crops, prepare_collection
+from lang3dxl_ns.preparation.crop_plan import CropPlan, plan_crops
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
+from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -198,10 +199,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
             return None
         # Held-out photos have the whole pyramid, which serves as the 2-D teacher.
         fine = [p.name for p in self.train_dataset.photos] if self.config.crops == "fine" else []
-        return prepare_collection(
-            photos, self.reconstruction, self.config, self.cache_dir, self.device,
-            log=_log, regions=self._region_source, fine=fine,
-        )  # fmt: skip
+        plan, store = self.crop_plan, FeatureStore(self.cache_dir)
+        for reason in plan.reasons:
+            _log(reason)
+        return prepare(
+            photos, plan.pixel_sizes, self.config, plan.scales, store, self.device, self._region_source, fine
+        )
 
     def clean_store(self) -> tuple[int, int]:
         """Delete targets that this configuration and the scene's photos don't use; count files and bytes."""
