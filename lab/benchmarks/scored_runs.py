@@ -348,12 +348,20 @@ def probabilities(
     segmenter: Any, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]
 ) -> Float[Tensor, "q h w"]:
     """Compute a segmenter's confidence in every prompt at every pixel, 0…1, at the image's size, on the CPU:
-    of a SAM 3, the highest instance score × mask, without a threshold."""
-    from lang3dxl_ns.preparation.segmentation import Sam3
+    of a SAM 3, the highest instance score × mask, without a threshold; of boxes with a SAM, the score of the
+    best box whose mask covers the pixel, else 0."""
+    from lang3dxl_ns.preparation.segmentation import BoxesAndSam, ClipSeg
 
-    if not isinstance(segmenter, Sam3):
+    if isinstance(segmenter, ClipSeg):
         return segmenter.probabilities(image, prompts)
     maps = []
+    if isinstance(segmenter, BoxesAndSam):
+        for prompt in prompts:
+            boxes, scores = segmenter.boxes(image, prompt)
+            nowhere = torch.zeros(1, *image.shape[:2])
+            scored = scores[:, None, None] * segmenter.masks(image, boxes)
+            maps.append(torch.cat([nowhere, scored]).amax(dim=0))
+        return torch.stack(maps)
     for output in segmenter.outputs(image, prompts):
         scores = (output.pred_logits.sigmoid() * output.presence_logits.sigmoid())[0]
         maps.append((scores[:, None, None] * output.pred_masks[0].sigmoid()).amax(dim=0))

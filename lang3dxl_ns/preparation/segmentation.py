@@ -190,21 +190,12 @@ class BoxesAndSam:
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
         """Combine the masks of all boxes (see `TextSegmenter.segment`)."""
-        return (self.probabilities(image, prompts) > 0).any(dim=0)
-
-    def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Compute the score of the best box whose mask covers the pixel, else 0, for each prompt, at the
-        image's size, on the CPU. The detector sees one prompt at a time, so that prompts don't compete."""
-        found = [self.boxes(image, prompt) for prompt in prompts]
-        masks = iter(self._masks(image, torch.cat([boxes for boxes, _ in found])))
-        maps = torch.zeros(len(prompts), *image.shape[:2])
-        for one, (_, scores) in zip(maps, found, strict=True):
-            for score in scores:
-                torch.maximum(one, next(masks) * score, out=one)
-        return maps
+        boxes = [self.boxes(image, prompt)[0] for prompt in prompts]
+        return self.masks(image, torch.cat(boxes)).any(dim=0)
 
     @torch.no_grad()
-    def _masks(self, image: UInt8[Tensor, "h w 3"], boxes: Float[Tensor, "n 4"]) -> Bool[Tensor, "n h w"]:
+    def masks(self, image: UInt8[Tensor, "h w 3"], boxes: Float[Tensor, "n 4"]) -> Bool[Tensor, "n h w"]:
+        """Segment what each box holds, at the size of the image, on the CPU."""
         if not len(boxes):
             return torch.zeros(0, *image.shape[:2], dtype=torch.bool)
         inputs = self._sam_processor(
@@ -222,7 +213,8 @@ class BoxesAndSam:
     def boxes(
         self, image: UInt8[Tensor, "h w 3"], prompt: str
     ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-        """Find the boxes of what the prompt names (left, top, right, bottom in pixels), and their scores."""
+        """Find the boxes of what the prompt names (left, top, right, bottom in pixels), and their scores. The
+        detector sees one prompt at a time, so that prompts don't compete."""
         caption = prompt.strip().lower().rstrip(".") + "."  # the form that the detector was trained with
         inputs = self._detector_processor(images=_picture(image), text=caption, return_tensors="pt")
         output = self._detector(**inputs.to(self._detector.device))
