@@ -126,7 +126,7 @@ class RenderingModel(SplatfactoModel):
         scene has colors only."""
         codes, looks = self.carried, self.appearance
         return Scene(
-            self.splats().copied(),
+            self.splats().mapped(torch.clone),
             file,
             None if codes is None else _frozen(self.semantic_field),
             None if codes is None else codes.detach().clone(),

@@ -49,10 +49,6 @@ class Splats(Gaussians):
         """Return the same Gaussians on a device."""
         return self.mapped(lambda tensor: tensor.to(device))
 
-    def copied(self) -> Splats:
-        """Copy the Gaussians to new memory."""
-        return self.mapped(torch.clone)
-
     def select(self, which: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> Splats:
         """Return some of the Gaussians, chosen by a mask or by their indices (tensors or NumPy arrays)."""
         rows = torch.as_tensor(which, device=self.means.device)
