@@ -1,14 +1,16 @@
-"""Additions to `lang3dxl_ns.common.reports` for the laboratory: commands, own processes, and figures."""
+"""Additions to `lang3dxl_ns.common.reports` for the laboratory: commands, own processes, memory, figures."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
 import shlex
+import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from multiprocessing.context import BaseContext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:  # imported where it is used, so that a command's help does not load it
@@ -37,6 +39,12 @@ def in_own_process(work: Callable[..., Result], /, *args: Any, preload: Sequence
         context.set_forkserver_preload(list(preload))
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         return pool.submit(work, *args).result()
+
+
+def reset_host_peak() -> None:
+    """Lower the peak memory of this process (`host_peak`) to its present memory, where the system can."""
+    if sys.platform == "linux":
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def with_flags(config: Settings, flags: str) -> Settings:

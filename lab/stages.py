@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from lab.reports import reset_host_peak
 from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.common.reports import host_peak
@@ -28,7 +29,7 @@ class MeasuredStages(Stages):
     def begin(self, name: str) -> None:
         """End the present stage, if there is one, and announce and measure another."""
         super().begin(name)
-        host_peak(reset=True)
+        reset_host_peak()
 
     def end(self) -> None:
         """End the present stage, if there is one, and keep what it took."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering.splats import Splats, harmonics_of

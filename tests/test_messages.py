@@ -137,9 +137,7 @@ def test_pooled_figures_that_are_no_numbers(value, tmp_path, monkeypatch):
         main(["evaluate", "pool", "--reports", "a.json", "--out", "report"])
 
 
-def test_the_test_views_have_labels_of_their_own():
-    with pytest.raises(SystemExit, match="leave --ground-truth off"):
-        main(["evaluate", "run", "none", "--split", "test", "--ground-truth", "nope", "--out", "report"])
+def test_ground_truth_that_is_no_folder():
     with pytest.raises(SystemExit, match="nope is not a folder"):
         main(["evaluate", "run", "none", "--ground-truth", "nope", "--out", "report"])
 

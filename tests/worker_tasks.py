@@ -56,6 +56,6 @@ def prepare(folder: Path, clip: str, workers: int, engine: str) -> list:
     photos = [Photo(path.name, path, None, Lens(100, 80, 90.0, 96.0, 50.0, 40.0)) for path in paths]
     config = PreparationConfig(clip=clip, dense="none", workers=workers, engine=engine)
     store = FeatureStore(folder / "store")
-    made = preparation.prepare(photos, None, config, [0.4, 0.8], store, "cpu")
-    assert len(made.reader.names) == len(photos)
+    reader = preparation.prepare(photos, None, config, [0.4, 0.8], store, "cpu")
+    assert len(reader.names) == len(photos)
     return [store.read("clip", photo.name)["features"].clone() for photo in photos]

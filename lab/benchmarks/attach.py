@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from lab.landmark.novel_views import read_novel_views
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.frames import camera_in
@@ -18,12 +19,11 @@ from lang3dxl_ns.common.reports import markdown_table
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
-from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
+from lang3dxl_ns.evaluation.scores import LanguageScorer, open_scorer
 from lang3dxl_ns.open_scene import find_scene_file
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import read_scene
 from lang3dxl_ns.scene.camera import Camera
-from lang3dxl_ns.scene.novel_views import read_novel_views
 
 
 @showing("scenes", "data", "out")
@@ -94,7 +94,7 @@ def _labeled(data: Path, scene: Scene) -> tuple[GroundTruth, list[Labeled]]:
     """The test views, or else the labeled photos."""
     if (novel := read_novel_views(data)) is not None:
         similarity = np.vstack([scene.file.scale * np.array(scene.file.transform), [0, 0, 0, 1]])
-        truth = GroundTruth(novel.folder / "ground_truth", "plain")
+        truth = novel.truth
         cameras = [(view.name, camera_in(similarity, view)) for view in novel.cameras]
     else:
         folder = find_ground_truth(data)

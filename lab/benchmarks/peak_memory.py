@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from lab.reports import in_own_process
+from lab.reports import in_own_process, reset_host_peak
 from lang3dxl_ns.common.reports import host_peak
 
 MEBIBYTE = 2**20
@@ -32,6 +32,7 @@ def _measure_peak(setup: Callable[..., Callable[[], object]], args: Sequence[Any
         before = torch.cuda.memory_allocated()
         work()
         return torch.cuda.max_memory_allocated() - before
-    before = host_peak(reset=True)
+    reset_host_peak()
+    before = host_peak()
     work()
     return host_peak() - before

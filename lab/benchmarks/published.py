@@ -23,8 +23,7 @@ from lang3dxl_ns.common.presets import scene_presets, train_flags
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import pool
-from lang3dxl_ns.evaluation.lerf_ovs import is_lerf_ovs
-from lang3dxl_ns.evaluation.mask_folders import is_holyscenes
+from lang3dxl_ns.evaluation.layouts import is_holyscenes, is_lerf_ovs
 
 _DEPTH = 4
 """Levels of folders below --data that are searched."""

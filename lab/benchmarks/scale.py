@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING, Literal
 
-from lab.reports import command_line, in_own_process
+from lab.reports import command_line, in_own_process, reset_host_peak
 from lang3dxl_ns.common.reports import describe_machine, host_peak, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 
@@ -115,7 +115,8 @@ def markdown(settings: ScaleBenchmark, stages: Sequence[Stage]) -> str:
 
 def _measured(name: str, amount: str, work: Callable[[], object], each: Callable[[float], str]) -> Stage:
     """A stage, with its times and peak memory. each: of its processor seconds."""
-    empty, start, used = host_peak(reset=True), time.perf_counter(), time.process_time()
+    reset_host_peak()
+    empty, start, used = host_peak(), time.perf_counter(), time.process_time()
     work()
     seconds, cpu = time.perf_counter() - start, time.process_time() - used
     return Stage(name, amount, seconds, cpu, each(cpu), host_peak() - empty)

@@ -16,20 +16,23 @@ from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from lab.benchmarks.ablation_rows import CLIPSEG, FINE_TEACHER, LANGSAM, SAM3, SEGMENTERS, Row
-from lab.reports import in_own_process, with_flags
+from lab.landmark.novel_views import read_novel_views
+from lab.reports import in_own_process, reset_host_peak, with_flags
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.reports import host_peak
 
 if TYPE_CHECKING:
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-    from lang3dxl_ns.evaluation.language import LanguageScorer
-    from lang3dxl_ns.evaluation.scores import Maps, MapScorer
+    from lang3dxl_ns.evaluation.scores import LanguageScorer, Maps, MapScorer
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
     from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
@@ -228,6 +231,7 @@ def write_output_to(log: Path) -> None:
 
 
 def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
+    from lab.judging import judge
     from lang3dxl_ns.common import timing
     from lang3dxl_ns.evaluation.aggregate import average
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
@@ -245,6 +249,7 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     trainer.train()
     seconds = _now() - start
     peak = _peak()
+    judge(trainer.pipeline)
     figures = average([photo.metrics for photo in trainer.pipeline.evaluation.evaluate("held-out")])
     figures = {name: value for name, value in figures.items() if name not in _UNWANTED}
     figures |= _beside(trainer.pipeline)
@@ -260,15 +265,18 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
 def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     """Compute the figures of test views (`test_…`) and of labeled training photos (`seen_…`), if there are
     any. Both are far more numerous than the held-out photos."""
+    from lab.landmark.novel_views_of_runs import evaluate_novel_views
     from lang3dxl_ns.evaluation.aggregate import PREFIXES, average
 
     scorer, photos = pipeline.evaluation.scorer, pipeline.datamanager.train_dataset.photos
-    splits: list[Literal["test", "seen"]] = [] if pipeline.datamanager.test_views is None else ["test"]
+    splits = {}
+    if read_novel_views(pipeline.datamanager.data_folder) is not None:
+        splits["test"] = evaluate_novel_views(pipeline)
     if scorer is not None and any(scorer.truth.key(photo.name) is not None for photo in photos):
-        splits.append("seen")
+        splits["seen"] = pipeline.evaluation.evaluate("seen")
     found = {}
-    for split in splits:
-        for name, value in average([photo.metrics for photo in pipeline.evaluation.evaluate(split)]).items():
+    for split, evaluated in splits.items():
+        for name, value in average([photo.metrics for photo in evaluated]).items():
             plain = next((name.removeprefix(p) for p in PREFIXES if p and name.startswith(p)), name)
             if plain in _BESIDE or plain.startswith("ap_"):
                 found[f"{split}_{name}"] = value
@@ -276,7 +284,7 @@ def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
 
 
 def _reset_peak() -> None:
-    host_peak(reset=True)
+    reset_host_peak()
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
 
@@ -331,13 +339,40 @@ def _segmenter_maps(
 ) -> Maps:
     from lang3dxl_ns.evaluation.scores import resize_map
 
-    found = resize_map(segmenter.probabilities(photo.read_uint8(), words), size)
+    found = resize_map(probabilities(segmenter, photo.read_uint8(), words), size)
     return dict(zip(words, found, strict=True))
+
+
+@torch.no_grad()
+def probabilities(
+    segmenter: Any, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]
+) -> Float[Tensor, "q h w"]:
+    """Compute a segmenter's confidence in every prompt at every pixel, 0…1, at the image's size, on the CPU:
+    of a SAM 3, the highest instance score × mask, without a threshold; of boxes with a SAM, the score of the
+    best box whose mask covers the pixel, else 0."""
+    from lang3dxl_ns.preparation.segmentation import BoxesAndSam, ClipSeg
+
+    if isinstance(segmenter, ClipSeg):
+        return segmenter.probabilities(image, prompts)
+    maps = []
+    if isinstance(segmenter, BoxesAndSam):
+        for prompt in prompts:
+            boxes, scores = segmenter.boxes(image, prompt)
+            nowhere = torch.zeros(1, *image.shape[:2])
+            scored = scores[:, None, None] * segmenter.masks(image, boxes)
+            maps.append(torch.cat([nowhere, scored]).amax(dim=0))
+        return torch.stack(maps)
+    for output in segmenter.outputs(image, prompts):
+        scores = (output.pred_logits.sigmoid() * output.presence_logits.sigmoid())[0]
+        maps.append((scores[:, None, None] * output.pred_masks[0].sigmoid()).amax(dim=0))
+    size = tuple(image.shape[:2])
+    return F.interpolate(torch.stack(maps)[None].float(), size, mode="bilinear")[0].cpu()
 
 
 def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
     """Score the pictures' own fine targets, made in the way that training photos' targets are."""
-    from lang3dxl_ns.evaluation.language import open_scorer
+    from lab.landmark.novel_views_of_runs import novel_pixel_sizes
+    from lang3dxl_ns.evaluation.scores import open_scorer
     from lang3dxl_ns.preparation.prepare import prepare
     from lang3dxl_ns.preparation.store import FeatureStore
 
@@ -347,9 +382,10 @@ def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, 
     found: dict[str, float] = {}
     plan, store = data.crop_plan, FeatureStore(work / "targets")
     for prefix, truth, photos in _pictures(run, data):
-        sizes = data.test_pixel_sizes(photos) if prefix else plan.pixel_sizes
+        views = read_novel_views(data.data_folder) if prefix else None
+        sizes = plan.pixel_sizes if views is None else novel_pixel_sizes(data, views, photos)
         names = [photo.name for photo in photos]
-        targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names).reader
+        targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names)
         scorer = open_scorer(truth, config.clip, "cpu")
         maps = partial(_crop_maps, scorer, targets)
         found |= _score_pictures(prefix, scorer, photos, maps)
@@ -369,12 +405,12 @@ def _colors_alone(config: Lang3DXLTrainerConfig) -> Lang3DXLDataManager:
 
 def _pictures(run: Run, data: Lang3DXLDataManager) -> Iterator[tuple[str, GroundTruth, list[Photo]]]:
     """Yield held-out photos and test views, each with the prefix of their figures and their truth."""
+    from lab.landmark.novel_views_of_runs import novel_dataset
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
     yield "", GroundTruth(run.scene / "ground_truth"), data.eval_dataset.photos
-    if data.test_views is not None:
-        truth = GroundTruth(data.test_views.folder / "ground_truth", "plain")
-        yield "test_", truth, data.test_dataset.photos
+    if (views := read_novel_views(data.data_folder)) is not None:
+        yield "test_", views.truth, novel_dataset(data, views).photos
 
 
 def _score_pictures(

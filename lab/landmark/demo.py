@@ -87,6 +87,8 @@ class Demo:
 
                 settings = {"family": self.family, **self._wanted}
                 write_scene(DemoScene(out=scene, **settings))
+        from lab.judging import judge
+
         config = self._config(scene, out)
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
         trainer.stages = stages
@@ -95,11 +97,14 @@ class Demo:
             trainer.train()
         else:
             say("train: skipped, the run is finished")
+        judge(trainer.pipeline)
         with stages.stage("evaluate"):
             photos = list(trainer.pipeline.evaluation.evaluate("held-out"))
             splits = {"Held-out photos": photos}
-            if trainer.pipeline.datamanager.test_views is not None:
-                splits = {"Test views": list(trainer.pipeline.evaluation.evaluate("test")), **splits}
+            if (scene / "test_views").is_dir():
+                from lab.landmark.novel_views_of_runs import evaluate_novel_views
+
+                splits = {"Test views": list(evaluate_novel_views(trainer.pipeline)), **splits}
             report = self._report(splits, trainer)
         report |= stages.figures()
         folder = config.get_base_dir()

@@ -20,6 +20,7 @@ from lab.landmark.demo_scene import DemoScene
 from lab.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
 from lab.landmark.landmark import Landmark
 from lab.landmark.novel_cameras import choose_cameras
+from lab.landmark.novel_views import CAMERAS, FOLDER
 from lab.landmark.photography import (
     Shot,
     View,
@@ -42,7 +43,6 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import TrackedPhoto
-from lang3dxl_ns.scene.novel_views import CAMERAS, FOLDER
 
 HELD_OUT_EVERY = 8
 """Interval of nerfstudio's split: of the photos sorted by name, 0, 8, 16 … are held out."""

@@ -134,8 +134,8 @@ class _Compared:
         splat covers, without its edges, where the background that it lacks shows through."""
         camera = camera_in(similarity, self.tracked)
         colors = splats.colors(camera.position.detach()).mean(1, keepdim=True)
-        gaussians = splats.gaussians.seen_from(camera)
-        raster = rasterize(gaussians, camera, colors, antialiased=splats.antialiased)
+        seen = splats.seen_from(camera)
+        raster = rasterize(seen, camera, colors, antialiased=splats.antialiased)
         drawn, alpha = raster.image[..., 0], raster.alpha[..., 0].detach()
         covered = -F.max_pool2d(-alpha[None], 3, 1, 1)[0] > 0.8
         return drawn, self.gray.to(drawn), self.mask.to(drawn.device) & covered

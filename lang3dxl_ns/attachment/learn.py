@@ -13,16 +13,17 @@ from torch import Tensor
 
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.preparation.collection import prepare_collection
+from lang3dxl_ns.preparation.crop_plan import plan_crops
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.rendering.render import composite
@@ -45,12 +46,11 @@ def prepare_photos(
     """Prepare the photos' foreground and targets with `settled` settings, in the folder `cache`, where
     training also finds them. Photos that cannot be read are left out."""
     masked = with_foreground(collection.photos, config, collection.folder, cache, device, say)
-    names = [photo.name for photo in masked]
-    made = prepare_collection(
-        masked, collection.reconstruction, config, cache, device, log=say, regions=None, fine=names
-    )
-    kept = set(made.reader.names)
-    return replace(collection, photos=[photo for photo in masked if photo.name in kept]), made.reader
+    plan, names = plan_crops(masked, collection.reconstruction, config), [photo.name for photo in masked]
+    say(*plan.reasons)
+    reader = prepare(masked, plan.pixel_sizes, config, plan.scales, FeatureStore(cache), device, fine=names)
+    kept = set(reader.names)
+    return replace(collection, photos=[photo for photo in masked if photo.name in kept]), reader
 
 
 def learn(
@@ -92,23 +92,16 @@ def scene_file(
     config: PreparationConfig,
 ) -> SceneFile:
     """Describe what a scene keeps of its photos and of the frame, where splat's = similarity · photos'."""
-    known, local = find_model(config.clip, CLIP_OPTION), expanded(config.clip)
+    known = find_model(config.clip, CLIP_OPTION)
     scale = float(torch.from_numpy(similarity[:3, :3]).double().det().pow(1 / 3))
-    photos = [
-        ScenePhoto(
-            name=photo.name,
-            split="train",
-            camera_to_world=camera_to_world(cameras[photo.name].view_matrix.double()).tolist(),
-            lens=photo.lens.scaled(min(1.0, LONGER_SIDE / max(photo.width, photo.height))),
-            mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
-            size=(photo.width, photo.height),
-            quarter_turns=photo.quarter_turns,
-        )
-        for photo in collection.photos
-    ]
+    photos = []
+    for photo in collection.photos:
+        pose = camera_to_world(cameras[photo.name].view_matrix.double()).tolist()
+        size = min(1.0, LONGER_SIDE / max(photo.width, photo.height))
+        photos.append(ScenePhoto.of(photo, "train", pose, size))
     return SceneFile(
         photos=photos,
-        clip=str(local.absolute()) if local.is_dir() else config.clip,
+        clip=known.address,
         clip_identity=known.identity,
         scale=scale,
         transform=(similarity[:3] / scale).tolist(),

@@ -75,8 +75,8 @@ class EvaluateRun(_Scored):
     run: tyro.conf.Positional[Path | None] = None
     """Folder of the run, or its config.yml (default: the newest under outputs/). For a .scene file, its words
     are scored with --ground-truth, which needs neither its run nor its photos."""
-    split: Literal["held-out", "seen", "test"] = "held-out"
-    """Photos to score: those held out of training, labeled training photos, or the run's test views."""
+    split: Literal["held-out", "seen"] = "held-out"
+    """Photos to score: those held out of training, or labeled training photos."""
     ground_truth: Path | None = None
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
 
@@ -86,8 +86,6 @@ class EvaluateRun(_Scored):
             return
         from lang3dxl_ns.plugin.trainer_config import open_run
 
-        if self.split == "test" and (self.ground_truth is not None or self.layout != "auto"):
-            raise UserError("--split test has labels of its own, in test_views/: leave --ground-truth off")
         if self.ground_truth is not None:
             GroundTruth(self.ground_truth, self.layout)  # fail now rather than after loading
         _, pipeline, _ = open_run(self.run)
@@ -103,7 +101,7 @@ class EvaluateRun(_Scored):
         from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene, score_selections
         from lang3dxl_ns.open_scene import load_scene
 
-        if self.ground_truth is None or self.split == "test":
+        if self.ground_truth is None:
             raise UserError(f"{file} is scored with --ground-truth FOLDER, --split held-out or seen")
         truth = GroundTruth(self.ground_truth, self.layout)
         scene = load_scene(file)

@@ -23,8 +23,7 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Match, save_picture, together
-from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.question import Question
+from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import Provenance, with_words_of, write_scene

@@ -54,7 +54,7 @@ class Teach:
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
 
     def _example(self) -> Example:
-        from lang3dxl_ns.evaluation.annotations import read_gray
+        from lang3dxl_ns.evaluation.layouts import read_gray
         from lang3dxl_ns.query.teach import Example
 
         box = None if self.box is None else _numbers(self.box, 4, "--box LEFT,TOP,RIGHT,BOTTOM")

@@ -1,11 +1,12 @@
-"""Choice of the device, a warning about GPUs that torch cannot use, copies that do not wait for the GPU."""
+"""Device and precision: choice of a device, copies that do not wait for a GPU, float32 inside autocast."""
 
 from __future__ import annotations
 
 import functools
 import glob
 import shutil
-from typing import TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from lang3dxl_ns.common.console import say
 
 _INSTALL = "https://pytorch.org/get-started/locally"
 Moved = TypeVar("Moved", bound=Tensor)
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def to_device(tensor: Moved, device: torch.device | str) -> Moved:
@@ -61,3 +63,23 @@ def _reason() -> str:
     except Exception as error:
         return str(error).strip().splitlines()[0].rstrip(".")
     return "it sees no device: check CUDA_VISIBLE_DEVICES"
+
+
+def in_full_precision(function: Function) -> Function:
+    """Run a function outside autocast, with 16-bit tensor arguments widened to float32. This is for sums over
+    thousands of pixels, differences of large numbers, and positions, which 16 bits would make wrong, not just
+    imprecise. Without autocast, it changes nothing."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        if not (torch.is_autocast_enabled("cpu") or torch.is_autocast_enabled("cuda")):
+            return function(*args, **kwargs)
+        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+            return function(*map(_widened, args), **{name: _widened(v) for name, v in kwargs.items()})
+
+    return run  # type: ignore[return-value]
+
+
+def _widened(value: Any) -> Any:
+    narrow = isinstance(value, Tensor) and value.dtype in (torch.float16, torch.bfloat16)
+    return value.float() if narrow else value

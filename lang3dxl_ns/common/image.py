@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 
@@ -14,9 +15,14 @@ def fitted_size(codes: Float[Tensor, "H W 3"], longer_side: int) -> tuple[int, i
     return max(round(height * scale), 1), max(round(width * scale), 1)
 
 
-def resize_nearest(image: Float[Tensor, "H W c"], size: tuple[int, int]) -> Float[Tensor, "h w c"]:
-    """Resize by nearest-exact sampling, because the mean of two codes is meaningless."""
-    return F.interpolate(image.permute(2, 0, 1)[None], size, mode="nearest-exact")[0].permute(1, 2, 0)
+def resize_nearest(values: Shaped[Tensor, "H W *c"], size: tuple[int, int]) -> Shaped[Tensor, "h w *c"]:
+    """Resize to the values under the pixels' centers, because the mean of two codes or labels is
+    meaningless."""
+    rows, columns = (
+        ((torch.arange(n, device=values.device) + 0.5) * length / n).long()
+        for n, length in zip(size, values.shape[:2], strict=True)
+    )
+    return values[rows[:, None], columns]
 
 
 def resize(values: Float[Tensor, "h w c"], grid: tuple[int, int]) -> Float[Tensor, "hd wd c"]:

@@ -46,12 +46,10 @@ def synchronize() -> None:
         torch.cuda.synchronize()
 
 
-def host_peak(reset: bool = False) -> int:
-    """Return the peak memory of this process, bytes. `reset` first lowers the peak to the present memory."""
+def host_peak() -> int:
+    """Return the peak memory of this process, bytes."""
     if sys.platform == "linux":
         # getrusage would include the parent's peak, because Linux carries it over into a new process.
-        if reset:
-            Path("/proc/self/clear_refs").write_text("5")
         status = Path("/proc/self/status").read_text()
         kibibytes = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
         return int(kibibytes) * 1024

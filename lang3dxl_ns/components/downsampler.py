@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.common.precision import in_full_precision
+from lang3dxl_ns.common.device import in_full_precision
 
 KernelName = Literal["pyramid", "box"]
 

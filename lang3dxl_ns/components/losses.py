@@ -15,10 +15,9 @@ from jaxtyping import Bool, Float, Int
 from pytorch_msssim import ssim
 from torch import Tensor
 
-from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.common.device import in_full_precision, to_device
 from lang3dxl_ns.common.image import resize
 from lang3dxl_ns.common.kernels import takes_kernels
-from lang3dxl_ns.common.precision import in_full_precision
 
 _SSIM_WINDOW = 11
 

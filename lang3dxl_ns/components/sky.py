@@ -49,5 +49,4 @@ class Sky(nn.Module):
         def still(values: Tensor) -> Tensor:
             return torch.cat((values[: len(self)].detach(), values[len(self) :]))
 
-        kept = Gaussians(*map(still, vars(gaussians).values()))
-        return kept, torch.cat((self.colors, colors[len(self) :]))
+        return gaussians.mapped(still), torch.cat((self.colors, colors[len(self) :]))

@@ -11,9 +11,16 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.evaluation.annotations import Truth
-from lang3dxl_ns.evaluation.lerf_ovs import Outlines, is_lerf_ovs, read_lerf_ovs
-from lang3dxl_ns.evaluation.mask_folders import MaskFile, is_holyscenes, read_holyscenes, read_plain
+from lang3dxl_ns.evaluation.layouts import (
+    MaskFile,
+    Outlines,
+    Truth,
+    is_holyscenes,
+    is_lerf_ovs,
+    read_holyscenes,
+    read_lerf_ovs,
+    read_plain,
+)
 
 Layout = Literal["holyscenes", "lerf_ovs", "plain"]
 _READERS: dict[str, Callable[[Path], Mapping[str, Mapping[str, MaskFile | Outlines]]]] = {

@@ -15,8 +15,8 @@ from torch import Tensor
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_array, slugs
-from lang3dxl_ns.evaluation.annotations import PICTURES, check_shape, read_gray
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.layouts import PICTURES, check_shape, read_gray
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest_level
 from lang3dxl_ns.preparation.foreground import find_mask
 

@@ -13,8 +13,11 @@ from numpy import ndarray as Array
 from scipy.ndimage import gaussian_filter, uniform_filter
 from torch import Tensor
 
-from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.layouts import Truth
+from lang3dxl_ns.preparation.encoders import load_image_text_encoder
+from lang3dxl_ns.query.relevancy import CANONICAL, TEMPERATURE, calibrated
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextConfig, TextEncoder
 
 Maps = dict[str, Float[Tensor, "h w"]]
 """Relevancy maps by category, 0…1, above 0.5 at matches."""
@@ -171,19 +174,6 @@ def score_maps(
     return scores
 
 
-def bounds(labels: Maps, truths: Mapping[str, Truth]) -> dict[str, float]:
-    """Compute average precision by chance and at best, for every category in the photo.
-    `chance_ap_{category}` is that of a map without information, the share of positives. `limit_ap_{category}`
-    is that of `labels`, the exact labels after lifting and rendering (`label_limit`)."""
-    found: dict[str, float] = {}
-    for category, truth in truths.items():
-        best = average_precision(labels[category].cpu().numpy(), truth.mask)
-        if best is not None:
-            found[f"chance_ap_{category}"] = float(truth.mask.mean())
-            found[f"limit_ap_{category}"] = best
-    return found
-
-
 class MapScorer:
     """Scorer of maps against a scene's ground truth, for runs and for predictions of other programs alike."""
 
@@ -249,3 +239,35 @@ class MapScorer:
             "prompts_without_photos": [c for c in truth.categories if c not in self._scored],
             "photos_without_positives": {category: len(photos) for category, photos in self.without.items()},
         }
+
+
+class LanguageScorer(MapScorer):
+    """Scorer of relevancy maps for a scene's categories, whose names are the prompts. It treats the 3D field
+    and its 2D teacher, the photo's own CLIP target, alike."""
+
+    def __init__(self, truth: GroundTruth, encode_texts: EncodeTexts) -> None:
+        super().__init__(truth)
+        text = TextEncoder(encode_texts)
+        self.queries = text.plain_queries(truth.categories)
+        """Queries of the categories, in their order."""
+        self.yardstick = text.yardstick
+        """Words that calibrate relevancies, from `TextEncoder.yardstick`."""
+        published = TextEncoder(encode_texts, TextConfig(combine="joined", negatives=CANONICAL))
+        self.published_queries = published.queries([Prompt(category) for category in truth.categories])
+        """Queries as published: a specialist word joined with common ones, against canonical phrases."""
+
+    def named(self, maps: Float[Tensor, "q H W"], size: tuple[int, int]) -> Maps:
+        """Return the categories' maps by name, resized to `size`."""
+        return dict(zip(self.truth.categories, resize_map(maps, size), strict=True))
+
+    def teacher_maps(self, target: Float[Tensor, "hd wd c"], size: tuple[int, int]) -> Maps:
+        """Compute maps of a CLIP target, whose features are first interpolated to `size`, as in Lang3D-XL."""
+        features = resize_map(target.permute(2, 0, 1), size).permute(1, 2, 0)
+        queries, words = self.queries.to(features.device), self.yardstick.to(features.device)
+        temperature = calibrated(TEMPERATURE, words.cosines(target.flatten(0, 1).float()))
+        return self.named(queries.relevancy_of_cosines(queries.cosines(features), temperature), size)
+
+
+def open_scorer(truth: GroundTruth, clip: str, device: torch.device | str) -> LanguageScorer:
+    """Open the scorer for targets made with this CLIP (name or folder)."""
+    return LanguageScorer(truth, load_image_text_encoder(clip, device).encode_texts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
@@ -33,14 +33,13 @@ from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for, recorded_scene
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
-from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset, novel_outputs
-from lang3dxl_ns.preparation.collection import CropPlan, plan_crops, prepare_collection
+from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
+from lang3dxl_ns.preparation.crop_plan import CropPlan, plan_crops
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
-from lang3dxl_ns.preparation.physical_scale import pixel_sizes
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -49,7 +48,6 @@ from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, S
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.scene.colmap import Reconstruction
-from lang3dxl_ns.scene.novel_views import NovelViews, read_novel_views
 from lang3dxl_ns.scene.photo import Photo
 
 
@@ -147,15 +145,16 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return self.config.run or super().get_datapath()
 
     def create_train_dataset(self) -> PhotoDataset:
-        dataset = self._dataset(self.train_dataparser_outputs)
+        dataset = self.dataset_of(self.train_dataparser_outputs)
         positions = dataset.cameras.camera_to_worlds[..., 3]
         SceneFacts([photo.name for photo in dataset.photos], positions).into(dataset.metadata)
         return dataset
 
     def create_eval_dataset(self) -> PhotoDataset:
-        return self._dataset(self.dataparser.get_dataparser_outputs(split=self.test_split))
+        return self.dataset_of(self.dataparser.get_dataparser_outputs(split=self.test_split))
 
-    def _dataset(self, outputs: DataparserOutputs) -> PhotoDataset:
+    def dataset_of(self, outputs: DataparserOutputs) -> PhotoDataset:
+        """Build the dataset of a dataparser's outputs. Raises UserError if they have no photo."""
         if "photos" not in outputs.metadata:  # one of nerfstudio's own dataparsers
             outputs.metadata["photos"] = photos_of(outputs, Path(self.config.dataparser.data))
         if not outputs.metadata["photos"]:
@@ -200,10 +199,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
             return None
         # Held-out photos have the whole pyramid, which serves as the 2-D teacher.
         fine = [p.name for p in self.train_dataset.photos] if self.config.crops == "fine" else []
-        return prepare_collection(
-            photos, self._reconstruction(), self.config, self.cache_dir, self.device,
-            log=_log, regions=self._region_source, fine=fine,
-        ).reader  # fmt: skip
+        plan, store = self.crop_plan, FeatureStore(self.cache_dir)
+        for reason in plan.reasons:
+            _log(reason)
+        return prepare(
+            photos, plan.pixel_sizes, self.config, plan.scales, store, self.device, self._region_source, fine
+        )
 
     def clean_store(self) -> tuple[int, int]:
         """Delete targets that this configuration and the scene's photos don't use; count files and bytes."""
@@ -213,46 +214,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
         used += [FOREGROUND] if c.foreground == "text" else []
         used += [REGIONS] if self._region_source is not None else []
         names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
-        names += [] if self.test_views is None else [view.name for view in self.test_views.cameras]
         return FeatureStore(self.cache_dir).clean(used, names)
 
     @cached_property
-    def test_views(self) -> NovelViews | None:
-        """Test views of the scene; None if it has none."""
-        return read_novel_views(self.data_folder)
-
-    @cached_property
-    def test_dataset(self) -> PhotoDataset:
-        """The test views as photos, with targets made with the collection's crop sizes."""
-        views, config = self.test_views, self.config
-        if views is None:
-            raise UserError(
-                f"{self.data_folder} has no test views: `lang3dxl demo-scene` makes scenes with them"
-            )
-        dataset = self._dataset(
-            novel_outputs(views, self.train_dataparser_outputs, config.foreground != "none")
-        )
-        if self.targets is not None:
-            config = config if config.targets_in_steps else replace(config, dense="none")
-            sizes, store = self.test_pixel_sizes(dataset.photos), FeatureStore(self.cache_dir)
-            prepare(dataset.photos, sizes, config, self.crop_plan.scales, store, self.device)
-        return dataset
-
-    @cached_property
     def crop_plan(self) -> CropPlan:
-        """Crop sizes of the scene's photos, which test views share."""
-        return plan_crops(list(self.photos.values()), self._reconstruction(), self.config)
-
-    def test_pixel_sizes(self, photos: list[Photo]) -> dict[str, float] | None:
-        """Return the world units per pixel of the test views' photos, by the same rules as for all others;
-        None if crops are relative."""
-        if self.crop_plan.pixel_sizes is None or self.test_views is None:
-            return None
-        views = {view.name: view for view in self.test_views.cameras}
-        seen = replace(self._reconstruction(), photos=views)
-        # These are per pixel of the views' files.
-        sizes, _ = pixel_sizes(seen, self.config.pixel_distance, self.config.pixel_angle)
-        return {photo.name: sizes[photo.name] * views[photo.name].width / photo.width for photo in photos}
+        """Crop sizes of the scene's photos."""
+        return plan_crops(list(self.photos.values()), self.reconstruction, self.config)
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
@@ -263,9 +230,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Needs of the scene for optional components, measured on first use."""
         learns, photos = self.config.clip != "none", list(self.photos.values())
         dense, regions = self.config.makes_dense, self._region_source is not None
-        return scene_needs(
-            photos, self._reconstruction(), self.crop_plan, learns and dense, learns and regions
-        )
+        return scene_needs(photos, self.reconstruction, self.crop_plan, learns and dense, learns and regions)
 
     @cached_property
     def photos(self) -> dict[str, Photo]:
@@ -285,12 +250,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Describe the scene for the run's folder: photos, cameras and CLIP."""
         outputs, clip = self.train_dataparser_outputs, self.config.clip
         known = None if clip == "none" else find_model(clip, CLIP_OPTION)
-        local, trained = expanded(clip), self._described(self.train_dataset, "train")
+        trained = self._described(self.train_dataset, "train")
         names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are also held out
         held_out = self._described(self.eval_dataset, "eval")
         return SceneFile(
             photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
-            clip=None if known is None else str(local.absolute()) if local.is_dir() else clip,
+            clip=None if known is None else known.address,
             clip_identity=None if known is None else known.identity,
             scale=float(outputs.dataparser_scale),
             transform=outputs.dataparser_transform.tolist(),
@@ -299,18 +264,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def _described(self, dataset: PhotoDataset, split: Literal["train", "eval"]) -> list[ScenePhoto]:
         poses, photos = dataset.cameras.camera_to_worlds.tolist(), self.photos
-        return [
-            ScenePhoto(
-                name=photo.name,
-                split=split,
-                camera_to_world=pose,
-                lens=photo.lens.scaled(dataset.scale),
-                mask=None if photo.mask_path is None else str(photo.mask_path.absolute()),
-                size=(photo.lens.width, photo.lens.height),
-                quarter_turns=photo.quarter_turns,
-            )
-            for photo, pose in zip((photos[p.name] for p in dataset.photos), poses, strict=True)
-        ]
+        named = zip((photo.name for photo in dataset.photos), poses, strict=True)
+        return [ScenePhoto.of(photos[name], split, pose, dataset.scale) for name, pose in named]
 
     @property
     def data_folder(self) -> Path:
@@ -323,8 +278,9 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Folder of prepared targets."""
         return expanded(self.config.cache_dir or self.data_folder / "lang3dxl_cache")
 
-    def _reconstruction(self) -> Reconstruction:
-        """Return the model in its own units: COLMAP's, or else one made from the dataparser's seed points."""
+    @property
+    def reconstruction(self) -> Reconstruction:
+        """The model in its own units: COLMAP's, or else one made from the dataparser's seed points."""
         own = getattr(self.dataparser, "reconstruction", None)
         if own is not None:
             return own

@@ -1,10 +1,10 @@
-"""Evaluation of a run: renders the photos of a split and scores their colors, features and words."""
+"""Evaluation of a run: renders the photos of a split and scores their colors and words."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -22,11 +22,9 @@ from lang3dxl_ns.common.reports import host_peak, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
 from lang3dxl_ns.evaluation.half_image import PROTOCOL, HalfImageProtocol
-from lang3dxl_ns.evaluation.label_limit import label_limit
-from lang3dxl_ns.evaluation.language import LanguageScorer, open_scorer
 from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
 from lang3dxl_ns.evaluation.score_scene import truths_of
-from lang3dxl_ns.evaluation.scores import bounds, inside, map_size
+from lang3dxl_ns.evaluation.scores import LanguageScorer, inside, map_size, open_scorer
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
@@ -35,15 +33,9 @@ from lang3dxl_ns.plugin.photo_dataset import EvalPhotos
 from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.photo import Photo
 
-Split = Literal["held-out", "seen", "test"]
-Score = Callable[[Cameras, EvaluatedPhoto, Batch, Photo], None]
-"""Function that adds word scores to an evaluated photo."""
-LabelLimit = Callable[[Camera], Float[Tensor, "categories h w"]]
-_COLORS_OF_LIGHT = ("psnr", "ssim", "lpips")
-"""Image metrics that are meaningless for views whose lighting differs from the photos'."""
+Split = Literal["held-out", "seen"]
 
 
 @dataclass
@@ -57,8 +49,8 @@ class EvaluationSettings:
     ground_truth_layout: Layout | Literal["auto"] = "auto"
     """Layout of ground truth: HolyScenes' masks, LERF-OVS' or PT-OVS' labels, or plain; `auto` detects it."""
     evaluated_photos: Split = "held-out"
-    """Photos that `ns-eval` evaluates. `held-out`: photos held out of training, and any test views. `seen`:
-    training photos with ground truth, as in HolyScenes' main tables. `test`: the scene's test views."""
+    """Photos that `ns-eval` evaluates. `held-out`: photos held out of training. `seen`: training photos with
+    ground truth, as in HolyScenes' main tables."""
 
 
 class Evaluation:
@@ -82,17 +74,6 @@ class Evaluation:
         self._check_labels(truth)
         return open_scorer(truth, self._data.config.clip, self._model.device)
 
-    @cached_property
-    def _test_scorer(self) -> LanguageScorer | None:
-        views = self._data.test_views
-        if views is None or self._model.semantic_field is None:
-            return None
-        truth = GroundTruth(views.folder / "ground_truth", "plain")
-        return open_scorer(truth, self._data.config.clip, self._model.device)
-
-    def _scorer_of(self, split: Split) -> LanguageScorer | None:
-        return self._test_scorer if split == "test" else self.scorer
-
     def _check_labels(self, truth: GroundTruth) -> None:
         """Check that each label belongs to one photo of the scene; warn about labels without a photo."""
         named: dict[str, str] = {}
@@ -115,34 +96,32 @@ class Evaluation:
                 f"scored:[/yellow] {escape(some(absent))}"
             )
 
-    @torch.no_grad()
     def evaluate(self, split: Split | None = None) -> Iterator[EvaluatedPhoto]:
         """Render and score the photos of a split (default: the configured one), with a progress bar."""
+        split = split or self._settings.evaluated_photos
+        return self.evaluate_photos(self._photos_of(split), self.scorer, self._fits_looks(split))
+
+    @torch.no_grad()
+    def evaluate_photos(
+        self, photos: EvalPhotos, scorer: LanguageScorer | None, fits_looks: bool = False
+    ) -> Iterator[EvaluatedPhoto]:
+        """Render photos and score them, their words by a scorer, with a progress bar; `fits_looks` applies
+        the half-image protocol."""
         self._model.eval()
         self._engine = None
-        split = split or self._settings.evaluated_photos
-        photos, score = self._photos_of(split), None
-        scorer = self._scorer_of(split)
-        if scorer is not None:
-            score = partial(self._score_words, scorer, self._label_limit(scorer, photos))
-        views = self._data.test_views if split == "test" else None
-        hidden = () if views is None or views.same_light else _COLORS_OF_LIGHT
         for number, (camera, batch) in enumerate(tracked(photos, "evaluating", len(photos))):
             photo = photos.dataset.photos[batch["image_idx"]]
             if number == 0:  # warm-up, excluded from timing
-                self._evaluate_photo(camera, batch, photo, score)
-            evaluated = self._evaluate_photo(camera, batch, photo, score)
-            for name in hidden:
-                evaluated.metrics.pop(name, None)
-            if self._fits_looks(split):
+                self._evaluate_photo(camera, batch, photo, scorer)
+            evaluated = self._evaluate_photo(camera, batch, photo, scorer)
+            if fits_looks:
                 evaluated.images["fitted"], figures = self._half_image(camera, batch)
                 evaluated.metrics = figures | evaluated.metrics
             yield evaluated
         self._model.train()
 
     def _fits_looks(self, split: Split) -> bool:
-        """Return whether the half-image protocol applies: to held-out photos, whose looks are unknown. It
-        takes most of the time of an evaluation, and matched colors serve for test views."""
+        """Return whether the half-image protocol applies: to held-out photos, whose looks are unknown."""
         return self._model.appearance is not None and split == "held-out"
 
     def _half_image(self, camera: Cameras, batch: Batch) -> tuple[Float[Tensor, "h w 3"], dict[str, float]]:
@@ -157,7 +136,7 @@ class Evaluation:
 
     def _photos_of(self, split: Split) -> EvalPhotos:
         if split != "seen":
-            return self._data.evaluated(self._data.test_dataset if split == "test" else None)
+            return self._data.evaluated()
         if self.scorer is None:
             raise UserError("seen photos can be evaluated only with ground truth and CLIP")
         seen = self._data.train_dataset
@@ -166,15 +145,9 @@ class Evaluation:
             raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
         return self._data.evaluated(seen, labeled)
 
-    def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> LabelLimit:
-        """Build a function that renders the labels themselves, lifted from the photos to the Gaussians."""
-        truth = scorer.truth
-        sized = ((camera, p, truth.scoring_size(p.height, p.width)) for camera, p in photos.cameras())
-        labels = ((to_rasterizer(camera), truths_of(truth, photo, size)) for camera, photo, size in sized)
-        masks = ((view, {name: t.mask for name, t in truths.items()}) for view, truths in labels)
-        return label_limit(self._model.splats(), masks, truth.categories, self._model.backend)
-
-    def _evaluate_photo(self, camera, batch: Batch, photo: Photo, score: Score | None) -> EvaluatedPhoto:
+    def _evaluate_photo(
+        self, camera: Cameras, batch: Batch, photo: Photo, scorer: LanguageScorer | None
+    ) -> EvaluatedPhoto:
         start = perf_counter()
         self._model.set_crop(None)
         outputs = self._model.get_outputs(camera)
@@ -182,21 +155,14 @@ class Evaluation:
         seconds = perf_counter() - start
         metrics, images = self._model.get_image_metrics_and_images(outputs, batch)
         metrics = {"cc_psnr": self._model.corrected_psnr(outputs, batch)} | metrics
-        metrics |= self._model.feature_metrics(camera, batch)
         metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
         evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, photo.mask_path is not None)
-        if score is not None:
-            score(camera, evaluated, batch, photo)
+        if scorer is not None:
+            self._score_words(scorer, camera, evaluated, batch, photo)
         return evaluated
 
     def _score_words(
-        self,
-        scorer: LanguageScorer,
-        limit: LabelLimit,
-        camera: Cameras,
-        evaluated: EvaluatedPhoto,
-        batch: Batch,
-        photo: Photo,
+        self, scorer: LanguageScorer, camera: Cameras, evaluated: EvaluatedPhoto, batch: Batch, photo: Photo
     ) -> None:
         size = scorer.truth.scoring_size(photo.height, photo.width)
         keep = batch["mask"][..., 0] if "mask" in batch else None
@@ -215,8 +181,6 @@ class Evaluation:
         evaluated.maps = inside(raw, keep)
         truths = truths_of(scorer.truth, photo, map_size(raw))
         evaluated.metrics |= scorer.scores(photo.name, variants | {"teacher_": teacher}, truths)
-        lifted = scorer.named(limit(to_rasterizer(camera)), size)
-        evaluated.metrics |= bounds(inside(lifted, keep), truths)
 
     @torch.no_grad()
     def relevancy(self, camera: Cameras, queries: Queries, yardstick: Queries) -> Float[Tensor, "q h w"]:
@@ -234,31 +198,25 @@ class Evaluation:
     def scored(self, output_path: Path | None = None, get_std: bool = False) -> dict[str, Any]:
         """Compute means and totals over the evaluated photos, and `peak_memory_mb` of the process (or of the
         GPU, if one is used); see `evaluation.aggregate.average`. output_path: folder for a picture of every
-        photo, optional. get_std: add standard deviations, `protocol` (what was scored, and how), `photos`
-        (the figures of each), and, for held-out photos, the same for the scene's `test_views`."""
-        results = self._averages(self._settings.evaluated_photos, output_path, get_std)
-        on_gpu = torch.device(self._model.device).type == "cuda"
-        results["peak_memory_mb"] = (torch.cuda.max_memory_allocated() if on_gpu else host_peak()) / 2**20
-        beside = self._settings.evaluated_photos == "held-out" and self._data.test_views is not None
-        if get_std and beside:
-            results["test_views"] = self._averages("test", output_path, get_std)
-        return results
-
-    def _averages(self, split: Split, output_path: Path | None, get_std: bool) -> dict[str, Any]:
+        photo, optional. get_std: add standard deviations, `protocol` (what was scored, and how), and `photos`
+        (the figures of each)."""
         evaluated = []
-        for photo in self.evaluate(split):
+        for photo in self.evaluate():
             if output_path is not None:
                 photo.write_pictures(output_path)
             photo.images, photo.maps = {}, {}  # pictures and maps of all photos would take too much memory
             evaluated.append(photo)
         results = average([photo.metrics for photo in evaluated], get_std)
+        on_gpu = torch.device(self._model.device).type == "cuda"
+        results["peak_memory_mb"] = (torch.cuda.max_memory_allocated() if on_gpu else host_peak()) / 2**20
         if get_std:
-            results["protocol"] = self._protocol(split, evaluated)
+            results["protocol"] = self._protocol(evaluated)
             results["photos"] = {photo.name: photo.metrics for photo in evaluated}
         return results
 
-    def _protocol(self, split: Split, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
-        scorer, masked = self._scorer_of(split), sum(photo.masked for photo in evaluated)
+    def _protocol(self, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
+        scorer, masked = self.scorer, sum(photo.masked for photo in evaluated)
+        split = self._settings.evaluated_photos
         trained = {photo.name for photo in self._data.train_dataset.photos}
         photos: dict[str, Any] = {"split": split, "evaluated_photos": len(evaluated)}
         photos["seen_in_training"] = sum(photo.name in trained for photo in evaluated)

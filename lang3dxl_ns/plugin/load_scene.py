@@ -14,7 +14,7 @@ from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.preparation.targets import SceneFacts
-from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.run_checkpoint import latest_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, find_config
 from lang3dxl_ns.query.run_settings import read_model_config

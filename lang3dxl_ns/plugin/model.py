@@ -10,7 +10,6 @@ from math import isqrt
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import color_correct
@@ -23,7 +22,7 @@ from torch.nn import Parameter
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.timing import part
-from lang3dxl_ns.components import losses, schedules
+from lang3dxl_ns.components import losses
 from lang3dxl_ns.components.initialization import (
     EVERY,
     FREE,
@@ -34,8 +33,9 @@ from lang3dxl_ns.components.initialization import (
     seed_positions,
 )
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
-from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr
+from lang3dxl_ns.evaluation.photo_metrics import Lpips, psnr
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
+from lang3dxl_ns.plugin.optimizers import semantic_ramp
 from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
@@ -166,7 +166,7 @@ class Lang3DXLModel(RenderingModel):
     ) -> dict[str, Tensor]:
         c = self.config
         assert c.dense_weight is not None
-        ramp = schedules.semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
+        ramp = semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
         size = fitted_size(codes, self._random_size())
         clip, dense, small_mask = self._decode_small(codes, mask, size)
         assert self.semantic_field is not None and self.downsampler is not None
@@ -183,10 +183,8 @@ class Lang3DXLModel(RenderingModel):
                 difference = losses.dense_loss(dense, batch["dense_target"], shown, c.dense_compare)
                 loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
-                labels = _resized(batch["regions"], clip.shape[:2])
-                loss["regions"] = c.region_weight * losses.region_variance_loss(
-                    clip, labels.long(), small_mask
-                )
+                labels = resize_nearest(batch["regions"], (clip.shape[0], clip.shape[1]))
+                loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
             own = self.semantic_field.own_losses(clip, dense)
         return loss | {name: ramp * value for name, value in own.items()}
 
@@ -195,7 +193,7 @@ class Lang3DXLModel(RenderingModel):
         assert self.semantic_field is not None
         with part("decode"):
             clip, dense = self.semantic_field(resize_nearest(codes, size))
-        return clip, dense, _resized(mask, size)
+        return clip, dense, None if mask is None else resize_nearest(mask, size)
 
     def _random_size(self) -> int:
         """Draw the longer side at which this iteration decodes. It is one of a few, since a GPU's libraries
@@ -249,39 +247,6 @@ class Lang3DXLModel(RenderingModel):
         perceptual = self.lpips(*chw)
         return metrics if perceptual is None else metrics | {"lpips": perceptual}
 
-    @torch.no_grad()
-    def feature_metrics(self, camera: Cameras, batch: Batch) -> dict[str, float]:
-        """Measure agreement with a photo's targets, for the model and for the mean training feature."""
-        if self.carried is None or "clip_target" not in batch:
-            return {}
-        assert self.config.decode_size is not None
-        mask = batch["mask"][..., 0] if "mask" in batch else None
-        clip, dense, small_mask = self._feature_maps(camera, self.config.decode_size[1], mask)
-        target = batch["clip_target"]
-        predicted, weight = match(clip, target, batch["crop_sides"], small_mask)
-        metrics = feature_metrics("clip", predicted, target, self.clip_mean, weight)
-        if dense is not None and "dense_target" in batch:
-            target = losses.resize(batch["dense_target"], dense.shape[:2])
-            metrics |= feature_metrics("dense", dense, target, self.dense_mean, small_mask)
-        return metrics
-
-    def _feature_maps(self, camera: Cameras, longer_side: int, mask: Tensor | None):
-        """Compute features in a camera → clip [h, w, C], dense [h, w, D] or None, mask [h, w]. They are
-        decoded before or after compositing, depending on the decoder."""
-        decoder, carried = self.semantic_field, self.carried
-        assert decoder is not None and carried is not None
-        if not decoder.per_gaussian:
-            codes = self.composite(camera, carried)
-            return self._decode_small(codes, mask, fitted_size(codes, longer_side))
-        # The last layer is linear, so hidden activations are composited and divided by coverage.
-        known = carried.isfinite().all(1, keepdim=True)
-        hidden = torch.where(known, decoder.hidden(torch.where(known, carried, 0.0)), 0.0)
-        maps = self.composite(camera, torch.cat([hidden, known.to(hidden)], dim=1))
-        size = fitted_size(maps, longer_side)
-        maps = resize_nearest(maps, size)
-        clip, head = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3), decoder.clip_head()
-        return clip if head is None else F.linear(clip, *head), None, _resized(mask, size)
-
     # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs):  # type: ignore[override]
@@ -301,8 +266,3 @@ class Lang3DXLModel(RenderingModel):
                 )
             parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super(SplatfactoModel, self).load_state_dict(state, **kwargs)
-
-
-def _resized(values: Tensor | None, size: tuple[int, int]) -> Any:
-    """Resize a mask or labels [h, w] to a size (nearest), as floats; None stays None."""
-    return None if values is None else resize_nearest(values[..., None].float(), size)[..., 0]

@@ -8,14 +8,13 @@ from typing import Literal
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from lang3dxl_ns.common.settings_help import showing, without
-from lang3dxl_ns.components import schedules
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO
-from lang3dxl_ns.plugin.optimizers import run_length_weight
+from lang3dxl_ns.plugin.optimizers import log_linear, run_length_weight
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
 
 SHORT_FIELD_RUN = 5_000
@@ -126,9 +125,9 @@ class ModelSettings(SplatfactoModelConfig):
             self.appearance.preset = "coarse" if iterations < SHORT_FIELD_RUN else "paper"
         self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
         if self.densify_grad_thresh is None:
-            self.densify_grad_thresh = schedules.log_linear(x, 2e-3, 2e-4)
+            self.densify_grad_thresh = log_linear(x, 2e-3, 2e-4)
         if self.dense_weight is None:
-            self.dense_weight = schedules.log_linear(x, 2.0, 0.5)
+            self.dense_weight = log_linear(x, 2.0, 0.5)
         if self.decode_size is None:
             self.decode_size = (round(56 + 24 * x), round(72 + 48 * x))
 

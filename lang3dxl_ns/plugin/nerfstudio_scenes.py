@@ -18,7 +18,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import check_regular, expanded, read_json
 from lang3dxl_ns.plugin.cameras import lens_of
 from lang3dxl_ns.preparation.physical_scale import points_in_view
-from lang3dxl_ns.scene.camera import Lens, check_pose
+from lang3dxl_ns.scene.camera import Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo import Photo
@@ -147,10 +147,10 @@ def reconstruction_of(splits: list[DataparserOutputs]) -> Reconstruction:
         colors = metadata["points3D_rgb"].numpy() if len(points) else colors
     photos = {}
     for outputs in splits:
-        poses = outputs.cameras.camera_to_worlds.double().numpy()
+        poses = outputs.cameras.camera_to_worlds.double()
         for photo, pose in zip(outputs.metadata["photos"], poses, strict=True):
-            rotation = (pose[:, :3] * [1, -1, -1]).T  # OpenGL camera axes to OpenCV's, inverted
-            camera_from_world = np.hstack([rotation, -rotation @ pose[:, 3:] / scale])
+            camera_from_world = view_matrix(pose)[:3].numpy()
+            camera_from_world[:, 3] /= scale
             tracked = TrackedPhoto(photo.name, photo.lens, camera_from_world, _NONE, _NONE[:, :2])
             photos[photo.name] = replace(tracked, points=points_in_view(points, tracked))
     return Reconstruction(dict(sorted(photos.items())), points, colors)

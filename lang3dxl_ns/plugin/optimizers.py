@@ -1,4 +1,9 @@
-"""Optimizers: Adam and its learning rates over a run of any length, with a guard before each step."""
+"""Optimizers: Adam with a guard before each step, learning rates and other schedules of runs of any length.
+
+A schedule is a function of x, the run's fraction, and keeps its nearest end value outside [0, 1]. All return
+Python floats, because a NumPy scalar would end up in optimizer state and checkpoints, where a safe loader
+rejects it.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +20,6 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from lang3dxl_ns.components import schedules
-
 SHORT_RUN = 1_000
 """Iterations up to which runs use the short-run rates."""
 LONG_RUN = 30_000
@@ -26,7 +29,28 @@ LONG_RUN = 30_000
 def run_length_weight(iterations: int) -> float:
     """Compute the position of a run between the short (0) and the long one (1), on a logarithmic scale."""
     position = math.log(max(iterations, 1) / SHORT_RUN) / math.log(LONG_RUN / SHORT_RUN)
-    return min(max(position, 0.0), 1.0)
+    return _fraction(position)
+
+
+def log_linear(x: float, start: float, end: float) -> float:
+    """Interpolate from start to end (both positive), linearly in the logarithm."""
+    x = _fraction(x)
+    return math.exp((1 - x) * math.log(start) + x * math.log(end))
+
+
+def semantic_ramp(x: float, share: float) -> float:
+    """Raise the weight of the semantic losses from 0.1 to 1 over the run's first `share`: geometry leads."""
+    return log_linear(x / share if share > 0 else 1.0, 0.1, 1.0)
+
+
+def cosine_decay(x: float, peak: float, end: float, power: float = 1.0) -> float:
+    """Go from peak to end along half a cosine of x^power; a power above 1 stays near the peak longer."""
+    peak, end = float(peak), float(end)
+    return end + 0.5 * (peak - end) * (1 + math.cos(math.pi * _fraction(x) ** float(power)))
+
+
+def _fraction(x: float) -> float:
+    return min(max(float(x), 0.0), 1.0)
 
 
 @dataclass
@@ -43,7 +67,7 @@ class RunAdamConfig(AdamOptimizerConfig):
     def fit(self, iterations: int) -> None:
         """Resolve `lr` for a run of this many iterations."""
         if self.short_lr is not None:
-            self.lr = schedules.log_linear(run_length_weight(iterations), self.short_lr, self.lr)
+            self.lr = log_linear(run_length_weight(iterations), self.short_lr, self.lr)
             self.short_lr = None
 
     def setup(self, params) -> Optimizer:
@@ -85,16 +109,15 @@ class RunSchedule(Scheduler):
         return LambdaLR(optimizer, lambda step: self.multiple(step))
 
     def multiple(self, step: int) -> float:
-        """Compute the multiple of the rate at an iteration, as a Python float (a NumPy one would end up in
-        the checkpoint, where torch's weights-only loader rejects it)."""
+        """Compute the multiple of the rate at an iteration."""
         c = self.config
         x = min(step / max(c.total_steps, 1) / c.until, 1.0)
         if x < c.warm:
-            return schedules.log_linear(x / c.warm, c.start, 1.0)
+            return log_linear(x / c.warm, c.start, 1.0)
         rest = (x - c.warm) / (1.0 - c.warm) if c.warm < 1.0 else 1.0
         if c.shape == "log-linear":
-            return schedules.log_linear(rest, 1.0, c.end)
-        return schedules.cosine_decay(rest, 1.0, c.end, c.power)
+            return log_linear(rest, 1.0, c.end)
+        return cosine_decay(rest, 1.0, c.end, c.power)
 
 
 class GuardedOptimizers(Optimizers):

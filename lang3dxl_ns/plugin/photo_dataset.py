@@ -1,9 +1,8 @@
-"""Datasets of photos and test views, read upright, undistorted and resized on demand."""
+"""Datasets of photos, read upright, undistorted and resized on demand."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -16,12 +15,8 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
-from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
-from lang3dxl_ns.scene.camera import camera_to_world
-from lang3dxl_ns.scene.colmap import TrackedPhoto
-from lang3dxl_ns.scene.novel_views import NovelViews
 from lang3dxl_ns.scene.photo import Photo
 
 
@@ -78,19 +73,15 @@ class EvalPhotos:
     ):
         self.dataset, self._ready = dataset, ready
         photos = enumerate(dataset.photos)
-        self._wanted = [index for index, photo in photos if names is None or photo.name in names]
+        self.indices = [index for index, photo in photos if names is None or photo.name in names]
+        """Indices of these photos in the dataset."""
 
     def __len__(self) -> int:
-        return len(self._wanted)
-
-    def cameras(self) -> Iterator[tuple[Cameras, Photo]]:
-        """Yield every photo's camera and the photo, without reading files."""
-        for index in self._wanted:
-            yield self.dataset.cameras[index : index + 1], self.dataset.photos[index]
+        return len(self.indices)
 
     def __iter__(self) -> Iterator[tuple[Cameras, Batch]]:
         read, usable = self._ready(), False
-        for index in self._wanted:
+        for index in self.indices:
             try:
                 item = read(index)
             except UserError as reason:
@@ -101,32 +92,3 @@ class EvalPhotos:
             yield item
         if not usable:
             raise UserError("none of the photos can be used: see the reasons above")
-
-
-def novel_outputs(views: NovelViews, trained: DataparserOutputs, masked: bool) -> DataparserOutputs:
-    """Build dataparser outputs of the test views. trained: outputs of the photos, whose transform and scale
-    also apply to the views' cameras. masked: whether to include the views' foreground masks, if any."""
-
-    def photo(view: TrackedPhoto) -> Photo:
-        picture = views.image(view)
-        return Photo.from_model(
-            view, picture, find_mask(views.folder / "masks", picture.name) if masked else None
-        )
-
-    photos = [photo(view) for view in views.cameras]
-    transform, scale = trained.dataparser_transform.double(), trained.dataparser_scale
-    poses = [_pose(torch.from_numpy(g.camera_from_world), transform, scale) for g in views.cameras]
-    cameras = to_nerfstudio([photo.lens for photo in photos], torch.stack(poses).float())
-    files = [photo.path for photo in photos]
-    metadata = {"photos": photos}
-    return replace(trained, image_filenames=files, mask_filenames=None, cameras=cameras, metadata=metadata)
-
-
-def _pose(
-    camera_from_world: Float[Tensor, "3 4"], transform: Float[Tensor, "3 4"], scale: float
-) -> Float[Tensor, "3 4"]:
-    """Convert to camera → world in the run's frame, x ↦ scale · transform(x), with nerfstudio's axes."""
-    bottom = camera_from_world.new_tensor([[0.0, 0.0, 0.0, 1.0]])
-    pose = camera_to_world(torch.cat([camera_from_world, bottom]))
-    position = transform[:, :3] @ pose[:, 3:] + transform[:, 3:]
-    return torch.cat([transform[:, :3] @ pose[:, :3], scale * position], dim=1)

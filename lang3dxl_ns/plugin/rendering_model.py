@@ -27,8 +27,7 @@ from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.conversation import Conversation
-from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.question import Question, pictures
+from lang3dxl_ns.query.question import QueryConfig, Question, pictures
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import EncodeTexts
@@ -127,7 +126,7 @@ class RenderingModel(SplatfactoModel):
         scene has colors only."""
         codes, looks = self.carried, self.appearance
         return Scene(
-            self.splats().copied(),
+            self.splats().mapped(torch.clone),
             file,
             None if codes is None else _frozen(self.semantic_field),
             None if codes is None else codes.detach().clone(),

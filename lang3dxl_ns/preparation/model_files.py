@@ -45,6 +45,12 @@ class ModelFiles:
     option: str
     """Command-line option that chose the model, for messages."""
 
+    @property
+    def address(self) -> str:
+        """Name or whole path by which the model is found again, also from another folder."""
+        local = expanded(self.name)
+        return str(local.absolute()) if local.is_dir() else self.name
+
 
 def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     """Find a model's files by a local folder, a Hugging Face name (downloaded once), or "builtin", which is

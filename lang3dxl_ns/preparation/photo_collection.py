@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
 
@@ -16,7 +17,7 @@ from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.preparation.foreground import find_mask
-from lang3dxl_ns.scene.camera import Lens, check_pose
+from lang3dxl_ns.scene.camera import Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
@@ -174,6 +175,4 @@ def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
 
 def _camera_from_world(matrix: Any) -> Float[Array, "3 4"]:
     check_pose(matrix)
-    pose = np.array(matrix, dtype=np.float64)
-    rotation = (pose[:3, :3] * [1, -1, -1]).T  # OpenGL's camera axes to OpenCV's, inverted
-    return np.hstack([rotation, -rotation @ pose[:3, 3:]])
+    return view_matrix(torch.tensor(matrix[:3], dtype=torch.float64))[:3].numpy()

@@ -70,18 +70,6 @@ _LONG_S = 1800.0
 
 
 @dataclass
-class PreparedTargets:
-    """Result of a preparation."""
-
-    reader: TargetReader
-    """Reader for the photos whose targets are complete, in the order given."""
-    left_out: dict[str, str]
-    """Reason for each photo that could not be read, by name."""
-    encoded: int
-    """Number of photos for which this run made an entry."""
-
-
-@dataclass
 class _Task:
     """A photo, its targets, and those that are still to be made."""
 
@@ -129,8 +117,9 @@ def prepare(
     device: torch.device | str,
     regions: RegionSource | None = None,
     fine: Collection[str] = (),
-) -> PreparedTargets:
-    """Make the missing targets of all photos. The work ahead and the disk it needs are logged first.
+) -> TargetReader:
+    """Make the missing targets of all photos, and return the reader of those that are complete, in the order
+    given. The work ahead and the disk it needs are logged first.
 
     pixel_sizes: world units per pixel *of the photo as it is read* (its `width`), by photo name; None for
     relative scales. scales: crop sides in world units, or in photo widths without pixel sizes.
@@ -161,11 +150,10 @@ def prepare(
         raise UserError("no photo can be prepared: " + ("; ".join(left_out.values()) or "the scene has none"))
     if left_out:
         say(f"left out {len(left_out)} of {len(photos)} photos:", *(f"  {why}" for why in left_out.values()))
-    encoded = sum(task.photo.name not in left_out for task in missing)
     with_dense, with_regions = (
         [task.photo.name for task in tasks if kind in task.kinds] for kind in (DENSE, REGIONS)
     )
-    return PreparedTargets(TargetReader(store, names, with_dense, with_regions, fine), left_out, encoded)
+    return TargetReader(store, names, with_dense, with_regions, fine)
 
 
 def _plan(

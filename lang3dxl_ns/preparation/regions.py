@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_array
-from lang3dxl_ns.common.image import fitted_size, resize
+from lang3dxl_ns.common.image import fitted_size, resize, resize_nearest
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.model_files import ModelFiles
 from lang3dxl_ns.preparation.segmentation import (
@@ -121,7 +121,7 @@ class MaskRegions:
         """Label `image` by the network's masks, at the size of a stored label map."""
         small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
         size = label_size(*small.shape[:2])
-        masks = [_nearest(mask, size) for mask in self._masks(small)]
+        masks = [resize_nearest(mask, size) for mask in self._masks(small)]
         return label_map(torch.stack(masks), self._level) if masks else torch.full(size, -1)
 
 
@@ -164,7 +164,7 @@ def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "
 
 def stored_labels(labels: Int[Tensor, "hl wl"]) -> Int[Tensor, "h w"]:
     """Convert a label map for storage: `label_size` (nearest), numbered from 0, −1 for none, on the CPU."""
-    small = _numbered(_nearest(labels, label_size(*labels.shape)).cpu())
+    small = _numbered(resize_nearest(labels, label_size(*labels.shape)).cpu())
     return small.to(torch.int16 if small.max() < 2**15 else torch.int32)
 
 
@@ -195,15 +195,6 @@ def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
     """Renumber regions without gaps from 0; −1 for none."""
     regions, numbers = labels.clamp(min=-1).unique(return_inverse=True)
     return numbers - int(regions[0] < 0)
-
-
-def _nearest(values: Tensor, size: tuple[int, int]) -> Tensor:
-    """Resize integers: every pixel takes the value under its center."""
-    rows, columns = (
-        ((torch.arange(n, device=values.device) + 0.5) * length / n).long()
-        for n, length in zip(size, values.shape, strict=True)
-    )
-    return values[rows[:, None], columns]
 
 
 def _shrunk(image: Float[Tensor, "h w 3"], longer_side: int) -> Float[Tensor, "hs ws 3"]:

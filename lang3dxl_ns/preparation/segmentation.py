@@ -49,9 +49,6 @@ class TextSegmenter(Protocol):
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
         """Compute the mask of any of the prompts, at the size of the image, on the CPU."""
 
-    def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Compute the confidence in every prompt at every pixel, 0…1, at the image's size, on the CPU."""
-
 
 @dataclass(frozen=True)
 class SegmenterFiles:
@@ -117,7 +114,7 @@ class ClipSeg:
 
     @torch.no_grad()
     def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Compute the probabilities of all prompts (see `TextSegmenter.probabilities`)."""
+        """Compute every prompt's probability at every pixel, at the image's size, on the CPU."""
         inputs = self._processor(
             text=list(prompts),
             images=[_picture(image)] * len(prompts),
@@ -146,21 +143,12 @@ class Sam3:
         found = self.instances(image, prompts)
         return torch.cat([masks for masks, _ in found]).any(dim=0)
 
-    def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Compute, for each prompt and pixel, the highest instance score × mask, without a threshold."""
-        maps = []
-        for output in self._outputs(image, prompts):
-            scores = (output.pred_logits.sigmoid() * output.presence_logits.sigmoid())[0]
-            maps.append((scores[:, None, None] * output.pred_masks[0].sigmoid()).amax(dim=0))
-        size = tuple(image.shape[:2])
-        return F.interpolate(torch.stack(maps)[None].float(), size, mode="bilinear")[0].cpu()
-
     def instances(
         self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]
     ) -> list[tuple[Bool[Tensor, "n h w"], Float[Tensor, " n"]]]:
         """Find each prompt's instances: masks at the size of the image, and scores, on the CPU."""
         size, found = tuple(image.shape[:2]), []
-        for output in self._outputs(image, prompts):
+        for output in self.outputs(image, prompts):
             (result,) = self._processor.post_process_instance_segmentation(
                 output, _LEAST_SCORE, _LEAST_SCORE, target_sizes=[size]
             )
@@ -169,7 +157,8 @@ class Sam3:
         return found
 
     @torch.no_grad()
-    def _outputs(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Iterator[Any]:
+    def outputs(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Iterator[Any]:
+        """Yield the network's output for each prompt."""
         device = self._model.device
         pixels = self._processor(images=image.permute(2, 0, 1), return_tensors="pt")["pixel_values"]
         vision = self._model.get_vision_features(pixel_values=pixels.to(device))
@@ -201,21 +190,12 @@ class BoxesAndSam:
 
     def segment(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Bool[Tensor, "h w"]:
         """Combine the masks of all boxes (see `TextSegmenter.segment`)."""
-        return (self.probabilities(image, prompts) > 0).any(dim=0)
-
-    def probabilities(self, image: UInt8[Tensor, "h w 3"], prompts: Sequence[str]) -> Float[Tensor, "q h w"]:
-        """Compute the score of the best box whose mask covers the pixel, else 0, for each prompt. The
-        detector sees one prompt at a time, so that prompts don't compete."""
-        found = [self.boxes(image, prompt) for prompt in prompts]
-        masks = iter(self._masks(image, torch.cat([boxes for boxes, _ in found])))
-        maps = torch.zeros(len(prompts), *image.shape[:2])
-        for one, (_, scores) in zip(maps, found, strict=True):
-            for score in scores:
-                torch.maximum(one, next(masks) * score, out=one)
-        return maps
+        boxes = [self.boxes(image, prompt)[0] for prompt in prompts]
+        return self.masks(image, torch.cat(boxes)).any(dim=0)
 
     @torch.no_grad()
-    def _masks(self, image: UInt8[Tensor, "h w 3"], boxes: Float[Tensor, "n 4"]) -> Bool[Tensor, "n h w"]:
+    def masks(self, image: UInt8[Tensor, "h w 3"], boxes: Float[Tensor, "n 4"]) -> Bool[Tensor, "n h w"]:
+        """Segment what each box holds, at the size of the image, on the CPU."""
         if not len(boxes):
             return torch.zeros(0, *image.shape[:2], dtype=torch.bool)
         inputs = self._sam_processor(
@@ -233,7 +213,8 @@ class BoxesAndSam:
     def boxes(
         self, image: UInt8[Tensor, "h w 3"], prompt: str
     ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, " n"]]:
-        """Find the boxes of what the prompt names (left, top, right, bottom in pixels), and their scores."""
+        """Find the boxes of what the prompt names (left, top, right, bottom in pixels), and their scores. The
+        detector sees one prompt at a time, so that prompts don't compete."""
         caption = prompt.strip().lower().rstrip(".") + "."  # the form that the detector was trained with
         inputs = self._detector_processor(images=_picture(image), text=caption, return_tensors="pt")
         output = self._detector(**inputs.to(self._detector.device))

@@ -10,7 +10,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,8 @@ class FeatureStore:
         from safetensors.torch import save
 
         stored = {key: _compact(tensor, f"{key} of {name} ({kind})") for key, tensor in tensors.items()}
-        metadata = {"settings": _canonical(settings), "checksum": _checksum(stored)}
+        checksum = hash_tensors(hashlib.blake2b(digest_size=16), stored)
+        metadata = {"settings": _canonical(settings), "checksum": checksum}
         path = self.path(kind, name)
         self.write_bytes(path, save(stored, metadata=metadata), f"{name} ({kind})")
         _seal(path)
@@ -119,7 +120,7 @@ class FeatureStore:
                 if path.stat().st_mtime_ns % _SECOND == 0:  # sealed
                     return True
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-                if metadata.get("checksum") != _checksum(tensors):
+                if metadata.get("checksum") != hash_tensors(hashlib.blake2b(digest_size=16), tensors):
                     raise UserError(f"{path} ({kind} of {name}) is damaged: its checksum differs")
             _seal(path)
             return True
@@ -212,12 +213,11 @@ def _compact(tensor: Tensor, what: str) -> Tensor:
     return tensor.to(torch.float16 if fits else torch.float32)
 
 
-def _checksum(tensors: dict[str, Tensor]) -> str:
-    """Compute a checksum of the tensors' names, types, shapes and contents."""
-    digest = hashlib.blake2b(digest_size=16)
-    for key, tensor in sorted(tensors.items()):
-        digest.update(f"{key} {tensor.dtype} {list(tensor.shape)}".encode())
-        digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+def hash_tensors(digest: Any, tensors: Mapping[str, Tensor]) -> str:
+    """Add tensors' names, types, shapes and contents to a digest of hashlib, and return its hex digits."""
+    for name, value in sorted(tensors.items()):
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
 
 

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
-from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.question import Question, pictures
+from lang3dxl_ns.query.question import QueryConfig, Question, pictures
 from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution

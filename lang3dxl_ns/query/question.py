@@ -1,4 +1,4 @@
-"""A question: prompts put to one scene, and everything that their answers share.
+"""A question: prompts put to one scene, settings of queries, and everything that the answers share.
 
 All code that shows matches, in pixels or in Gaussians, goes through a question. Thresholds, doubt and the
 restriction to a foreground are therefore decided here and nowhere else.
@@ -7,7 +7,7 @@ restriction to a foreground are therefore decided here and nowhere else.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -15,11 +15,14 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.image import resize_nearest
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
-from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
+from lang3dxl_ns.query.text import Prompt, TextConfig
 from lang3dxl_ns.rendering.render import Rendering
 
 EVEN = 0.5
@@ -29,6 +32,43 @@ SHARE = 0.3
 Tuned on the validation landmarks (docs/lab/words.md)."""
 COVERED = 0.3
 """Share of a pixel that matching Gaussians must cover; under half, as most are small and edges blend."""
+_BOUNDS = {
+    "temperature": (1e-3, 1e4),
+    "threshold": (0, 1),
+    "min_alpha": (0, 1),
+    "size": (1, 1 << 16),
+    "views": (1, 1e6),
+    "view_side": (8, 8192),
+}
+
+
+@showing("threshold", "size", "foreground")
+@dataclass
+class QueryConfig:
+    """Settings of queries."""
+
+    text: TextConfig = field(default_factory=TextConfig)
+    """How prompts become vectors: synonyms, their combination, and negatives."""
+    temperature: float = TEMPERATURE
+    """Softmax temperature of the relevancy, for an encoder whose cosines spread like the built-in CLIP's;
+    cosines of other encoders are scaled. It changes neither the ranking of Gaussians nor what matches."""
+    threshold: float | None = None
+    """Relevancy above which Gaussians match. Default: set by what stands out in the scene, at most 0.5."""
+    min_alpha: float = 0.3
+    """Coverage below which a pixel cannot match."""
+    foreground: str = ""
+    """Restrict matches in views without a mask to what this prompt finds, such as `building`. The view of a
+    photo with a foreground mask is always restricted to that mask."""
+    size: int | None = None
+    """Longer side of pictures in pixels. Default: the photo's own, at most 1920."""
+    views: int = 100
+    """Number of training views, evenly spread, that `find` chooses from."""
+    view_side: int = 256
+    """Longer side in pixels of the views in which visible Gaussians are measured."""
+
+    def __post_init__(self) -> None:
+        """Raise UserError if an option is invalid."""
+        check_numbers(self, _BOUNDS)
 
 
 def match_thresholds(
@@ -107,8 +147,7 @@ class Question:
         assert rendering.channels is not None
         keep, size = rendering.alpha >= self.min_alpha, (rendering.camera.height, rendering.camera.width)
         if foreground is not None:
-            there = F.interpolate(foreground[None, None].float(), size, mode="nearest-exact")[0, 0] > 0
-            keep = keep & there.to(keep.device)
+            keep = keep & resize_nearest(foreground, size).to(keep.device)
         count = len(self.prompts)
         values, covered = rendering.channels.tensor_split([-count], dim=2)
         maps = torch.cat([self._confined(self.engine.maps(values, self.queries)), covered.permute(2, 0, 1)])

@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float64
 from numpy import ndarray as Array
 from PIL import Image
@@ -25,6 +24,7 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
+from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.photo import Photo
@@ -55,6 +55,16 @@ class ScenePhoto:
     """Width and height of the file; None: the lens's."""
     quarter_turns: int = 0
     """Clockwise quarter turns that bring the file's pixels as stored upright."""
+
+    @classmethod
+    def of(
+        cls, photo: Photo, split: Literal["train", "eval"], camera_to_world: list[list[float]], scale: float
+    ) -> ScenePhoto:
+        """Describe a photo that is used at `scale` and seen from a pose."""
+        mask = None if photo.mask_path is None else str(photo.mask_path.absolute())
+        size = photo.width, photo.height
+        lens, turns = photo.lens.scaled(scale), photo.quarter_turns
+        return cls(photo.name, split, camera_to_world, lens, mask, size, turns)
 
     def __repr__(self) -> str:
         width, height = self.file_size
@@ -95,9 +105,7 @@ class ScenePhoto:
         mask = None if isinstance(self.mask, bytes) else self.photo().read_mask()
         if isinstance(self.mask, bytes):
             mask = torch.from_numpy(np.array(Image.open(io.BytesIO(self.mask)).convert("1")))
-        if mask is None or size is None:
-            return mask
-        return F.interpolate(mask[None, None].float(), size, mode="nearest-exact")[0, 0].bool()
+        return mask if mask is None or size is None else resize_nearest(mask, size)
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.learn_word import Weights, learn
 from lang3dxl_ns.query.match import Found, Match, View
 from lang3dxl_ns.query.places import Viewpoint, rank_views, strongest_match
-from lang3dxl_ns.query.query_config import QueryConfig
-from lang3dxl_ns.query.question import Question, match_thresholds
+from lang3dxl_ns.query.question import QueryConfig, Question, match_thresholds
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, overview
 from lang3dxl_ns.query.splat_file import write_index, write_splats

@@ -33,7 +33,7 @@ from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.files import check_regular, write_atomically
+from lang3dxl_ns.preparation.store import hash_tensors
 from lang3dxl_ns.scene.camera import Camera
 
 _LEAST = 1e-3
@@ -58,10 +59,7 @@ class VisibleGaussians:
 def fingerprint(state: Mapping[str, Tensor], settings: object) -> str:
     """Hash tensors and settings (as JSON) to 16 hex digits."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
-    for name, value in sorted(state.items()):
-        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-        digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    return digest.hexdigest()[:16]
+    return hash_tensors(digest, state)[:16]
 
 
 def save_visible(path: Path, views: Mapping[str, VisibleGaussians], key: str) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -29,9 +30,10 @@ MAX_LOG_SCALE = 60.0
 CLOSEST = 1.5
 """Depth from which Gaussians are visible, in standard deviations of their longest axis. They are fully
 visible from twice this depth."""
+Kind = TypeVar("Kind", bound="Gaussians")
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Gaussians:
     """Gaussians in the world frame, with activated values (no logarithms, no logits)."""
 
@@ -44,11 +46,17 @@ class Gaussians:
     opacities: Float[Tensor, " n"]
     """Peak opacity, 0…1."""
 
-    def detach(self) -> Gaussians:
+    def detach(self: Kind) -> Kind:
         """Return the same Gaussians without gradient."""
-        return Gaussians(*(part.detach() for part in vars(self).values()))
+        return self.mapped(Tensor.detach)
 
-    def seen_from(self, camera: Camera) -> Gaussians:
+    def mapped(self: Kind, change: Callable[[Tensor], Tensor]) -> Kind:
+        """Return the Gaussians with a change to each of their tensors."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        changed: dict[str, Any] = {n: change(v) for n, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **changed)
+
+    def seen_from(self: Kind, camera: Camera) -> Kind:
         """Return the same Gaussians, but transparent where their depth is small relative to their length. A
         splat's affine approximation holds only where a Gaussian is small for its depth. Without this, a
         Gaussian as small as a finger beside the picture would cover it when the camera is close to a wall."""
@@ -58,7 +66,7 @@ class Gaussians:
             shown = (depth / (CLOSEST * self.scales.amax(1)).clamp_min(1e-30) - 1).clamp(0.0, 1.0)
         return replace(self, opacities=self.opacities * shown)
 
-    def moved(self, by: Float[Tensor, "3"]) -> Gaussians:
+    def moved(self: Kind, by: Float[Tensor, "3"]) -> Kind:
         """Return the same Gaussians with shifted centers."""
         return replace(self, means=self.means + by)
 

@@ -11,9 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 import lang3dxl_ns.rendering.gsplat_build as gsplat_build
-from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.common.device import in_full_precision, to_device
 from lang3dxl_ns.common.kernels import takes_kernels
-from lang3dxl_ns.common.precision import in_full_precision
 from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Ellipses, Gaussians, Raster
 from lang3dxl_ns.rendering.projection import project
 from lang3dxl_ns.rendering.torch_rasterizer import Compositing
@@ -123,14 +122,15 @@ def _without_broken(
         return torch.where(sound.view(-1, *[1] * (values.dim() - 1)), values, 0.0)
 
     features = None if features is None else clean(features)
-    return Gaussians(*map(clean, vars(g).values())), clean(channels), features
+    return gaussians.mapped(clean), clean(channels), features
 
 
 def _check_sizes(
     gaussians: Gaussians, channels: Tensor, background: Tensor | None, features: Tensor | None
 ) -> None:
     count = len(gaussians.means)
-    sizes = {name: len(value) for name, value in vars(gaussians).items()} | {"channels": len(channels)}
+    parts = {"channels": channels, **vars(gaussians)}
+    sizes = {name: len(part) for name, part in parts.items() if isinstance(part, Tensor)}
     if features is not None:
         sizes["features"] = len(features)
     wrong = {name: size for name, size in sizes.items() if size != count}

@@ -41,7 +41,7 @@ def render(
     `channels`, one row per Gaussian. This is safe to call from any thread. Raises ValueError like
     `rasterize`."""
     raster = rasterize(
-        splats.gaussians.seen_from(camera), camera, splats.colors(camera.position),
+        splats.seen_from(camera), camera, splats.colors(camera.position),
         None if background is None else background.to(splats.means), features=channels, render_depth=True,
         antialiased=splats.antialiased, backend=backend,
     )  # fmt: skip
@@ -55,5 +55,5 @@ def composite(
     splats: Splats, camera: Camera, channels: Float[Tensor, "n d"], backend: Backend = "auto"
 ) -> Float[Tensor, "h w d"]:
     """Composite values of the Gaussians over black, differentiable in the values, without their colors."""
-    gaussians = splats.gaussians.seen_from(camera)
-    return rasterize(gaussians, camera, channels, antialiased=splats.antialiased, backend=backend).image
+    seen = splats.seen_from(camera)
+    return rasterize(seen, camera, channels, antialiased=splats.antialiased, backend=backend).image

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.common.precision import in_full_precision
+from lang3dxl_ns.common.device import in_full_precision
 
 BAND_0 = math.sqrt(1 / (4 * math.pi))
 """Value of the constant harmonic: color = 0.5 + this × coefficient."""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from math import isqrt
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,18 +15,10 @@ from lang3dxl_ns.rendering.spherical_harmonics import BAND_0, spherical_harmonic
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Splats:
-    """Gaussians with activated values (no logarithms, no logits) and colors, without gradients. All tensors
-    are on one device. They must not be written to: renderings in other threads may be reading them."""
+class Splats(Gaussians):
+    """Gaussians with colors, without gradients. All tensors are on one device. They must not be written to:
+    renderings in other threads may be reading them."""
 
-    means: Float[Tensor, "n 3"]
-    """Centers, world units."""
-    quats: Float[Tensor, "n 4"]
-    """Rotations as quaternions (w, x, y, z) of any length; zero length means no rotation."""
-    scales: Float[Tensor, "n 3"]
-    """Standard deviations along the rotated axes, world units, positive."""
-    opacities: Float[Tensor, " n"]
-    """Peak opacity, 0…1."""
     harmonics: Float[Tensor, "n k 3"]
     """Spherical harmonics of the colors, degrees 0 to 3, the constant ones first (k = 1, 4, 9 or 16)."""
     antialiased: bool = False
@@ -47,7 +37,7 @@ class Splats:
 
     @property
     def gaussians(self) -> Gaussians:
-        """Shapes of the Gaussians, as `rasterize` takes them."""
+        """Shapes of the Gaussians, without their colors."""
         return Gaussians(self.means, self.quats, self.scales, self.opacities)
 
     def colors(self, center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
@@ -57,26 +47,17 @@ class Splats:
 
     def to(self, device: torch.device | str) -> Splats:
         """Return the same Gaussians on a device."""
-        return self._mapped(lambda tensor: tensor.to(device))
-
-    def copied(self) -> Splats:
-        """Copy the Gaussians to new memory."""
-        return self._mapped(torch.clone)
+        return self.mapped(lambda tensor: tensor.to(device))
 
     def select(self, which: Bool[Tensor, " n"] | Int[Tensor, " m"]) -> Splats:
         """Return some of the Gaussians, chosen by a mask or by their indices (tensors or NumPy arrays)."""
         rows = torch.as_tensor(which, device=self.means.device)
-        return self._mapped(lambda tensor: tensor[rows])
+        return self.mapped(lambda tensor: tensor[rows])
 
     def sound(self) -> Bool[Tensor, " n"]:
         """Return which Gaussians have no NaN or infinite value."""
         parts = (self.means, self.quats, self.scales, self.opacities, self.harmonics)
         return torch.stack([part.reshape(len(self), -1).isfinite().all(1) for part in parts]).all(0)
-
-    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Splats:
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        changed: dict[str, Any] = {n: change(v) for n, v in values.items() if isinstance(v, Tensor)}
-        return replace(self, **changed)
 
 
 def harmonics_of(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:

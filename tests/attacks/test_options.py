@@ -9,7 +9,7 @@ from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.text import TextConfig
 
 

@@ -17,7 +17,7 @@ from lang3dxl_ns import cli
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS, NoPictureError, open_picture
-from lang3dxl_ns.evaluation.annotations import read_gray
+from lang3dxl_ns.evaluation.layouts import read_gray
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.preparation import photo_cache
 from lang3dxl_ns.preparation.foreground import with_foreground

@@ -6,11 +6,11 @@ import os
 
 import pytest
 
+from lab.landmark.novel_views import read_novel_views
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, read_needs
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
 from lang3dxl_ns.scene.camera import Lens
-from lang3dxl_ns.scene.novel_views import read_novel_views
 
 POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]]
 

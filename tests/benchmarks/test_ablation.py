@@ -304,11 +304,11 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     assert (out / "results/scene/full/4-0.json").stat().st_mtime_ns == stamp
 
 
-def test_labels_of_held_out_photos_alone_are_enough():
+def test_labels_of_held_out_photos_alone_are_enough(tmp_path):
     photos = [SimpleNamespace(name="a.jpg"), SimpleNamespace(name="b.jpg")]
     pipeline = SimpleNamespace(
         evaluation=SimpleNamespace(scorer=SimpleNamespace(truth=SimpleNamespace(key=lambda name: None))),
-        datamanager=SimpleNamespace(train_dataset=SimpleNamespace(photos=photos), test_views=None),
+        datamanager=SimpleNamespace(train_dataset=SimpleNamespace(photos=photos), data_folder=tmp_path),
     )
     assert _beside(pipeline) == {}
 

@@ -9,12 +9,12 @@ from PIL import Image
 from lab.landmark.labels import PART, SMALLEST_POSITIVE, category_masks
 from lab.landmark.landmark import FAMILIES, Landmark
 from lab.landmark.novel_cameras import EACH, choose_cameras
+from lab.landmark.novel_views import read_novel_views
 from lab.landmark.photography import plain_view, take_photo
 from lab.landmark.raycast import Camera
 from lab.landmark.scene_writer import TEST_POINTS, DemoScene, write_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.colmap import read_reconstruction
-from lang3dxl_ns.scene.novel_views import read_novel_views
 
 SIZE, SEED, VIEWS = (120, 90), 6, 15
 

@@ -5,8 +5,7 @@ import torch
 from label_sets import write_plain
 
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.evaluation.language import LanguageScorer
-from lang3dxl_ns.evaluation.scores import MapScorer
+from lang3dxl_ns.evaluation.scores import LanguageScorer, MapScorer
 from lang3dxl_ns.query.relevancy import CANONICAL
 
 

@@ -6,8 +6,8 @@ import torch
 from label_sets import box_object, write_holyscenes, write_labels, write_plain
 from scipy.ndimage import uniform_filter
 
-from lang3dxl_ns.evaluation.annotations import Truth
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.layouts import Truth
 from lang3dxl_ns.evaluation.scores import (
     MapScorer,
     as_published,

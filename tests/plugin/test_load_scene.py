@@ -18,7 +18,7 @@ from tiny_models import make_tiny_clip
 
 import lang3dxl_ns
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.evaluation.language import open_scorer
+from lang3dxl_ns.evaluation.scores import open_scorer
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words, read_scene

@@ -10,11 +10,12 @@ from conftest import make_trainer
 from label_sets import write_plain
 from PIL import Image
 
+from lab.judging import judge
+from lab.landmark.novel_views import FOLDER, read_novel_views
+from lab.landmark.novel_views_of_runs import evaluate_novel_views, novel_dataset
 from lab.landmark.scene_writer import write_novel_cameras
-from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.colmap import read_reconstruction
-from lang3dxl_ns.scene.novel_views import FOLDER
 
 HELD_OUT = ("photo_000.jpg", "photo_008.jpg")
 
@@ -46,22 +47,24 @@ def pipeline(data, tiny_clip, tiny_dense, tmp_path_factory):
     return trainer.pipeline
 
 
-def test_a_photo_as_a_test_view_is_placed_and_scored_as_the_photo(pipeline):
+def test_a_photo_as_a_test_view_is_placed_and_scored_as_the_photo(pipeline, data):
     manager = pipeline.datamanager
+    views = novel_dataset(manager, read_novel_views(data))
     for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height"):
-        own, photo = (getattr(d.cameras, name) for d in (manager.test_dataset, manager.eval_dataset))
+        own, photo = (getattr(d.cameras, name) for d in (views, manager.eval_dataset))
         torch.testing.assert_close(own, photo, atol=1e-4, rtol=1e-5)
+    judge(pipeline)
     results = pipeline.get_average_eval_image_metrics(get_std=True)
-    beside = results["test_views"]
-    assert set(beside["photos"]) == {f"{FOLDER}/{name}" for name in HELD_OUT}
+    beside = {view.name: view.metrics for view in evaluate_novel_views(pipeline)}
+    assert set(beside) == {f"{FOLDER}/{name}" for name in HELD_OUT}
     for name, photo in results["photos"].items():
-        view = beside["photos"][f"{FOLDER}/{name}"]
+        view = beside[f"{FOLDER}/{name}"]
         same = [key for key in photo if key != "fps" and not key.endswith("_seconds")]
         assert {"psnr", "ap_dome", "teacher_ap_dome", "limit_ap_dome", "chance_ap_dome", "clip_l1"} <= set(
             same
         )
         assert {key: view[key] for key in same} == pytest.approx({key: photo[key] for key in same}, abs=1e-3)
-    assert beside["protocol"]["split"] == "test" and results["protocol"]["split"] == "held-out"
+    assert results["protocol"]["split"] == "held-out"
     assert results["limit_map"] > results["chance_map"] == pytest.approx(0.5, abs=0.02)
 
 
@@ -69,28 +72,14 @@ def test_in_another_light_colors_are_compared_once_matched(pipeline, data):
     path = data / FOLDER / "cameras.json"
     content = path.read_text()
     path.write_text(json.dumps(json.loads(content) | {"same_light": False}))
-    read = vars(pipeline.datamanager)
-    read.pop("test_views", None)
     try:
-        metrics = next(iter(pipeline.evaluation.evaluate("test"))).metrics
+        metrics = next(iter(evaluate_novel_views(pipeline))).metrics
     finally:
         path.write_text(content)
-        read.pop("test_views")
     assert "cc_psnr" in metrics and not {"psnr", "ssim"} & set(metrics)
-
-
-def test_the_split_is_asked_for_by_name(pipeline, data, tmp_path, monkeypatch):
-    monkeypatch.setattr("lang3dxl_ns.plugin.trainer_config.open_run", lambda path: (None, pipeline, 0))
-    (tmp_path / "config.yml").touch()
-    command = ["evaluate", "run", str(tmp_path / "config.yml"), "--split", "test"]
-    monkeypatch.setattr("sys.argv", ["lang3dxl", *command, "--out", str(tmp_path / "out")])
-    cli.main()
-    table = (tmp_path / "out" / "scores.md").read_text()
-    assert "limit" in table and "chance" in table and "split: test" in table
 
 
 def test_a_scene_without_test_views_says_so(train, scene):
     pipeline = train(scene, iterations=2, semantics=False).pipeline
-    assert "test_views" not in pipeline.get_average_eval_image_metrics(get_std=True)
     with pytest.raises(UserError, match=r"has no test views: `lang3dxl demo-scene` makes"):
-        list(pipeline.evaluation.evaluate("test"))
+        list(evaluate_novel_views(pipeline))

@@ -18,7 +18,7 @@ from scenes import view_of, write_scene
 from lang3dxl_ns.plugin.panel import INVITATION, least_size, stand_of
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 from lang3dxl_ns.query import conversation as session
-from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.run_file import overview
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from tiny_models import make_tiny_clipseg, make_tiny_dinov2, make_tiny_grounding_dino, make_tiny_sam
 
+from lab.benchmarks.scored_runs import probabilities
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import segmentation
 from lang3dxl_ns.preparation.segmentation import (
@@ -107,8 +108,9 @@ def test_a_pixel_has_the_score_of_the_best_box_whose_mask_covers_it(models, monk
     )
     masks = torch.zeros(4, 60, 90, dtype=torch.bool)
     masks[0, :30], masks[1, 10:20], masks[2, 25:40], masks[3, :, :5] = True, True, True, True
-    monkeypatch.setattr(found, "_masks", lambda *_: masks)
-    tower, sky, dome = found.probabilities(IMAGE, list(scores))
+    by_number = {3: masks[:3], 0: masks[:0], 1: masks[3:]}
+    monkeypatch.setattr(found, "masks", lambda _, boxes: by_number[len(boxes)])
+    tower, sky, dome = probabilities(found, IMAGE, list(scores))
     assert tower[[0, 15, 27, 35, 50], 0].tolist() == pytest.approx([0.4, 0.9, 0.5, 0.5, 0])
     assert not sky.any() and torch.equal(dome, 0.7 * masks[3])
 

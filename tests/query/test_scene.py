@@ -22,7 +22,7 @@ from painted_scene import (
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering.rasterize import rasterize
 from lang3dxl_ns.rendering.render import composite

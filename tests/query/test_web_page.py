@@ -27,7 +27,7 @@ from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.doubt import LEAST_PEAK, peaks
-from lang3dxl_ns.query.query_config import QueryConfig
+from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene_file import Provenance
 from lang3dxl_ns.query.teach import TaughtWord
 from lang3dxl_ns.query.vocabulary import shipped_vocabulary, whole_words

@@ -1,4 +1,4 @@
-"""Test views in test_views/: cameras that took no photo, with reference pictures and labels.
+"""Test views of a landmark in test_views/: cameras that took no photo, with reference pictures and labels.
 
 `test_views/cameras.json` holds the cameras in the COLMAP model's world, `images/` the pictures, `masks/`
 (optional) the foreground, and `ground_truth/<category>/` the labels. The views are not in the COLMAP model;
@@ -14,6 +14,7 @@ import numpy as np
 
 from lang3dxl_ns.common.errors import readable
 from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 
@@ -31,6 +32,11 @@ class NovelViews:
     `test_views/NNNN.jpg`, relative to the scene; the pictures are in `images/`."""
     same_light: bool
     """Whether the scene's photos share one lighting, so that the colors of views can be compared."""
+
+    @property
+    def truth(self) -> GroundTruth:
+        """The labels."""
+        return GroundTruth(self.folder / "ground_truth", "plain")
 
     def image(self, view: TrackedPhoto) -> Path:
         """Return the file of a view's picture."""

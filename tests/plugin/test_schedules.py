@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lang3dxl_ns.components.schedules import (
+from lang3dxl_ns.plugin.optimizers import (
     cosine_decay,
     log_linear,
     semantic_ramp,

@@ -1,14 +1,12 @@
-"""Preparation of a photo collection: choosing crop sizes, logging the reasons, making the targets."""
+"""Choice of the crops' sizes for a photo collection, with the reasons."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import torch
 
 from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
@@ -21,10 +19,7 @@ from lang3dxl_ns.preparation.physical_scale import (
     propose_scale_range,
     relative_scales,
 )
-from lang3dxl_ns.preparation.prepare import PreparedTargets, prepare
-from lang3dxl_ns.preparation.regions import RegionSource
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
 
@@ -87,25 +82,6 @@ def plan_crops(
         reasons.append(f"photos agree in scale: fixed crops of {_listed(fractions)} of their width")
         return CropPlan(fractions, None, spread, reasons)
     return CropPlan(scales, per_file_pixel, spread, reasons)
-
-
-def prepare_collection(
-    photos: Sequence[Photo],
-    reconstruction: Reconstruction,
-    config: PreparationConfig,
-    cache_dir: Path,
-    device: torch.device | str,
-    log: Callable[[str], None] = print,
-    regions: RegionSource | None = None,
-    fine: Collection[str] = (),
-) -> PreparedTargets:
-    """Choose crops, log the reasons, and make missing targets in `cache_dir`; for `fine`, see `prepare`."""
-    plan = plan_crops(photos, reconstruction, config)
-    for reason in plan.reasons:
-        log(reason)
-    return prepare(
-        photos, plan.pixel_sizes, config, plan.scales, FeatureStore(cache_dir), device, regions, fine
-    )
 
 
 def _scale_range(
