@@ -5,7 +5,6 @@ import shutil
 
 import pytest
 
-from lab.judging import judge, model_features
 from lang3dxl_ns.preparation.physical_scale import pixel_sizes, propose_scale_range
 from lang3dxl_ns.scene.colmap import read_reconstruction
 
@@ -26,7 +25,6 @@ def test_a_short_run_shows_the_facade_and_beats_the_mean_feature(train, real_sce
         pipeline__datamanager__camera_res_scale_factor=0.2,
         pipeline__model__sky_gaussians=2_000,
     )
-    judge(trainer.pipeline)
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert all(map(math.isfinite, metrics.values()))
     if real_scene.name == "sceaux":
@@ -39,7 +37,7 @@ def test_a_short_run_shows_the_facade_and_beats_the_mean_feature(train, real_sce
         assert metrics["half_psnr"] > 17.0
         datamanager, model = trainer.pipeline.datamanager, trainer.pipeline.model.eval()
         camera, batch = next(datamanager.train_photos())
-        learned = model_features(model, camera, batch)
+        learned = model.feature_metrics(camera, batch)
         assert learned["clip_l1"] < 0.7 * learned["clip_l1_of_mean"]
 
 

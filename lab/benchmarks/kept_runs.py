@@ -55,7 +55,6 @@ def _train_and_keep(
     run: Run, settings: RunSettings, truth: Path, folder: Path, log: Path
 ) -> dict[str, float]:
     write_output_to(log)
-    from lab.judging import judge
     from lang3dxl_ns.commands.evaluate import write_scores
     from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
     from lang3dxl_ns.plugin.trainer_config import open_run
@@ -74,7 +73,6 @@ def _train_and_keep(
     if not trainer.is_finished:
         trainer.train()
     _, pipeline, _ = open_run(config.get_base_dir())
-    judge(pipeline)
     results = pipeline.evaluation.scored(get_std=True)
     write_scores(folder, run.label, results, pipeline.device)
     return {name: value for name, value in results.items() if isinstance(value, float)}

@@ -231,7 +231,6 @@ def write_output_to(log: Path) -> None:
 
 
 def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
-    from lab.judging import judge
     from lang3dxl_ns.common import timing
     from lang3dxl_ns.evaluation.aggregate import average
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
@@ -249,7 +248,6 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     trainer.train()
     seconds = _now() - start
     peak = _peak()
-    judge(trainer.pipeline)
     figures = average([photo.metrics for photo in trainer.pipeline.evaluation.evaluate("held-out")])
     figures = {name: value for name, value in figures.items() if name not in _UNWANTED}
     figures |= _beside(trainer.pipeline)

@@ -57,7 +57,6 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
 
     import torch
 
-    from lab.judging import judge
     from lang3dxl_ns.common import timing
     from lang3dxl_ns.methods import run_config
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
@@ -78,7 +77,6 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
     with timing.measure() as seconds:
         trainer.train()
     total = time.perf_counter() - start
-    judge(trainer.pipeline)
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     step = median(seconds["step"])
     # "losses" is entered twice in a step with semantics.

@@ -87,8 +87,6 @@ class Demo:
 
                 settings = {"family": self.family, **self._wanted}
                 write_scene(DemoScene(out=scene, **settings))
-        from lab.judging import judge
-
         config = self._config(scene, out)
         trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
         trainer.stages = stages
@@ -97,7 +95,6 @@ class Demo:
             trainer.train()
         else:
             say("train: skipped, the run is finished")
-        judge(trainer.pipeline)
         with stages.stage("evaluate"):
             photos = list(trainer.pipeline.evaluation.evaluate("held-out"))
             splits = {"Held-out photos": photos}

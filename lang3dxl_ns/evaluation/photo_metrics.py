@@ -1,7 +1,8 @@
-"""Evaluated photo: PSNR and LPIPS of its rendering."""
+"""Evaluated photo: PSNR and LPIPS of its rendering; L1, PSNR and cosine of its decoded features."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +14,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig
 from lang3dxl_ns.evaluation.scores import Maps
 
 ALEXNET = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
@@ -74,3 +76,40 @@ class Lpips:
 
 def _weights() -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET.rpartition("/")[2]
+
+
+def match(
+    features: Float[Tensor, "h w c"],
+    target: Float[Tensor, "hd wd c"],
+    crop_sides: Sequence[float],
+    mask: Float[Tensor, "h w"] | None = None,
+) -> tuple[Float[Tensor, "hd wd c"], Float[Tensor, "hd wd"]]:
+    """Average features over the target's crops, and compute the weight of each cell. The kernel is the
+    downsampler's without its learned attenuation, so it is the same for every way of training."""
+    kernel = AttenuatedDownsampler(DownsamplerConfig(hidden=0), features.shape[-1])
+    return kernel(features, (target.shape[0], target.shape[1]), crop_sides, mask)
+
+
+def feature_metrics(
+    kind: str,
+    predicted: Float[Tensor, "h w c"],
+    target: Float[Tensor, "h w c"],
+    mean: Float[Tensor, " c"],
+    weight: Float[Tensor, "h w"] | None = None,
+) -> dict[str, float]:
+    """Compute L1, PSNR (peak 1) and cosine of `predicted`, and the same for predicting the `mean` everywhere.
+
+    Features are compared on the encoder's own scale, as in Lang3D-XL's encoder ablation. Cells of zero weight
+    (no foreground) are ignored. Keys are `{kind}_l1`, `{kind}_psnr` and `{kind}_cosine`, and the same with
+    `_of_mean` appended.
+    """
+    cells = target.new_ones(target.shape[:2], dtype=torch.bool) if weight is None else weight > 0
+    if not cells.any():
+        return {}
+    figures, wanted = {}, target[cells].double()
+    for whose, features in (("", predicted), ("_of_mean", mean.expand_as(target))):
+        found = features[cells].double()
+        figures[f"{kind}_l1{whose}"] = float(F.l1_loss(found, wanted))
+        figures[f"{kind}_psnr{whose}"] = float(psnr(found, wanted))
+        figures[f"{kind}_cosine{whose}"] = float(F.cosine_similarity(found, wanted, dim=-1).mean())
+    return figures

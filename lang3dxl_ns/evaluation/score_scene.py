@@ -5,20 +5,16 @@ Its maps are scored as those of runs, and its answers as a user gets them, by th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float
-from numpy import ndarray as Array
-from torch import Tensor
 
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.label_limit import Masks, lifted_labels
 from lang3dxl_ns.evaluation.layouts import Truth
 from lang3dxl_ns.evaluation.scores import LanguageScorer, map_size, overlap
 from lang3dxl_ns.query.places import Box, groups, shared_volume
@@ -26,16 +22,10 @@ from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.teach import known_word
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.rendering.gathering import Pixels, gather
-from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import composite
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.photo import Photo
 
 SceneSplit = Literal["held-out", "seen", "all"]
-Masks = Mapping[str, Bool[Array, "h w"]]
-"""Labels of a photo by category."""
 _LEAST_SHARE = 0.03
 """Share of a word's labels below which a group is not a separate object."""
 
@@ -133,31 +123,3 @@ def box_iou(a: Box, b: Box) -> float:
     both = shared_volume(a, b)
     whole = shared_volume(a, a) + shared_volume(b, b) - both
     return both / whole if whole > 0 else 0.0
-
-
-def lifted_labels(
-    splats: Splats, views: Iterable[tuple[Camera, Masks]], categories: list[str], backend: Backend = "auto"
-) -> Float[Tensor, "n categories"]:
-    """Compute each Gaussian's mean label over the pixels that it contributes to, weighted by compositing
-    weight, in all `views` that label the category. It is 0 for Gaussians that none of these views shows."""
-
-    def probes():
-        for camera, masks in views:
-            size = camera.height, camera.width
-            labels = Pixels.of([_labels(masks, categories, size)], size)
-            yield partial(composite, splats, camera, backend=backend), labels
-
-    lifted, _ = gather(len(splats), probes(), 2 * len(categories), splats.means)
-    labels, labeled = lifted.chunk(2, dim=1)
-    return torch.where(labeled > 0, labels / labeled, 0.0)
-
-
-def _labels(masks: Masks, categories: list[str], size: tuple[int, int]) -> Float[Tensor, "h w channels"]:
-    """Stack a channel per category with its label, and one per category that is 1 if it is labeled here."""
-    labels, labeled = torch.zeros(2, len(categories), *size)
-    for index, category in enumerate(categories):
-        if category in masks:
-            mask = torch.from_numpy(np.asarray(masks[category])).float()
-            labels[index] = F.adaptive_avg_pool2d(mask[None], size)[0]
-            labeled[index] = 1
-    return torch.cat([labels, labeled]).permute(1, 2, 0)

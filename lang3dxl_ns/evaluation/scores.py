@@ -174,6 +174,19 @@ def score_maps(
     return scores
 
 
+def bounds(labels: Maps, truths: Mapping[str, Truth]) -> dict[str, float]:
+    """Compute average precision by chance and at best, for every category in the photo.
+    `chance_ap_{category}` is that of a map without information, the share of positives. `limit_ap_{category}`
+    is that of `labels`, the exact labels after lifting and rendering (`label_limit`)."""
+    found: dict[str, float] = {}
+    for category, truth in truths.items():
+        best = average_precision(labels[category].cpu().numpy(), truth.mask)
+        if best is not None:
+            found[f"chance_ap_{category}"] = float(truth.mask.mean())
+            found[f"limit_ap_{category}"] = best
+    return found
+
+
 class MapScorer:
     """Scorer of maps against a scene's ground truth, for runs and for predictions of other programs alike."""
 

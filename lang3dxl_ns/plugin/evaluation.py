@@ -1,10 +1,10 @@
-"""Evaluation of a run: renders the photos of a split and scores their colors and words."""
+"""Evaluation of a run: renders the photos of a split and scores their colors, features and words."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal
@@ -22,9 +22,10 @@ from lang3dxl_ns.common.reports import host_peak, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, find_ground_truth
 from lang3dxl_ns.evaluation.half_image import PROTOCOL, HalfImageProtocol
+from lang3dxl_ns.evaluation.label_limit import label_limit
 from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
 from lang3dxl_ns.evaluation.score_scene import truths_of
-from lang3dxl_ns.evaluation.scores import LanguageScorer, inside, map_size, open_scorer
+from lang3dxl_ns.evaluation.scores import LanguageScorer, bounds, inside, map_size, open_scorer
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
@@ -33,9 +34,13 @@ from lang3dxl_ns.plugin.photo_dataset import EvalPhotos
 from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.photo import Photo
 
 Split = Literal["held-out", "seen"]
+Score = Callable[[Cameras, EvaluatedPhoto, Batch, Photo], None]
+"""Function that adds word scores to an evaluated photo."""
+LabelLimit = Callable[[Camera], Float[Tensor, "categories h w"]]
 
 
 @dataclass
@@ -108,12 +113,14 @@ class Evaluation:
         """Render photos and score them, their words by a scorer, with a progress bar; `fits_looks` applies
         the half-image protocol."""
         self._model.eval()
-        self._engine = None
+        self._engine, score = None, None
+        if scorer is not None:
+            score = partial(self._score_words, scorer, self._label_limit(scorer, photos))
         for number, (camera, batch) in enumerate(tracked(photos, "evaluating", len(photos))):
             photo = photos.dataset.photos[batch["image_idx"]]
             if number == 0:  # warm-up, excluded from timing
-                self._evaluate_photo(camera, batch, photo, scorer)
-            evaluated = self._evaluate_photo(camera, batch, photo, scorer)
+                self._evaluate_photo(camera, batch, photo, score)
+            evaluated = self._evaluate_photo(camera, batch, photo, score)
             if fits_looks:
                 evaluated.images["fitted"], figures = self._half_image(camera, batch)
                 evaluated.metrics = figures | evaluated.metrics
@@ -145,9 +152,15 @@ class Evaluation:
             raise UserError(f"none of the training photos has a label in {self.scorer.truth.folder}")
         return self._data.evaluated(seen, labeled)
 
-    def _evaluate_photo(
-        self, camera: Cameras, batch: Batch, photo: Photo, scorer: LanguageScorer | None
-    ) -> EvaluatedPhoto:
+    def _label_limit(self, scorer: LanguageScorer, photos: EvalPhotos) -> LabelLimit:
+        """Build a function that renders the labels themselves, lifted from the photos to the Gaussians."""
+        truth = scorer.truth
+        sized = ((camera, p, truth.scoring_size(p.height, p.width)) for camera, p in photos.cameras())
+        labels = ((to_rasterizer(camera), truths_of(truth, photo, size)) for camera, photo, size in sized)
+        masks = ((view, {name: t.mask for name, t in truths.items()}) for view, truths in labels)
+        return label_limit(self._model.splats(), masks, truth.categories, self._model.backend)
+
+    def _evaluate_photo(self, camera, batch: Batch, photo: Photo, score: Score | None) -> EvaluatedPhoto:
         start = perf_counter()
         self._model.set_crop(None)
         outputs = self._model.get_outputs(camera)
@@ -155,14 +168,21 @@ class Evaluation:
         seconds = perf_counter() - start
         metrics, images = self._model.get_image_metrics_and_images(outputs, batch)
         metrics = {"cc_psnr": self._model.corrected_psnr(outputs, batch)} | metrics
+        metrics |= self._model.feature_metrics(camera, batch)
         metrics |= {"fps": 1 / seconds, "render_seconds": seconds}
         evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, photo.mask_path is not None)
-        if scorer is not None:
-            self._score_words(scorer, camera, evaluated, batch, photo)
+        if score is not None:
+            score(camera, evaluated, batch, photo)
         return evaluated
 
     def _score_words(
-        self, scorer: LanguageScorer, camera: Cameras, evaluated: EvaluatedPhoto, batch: Batch, photo: Photo
+        self,
+        scorer: LanguageScorer,
+        limit: LabelLimit,
+        camera: Cameras,
+        evaluated: EvaluatedPhoto,
+        batch: Batch,
+        photo: Photo,
     ) -> None:
         size = scorer.truth.scoring_size(photo.height, photo.width)
         keep = batch["mask"][..., 0] if "mask" in batch else None
@@ -181,6 +201,8 @@ class Evaluation:
         evaluated.maps = inside(raw, keep)
         truths = truths_of(scorer.truth, photo, map_size(raw))
         evaluated.metrics |= scorer.scores(photo.name, variants | {"teacher_": teacher}, truths)
+        lifted = scorer.named(limit(to_rasterizer(camera)), size)
+        evaluated.metrics |= bounds(inside(lifted, keep), truths)
 
     @torch.no_grad()
     def relevancy(self, camera: Cameras, queries: Queries, yardstick: Queries) -> Float[Tensor, "q h w"]:

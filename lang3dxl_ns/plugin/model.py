@@ -10,6 +10,7 @@ from math import isqrt
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import color_correct
@@ -33,7 +34,7 @@ from lang3dxl_ns.components.initialization import (
     seed_positions,
 )
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
-from lang3dxl_ns.evaluation.photo_metrics import Lpips, psnr
+from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
 from lang3dxl_ns.plugin.optimizers import semantic_ramp
 from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
@@ -246,6 +247,40 @@ class Lang3DXLModel(RenderingModel):
         metrics = {"psnr": float(psnr(predicted, target)), "ssim": float(self.ssim(*chw))}
         perceptual = self.lpips(*chw)
         return metrics if perceptual is None else metrics | {"lpips": perceptual}
+
+    @torch.no_grad()
+    def feature_metrics(self, camera: Cameras, batch: Batch) -> dict[str, float]:
+        """Measure agreement with a photo's targets, for the model and for the mean training feature."""
+        if self.carried is None or "clip_target" not in batch:
+            return {}
+        assert self.config.decode_size is not None
+        mask = batch["mask"][..., 0] if "mask" in batch else None
+        clip, dense, small_mask = self._feature_maps(camera, self.config.decode_size[1], mask)
+        target = batch["clip_target"]
+        predicted, weight = match(clip, target, batch["crop_sides"], small_mask)
+        metrics = feature_metrics("clip", predicted, target, self.clip_mean, weight)
+        if dense is not None and "dense_target" in batch:
+            target = losses.resize(batch["dense_target"], dense.shape[:2])
+            metrics |= feature_metrics("dense", dense, target, self.dense_mean, small_mask)
+        return metrics
+
+    def _feature_maps(self, camera: Cameras, longer_side: int, mask: Tensor | None):
+        """Compute features in a camera → clip [h, w, C], dense [h, w, D] or None, mask [h, w]. They are
+        decoded before or after compositing, depending on the decoder."""
+        decoder, carried = self.semantic_field, self.carried
+        assert decoder is not None and carried is not None
+        if not decoder.per_gaussian:
+            codes = self.composite(camera, carried)
+            return self._decode_small(codes, mask, fitted_size(codes, longer_side))
+        # The last layer is linear, so hidden activations are composited and divided by coverage.
+        known = carried.isfinite().all(1, keepdim=True)
+        hidden = torch.where(known, decoder.hidden(torch.where(known, carried, 0.0)), 0.0)
+        maps = self.composite(camera, torch.cat([hidden, known.to(hidden)], dim=1))
+        size = fitted_size(maps, longer_side)
+        maps = resize_nearest(maps, size)
+        clip, head = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3), decoder.clip_head()
+        small_mask = None if mask is None else resize_nearest(mask, size)
+        return clip if head is None else F.linear(clip, *head), None, small_mask
 
     # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────
 

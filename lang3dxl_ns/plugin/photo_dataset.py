@@ -73,15 +73,19 @@ class EvalPhotos:
     ):
         self.dataset, self._ready = dataset, ready
         photos = enumerate(dataset.photos)
-        self.indices = [index for index, photo in photos if names is None or photo.name in names]
-        """Indices of these photos in the dataset."""
+        self._wanted = [index for index, photo in photos if names is None or photo.name in names]
 
     def __len__(self) -> int:
-        return len(self.indices)
+        return len(self._wanted)
+
+    def cameras(self) -> Iterator[tuple[Cameras, Photo]]:
+        """Yield every photo's camera and the photo, without reading files."""
+        for index in self._wanted:
+            yield self.dataset.cameras[index : index + 1], self.dataset.photos[index]
 
     def __iter__(self) -> Iterator[tuple[Cameras, Batch]]:
         read, usable = self._ready(), False
-        for index in self.indices:
+        for index in self._wanted:
             try:
                 item = read(index)
             except UserError as reason:

@@ -43,7 +43,7 @@ class Lang3DXLPipelineConfig(EvaluationSettings, VanillaPipelineConfig):
 
 
 class Lang3DXLPipeline(VanillaPipeline):
-    """nerfstudio's pipeline, which loads checkpoints strictly, and evaluates colors and words."""
+    """nerfstudio's pipeline, which loads checkpoints strictly, and evaluates colors, features and words."""
 
     config: Lang3DXLPipelineConfig
     datamanager: Lang3DXLDataManager

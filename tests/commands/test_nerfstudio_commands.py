@@ -56,7 +56,7 @@ def test_eval(run, folder):
     words = ("ns-eval", "--load-config", run / "config.yml", "--output-path", folder / "eval.json")
     command(*words, cwd=folder, shell=True)
     results = json.loads((folder / "eval.json").read_text())["results"]
-    assert {"psnr", "ssim", "cc_psnr", "render_seconds", "psnr_std"} <= set(results)
+    assert {"psnr", "ssim", "clip_l1", "clip_psnr", "clip_cosine", "psnr_std"} <= set(results)
 
 
 def test_resume(run, scene, tiny_clip, tiny_dense, folder):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lab.judging import feature_metrics
+from lang3dxl_ns.evaluation.photo_metrics import feature_metrics
 
 
 def test_a_constant_error_has_the_l1_and_psnr_of_that_error():

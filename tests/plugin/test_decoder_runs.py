@@ -8,7 +8,6 @@ from conftest import make_trainer
 from nerfstudio.utils.eval_utils import eval_setup
 
 from lab.baselines import BASELINES, langsplat
-from lab.judging import judge, model_features
 from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
@@ -49,7 +48,7 @@ def test_a_decoder_trains_gives_features_of_the_targets_width_and_is_the_same_on
     _, images = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
     assert model.semantic_field.decode_clip(model.carried).shape[-1] == batch["clip_target"].shape[-1]
     assert images["bottleneck"].shape[-1] == 3
-    metrics = model_features(model, camera, batch)
+    metrics = model.feature_metrics(camera, batch)
     without_dense = name in ("langsplat", "gathered", "lifting")
     assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is not without_dense
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
@@ -84,7 +83,6 @@ def test_gathered_features_come_near_the_targets_and_nothing_is_learned_before(r
     assert set(datamanager.next_train(0)[1]) == {"image", "image_idx", "name"}  # no step waits for a target
     assert {"clip_target", "dense_target"} < set(next(datamanager.train_photos())[1])
     assert not any("dense_target" in batch for _, batch in datamanager.fixed_indices_eval_dataloader)
-    judge(trainer.pipeline)
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert metrics["clip_l1"] < metrics["clip_l1_of_mean"] * 1.5
     assert not trainer.pipeline.model.gauss_params["codes"].requires_grad

@@ -10,7 +10,6 @@ from label_sets import box_object, write_labels, write_plain
 from PIL import Image
 from scenes import write_scene
 
-from lab.judging import judge
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
@@ -44,7 +43,7 @@ def evaluate(trainer, monkeypatch):
     pipeline = trainer.pipeline
 
     def run(**changes):
-        judge(pipeline)
+        pipeline.__dict__.pop("evaluation", None)
         for name, value in changes.items():
             monkeypatch.setattr(pipeline.config, name, value)
         return pipeline.get_average_eval_image_metrics(get_std=True)
@@ -52,7 +51,7 @@ def evaluate(trainer, monkeypatch):
     return run
 
 
-def test_evaluation_reports_pictures_features_words_and_cost(evaluate, scene, tmp_path):
+def test_ns_eval_reports_pictures_features_words_and_cost(evaluate, scene, tmp_path):
     results = evaluate(ground_truth=label(scene, tmp_path / "truth", range(12)))
     names = {
         "psnr",

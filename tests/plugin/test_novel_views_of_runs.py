@@ -10,7 +10,6 @@ from conftest import make_trainer
 from label_sets import write_plain
 from PIL import Image
 
-from lab.judging import judge
 from lab.landmark.novel_views import FOLDER, read_novel_views
 from lab.landmark.novel_views_of_runs import evaluate_novel_views, novel_dataset
 from lab.landmark.scene_writer import write_novel_cameras
@@ -53,7 +52,6 @@ def test_a_photo_as_a_test_view_is_placed_and_scored_as_the_photo(pipeline, data
     for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height"):
         own, photo = (getattr(d.cameras, name) for d in (views, manager.eval_dataset))
         torch.testing.assert_close(own, photo, atol=1e-4, rtol=1e-5)
-    judge(pipeline)
     results = pipeline.get_average_eval_image_metrics(get_std=True)
     beside = {view.name: view.metrics for view in evaluate_novel_views(pipeline)}
     assert set(beside) == {f"{FOLDER}/{name}" for name in HELD_OUT}
