@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from math import prod
@@ -129,12 +129,14 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     return len(data)
 
 
-def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
-    """Replace a scene file's taught words, and nothing else, atomically. Raises UserError as `read_scene`."""
+def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
+    """Replace some of a scene file's taught words (None: forget it), and nothing else, atomically. Words that
+    another command taught meanwhile stay. Raises UserError as `read_scene`."""
     from safetensors.numpy import save
 
     with _opened(path) as file:
-        described = file.about | {"taught": [word.to_json() for word in words]}
+        kept = {**{known_word(word.name): word for word in file.taught}, **words}
+        described = file.about | {"taught": [word.to_json() for word in kept.values() if word is not None]}
         content = {name: file.array(name) for name in file.shapes}
     write_atomically(path, save(content, {_KEY: json.dumps(described)}))
 

@@ -12,7 +12,7 @@ from PIL import Image
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands.query import CocoLabels
-from lang3dxl_ns.commands.teach import Teach
+from lang3dxl_ns.commands.teach import Teach, forgotten
 from lang3dxl_ns.query.scene_file import read_scene, write_scene
 from lang3dxl_ns.query.teach import Example, mask_of, run_lengths
 
@@ -57,6 +57,19 @@ def test_a_word_is_kept_in_the_scene_and_nothing_else_changes(place, capsys):
     assert left.points == ((69, 69),) and left.not_points == ((20, 60),)
     main(["words", str(place), "--forget", "Gizmo"])
     assert not words(place)
+
+
+def test_a_word_that_is_taught_while_another_is_forgotten_stays(place, monkeypatch):
+    teach(place, "--box", DOME)
+
+    def meanwhile(scene, name):
+        found = forgotten(scene, name)
+        main(["teach", str(place), "--word", "widget", "--photo", "0003.jpg", "--at", "69,69"])
+        return found
+
+    monkeypatch.setattr("lang3dxl_ns.commands.teach.forgotten", meanwhile)
+    main(["words", str(place), "--forget", "gizmo"])
+    assert list(words(place)) == ["widget"]
 
 
 def test_a_mask_teaches_and_queries_say_so(place, tmp_path, capsys):
