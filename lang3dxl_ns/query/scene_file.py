@@ -258,6 +258,7 @@ class _File:
         """Read a tensor of any type with this shape. Raises ValueError for another shape."""
         expect(self.shapes[name] == list(shape), f"{name} has the shape {self.shapes[name]}")
         values = self.array(name)
+        expect(not values.size or bool(np.isfinite(values).any()), f"no value of {name} is a number")
         return torch.from_numpy(values.astype(np.int32) if values.dtype == np.uint16 else values)
 
     def mask(self, photo: int) -> bytes | None:
@@ -277,6 +278,7 @@ class _File:
             for key, value in module.state_dict().items()
             if isinstance(value, Tensor)
         }
+        expect(all(bool(t.isfinite().all()) for t in tensors.values()), f"its {name} is not made of numbers")
         module.load_state_dict({**tensors, **(state or {})})
         return module.eval().requires_grad_(False)
 

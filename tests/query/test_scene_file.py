@@ -18,6 +18,8 @@ from painted_scene import (
     painted_splats,
 )
 from PIL import Image
+from safetensors import safe_open
+from safetensors.numpy import save
 
 from lab.baselines import BASELINES
 from lang3dxl_ns.commands.view import Info
@@ -228,6 +230,25 @@ def test_tensors_of_wrong_shapes_are_refused(written, name):
 
     rewritten(path, change)
     with pytest.raises(UserError, match=r"wall.scene"):
+        read_scene(path, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "said"),
+    [
+        ("means", slice(None), "no value of means is a number"),
+        ("words", slice(None), "no value of words is a number"),
+        ("decoder.output.bias", slice(1), "its decoder is not made of numbers"),
+    ],
+)
+def test_a_scene_without_numbers_is_refused_rather_than_answered_with_0(written, name, rows, said):
+    _, path = written
+    with safe_open(path, "np") as file:
+        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    tensors[name] = tensors[name].copy()
+    tensors[name][rows] = np.nan
+    path.write_bytes(save(tensors, metadata))
+    with pytest.raises(UserError, match=rf"wall\.scene is not a readable scene \({said}\)"):
         read_scene(path, "cpu")
 
 
