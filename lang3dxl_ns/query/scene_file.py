@@ -300,7 +300,8 @@ def _opened(path: Path) -> Iterator[_File]:
     except _NewerError as error:
         raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
     except (UserError, SafetensorError, *DAMAGE) as error:
-        raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): copy it again") from error
+        remedy = "copy it again" if path.suffix == SUFFIX else "a splat becomes one with lang3dxl attach"
+        raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): {remedy}") from error
 
 
 def _splats(file: _File) -> Splats:

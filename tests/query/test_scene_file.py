@@ -29,6 +29,7 @@ from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import Provenance, describe_scene_file, read_scene, write_scene
+from lang3dxl_ns.query.splat_file import write_splats
 
 ATOL = 1e-4 * TEMPERATURE
 """Of relevancies, whose slope is a quarter of the temperature: files hold half the digits."""
@@ -276,5 +277,8 @@ def test_cut_and_spoiled_files_are_refused_or_read_as_numbers(written):
 def test_other_names_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"end it in .scene"):
         write_scene(tmp_path / "a.ply", painted_scene())
+    write_splats(tmp_path / "a.ply", painted_splats())
+    with pytest.raises(UserError, match=r"a\.ply is not a readable scene .*: a splat .* lang3dxl attach"):
+        read_scene(tmp_path / "a.ply")
     with pytest.raises(UserError, match="not a file"):
         read_scene(tmp_path / "none.scene")
