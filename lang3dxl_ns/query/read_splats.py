@@ -14,6 +14,7 @@ from dataclasses import replace
 from math import isqrt
 from pathlib import Path
 from typing import Any, BinaryIO
+from zipfile import is_zipfile
 
 import numpy as np
 import torch
@@ -120,6 +121,8 @@ def _activated(
     means, log_scales, quats, logits, harmonics = map(_tensor, (means, log_scales, quats, logits, harmonics))
     bands = harmonics.shape[1]
     expect(isqrt(bands) ** 2 == bands, f"it has {bands} harmonics per color")
+    sides = [part.shape[-1] for part in (means, log_scales, quats, harmonics)]
+    expect(sides == [3, 3, 4, 3], f"its parts have {sides} numbers a Gaussian")
     opacities, harmonics = logits.reshape(-1).sigmoid(), harmonics[:, :_ALL_BANDS].contiguous()
     return Splats(means, quats, log_scales.exp(), opacities, harmonics, antialiased)
 
@@ -277,6 +280,8 @@ _SCALARS = (
 
 
 def _checkpoint(path: Path) -> Splats:
+    if not is_zipfile(path):
+        raise UserError("it is not a checkpoint of torch 1.6 or later: save it again with a newer torch")
     try:
         with torch.serialization.safe_globals([(_NumPyScalar, name) for name in _SCALARS]):
             state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)

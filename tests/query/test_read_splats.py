@@ -257,6 +257,17 @@ def test_every_bad_file_ends_in_one_sentence(tmp_path, capsys):
     assert capsys.readouterr().out == ""
 
 
+def test_checkpoints_in_the_old_format_and_of_other_shapes_are_told(tmp_path):
+    state = gsplat_state(some_splats(20))
+    torch.save(state, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    with pytest.raises(UserError, match=r"old\.pt: it is not a checkpoint of torch 1\.6 or later: save it"):
+        read_splats(tmp_path / "old.pt")
+    state["splats"]["quats"] = state["splats"]["quats"][:, :3]
+    torch.save(state, tmp_path / "flat.pt")
+    with pytest.raises(UserError, match=r"flat\.pt.*\[3, 3, 3, 3\] numbers a Gaussian"):
+        read_splats(tmp_path / "flat.pt")
+
+
 def test_a_ply_cut_anywhere_is_refused(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats(20))
     content = (tmp_path / "a.ply").read_bytes()
