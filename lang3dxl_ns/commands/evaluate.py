@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, write_report
@@ -17,6 +18,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_ph
 
 REPORT = "scores"
 """Name of the report's files, without suffix."""
+_DRAWN = "draw objects white on black, or black on white for --layout holyscenes"
 
 
 @dataclass(kw_only=True)
@@ -163,6 +165,8 @@ class EvaluateSplit:
 
     def main(self) -> None:
         names = held_out_photos(GroundTruth(self.ground_truth))
+        if not names:
+            raise UserError(f"no label in {self.ground_truth} marks a pixel; {_DRAWN}")
         write_atomically(self.out, "\n".join(names) + "\n")
         print(f"Wrote {len(names)} names to {self.out}")
 
@@ -189,3 +193,5 @@ def write_scores(folder: Path, scene: str, results: dict[str, Any], device: Any 
     write_report(folder, REPORT, table, report)
     print(table)
     print(f"\nWrote {folder / REPORT}.md")
+    if "map" not in results and (empty := results["protocol"].get("photos_without_positives")):
+        raise UserError(f"no word was scored: no label marks a pixel of {some(list(empty))}; {_DRAWN}")

@@ -191,6 +191,18 @@ def test_the_list_of_photos_to_hold_out_is_a_list_of_photos_to_score(scene, tmp_
         cli.main(["evaluate", "maps", *common, "--out", str(tmp_path / "out")])
 
 
+def test_labels_that_mark_nothing_are_told(scene, tmp_path, mask):
+    truth, maps = tmp_path / "black", scene[1]
+    write_plain(truth, "rose window", "0001", np.zeros_like(mask))
+    for words in (
+        ["maps", "--maps", str(maps), "--out", str(tmp_path)],
+        ["split", "--out", str(tmp_path / "a")],
+    ):
+        with pytest.raises(SystemExit, match=r"no label .*marks a pixel.*white on black"):
+            cli.main(["evaluate", *words, "--ground-truth", str(truth)])
+    assert (tmp_path / "scores.json").is_file() and not (tmp_path / "a").exists()
+
+
 def test_the_temperature_of_maps_matters_to_the_published_processing_alone(scene):
     truth, maps = scene
     steep, _ = score_predictions(GroundTruth(truth), maps, ["0002"], temperature=10)
