@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.ndimage import find_objects, label
 
 from lang3dxl_ns import __version__
-from lang3dxl_ns.common.console import say, tracked
+from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomically
 from lang3dxl_ns.common.settings_help import showing
@@ -85,6 +85,8 @@ class Query:
         if not prompts:
             raise UserError("there is no --text: say what to look for, such as --text windows")
         make_folder(self.out)
+        listed = self.out / "query.json"
+        before = listed.stat().st_mtime_ns if listed.is_file() else 0
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         scene = scene.with_words(()) if self.without_taught else scene
         question = scene.ask(prompts)
@@ -112,13 +114,16 @@ class Query:
             write_atomically(self.coco, json.dumps(labels.content) + "\n")
         texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))
         report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
-        write_atomically(self.out / "query.json", json.dumps(report, indent=2, ensure_ascii=False) + "\n")
+        write_atomically(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
         for (prompt, doubt, level, folder), (score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
             closest = "" if score > level else " (no match; this view comes closest)"
             say(f"{prompt.text}{' (taught)' if taught else ''}: {score:.2f} at {where}; {folder}{closest}")
             warnings = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
             say(*(f"  {advice}" for advice in warnings if advice))
+        old = sorted({p.parent.name for p in self.out.glob("*/*") if p.lstat().st_mtime_ns <= before})
+        if old:
+            say(f"{self.out} still has files of an earlier query, not listed in query.json: {some(old)}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
         """List file name (no suffix), camera or photo, and prompts of every requested view."""

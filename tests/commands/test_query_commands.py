@@ -69,6 +69,16 @@ def test_without_a_view_the_best_one_is_taken(run, tmp_path):
     assert (tmp_path / "dome" / "right_0002.npy").exists()
 
 
+def test_files_of_an_earlier_query_stay_and_are_told(run, tmp_path, capsys):
+    photo = ("--image", "all/0003.jpg", "--out", tmp_path)
+    run("query", "c", "--text", "dome; window", *photo)
+    run("query", "c", "--text", "dome; window", *photo)
+    assert "earlier query" not in capsys.readouterr().out
+    run("query", "c", "--text", "dome", *photo)
+    assert "files of an earlier query, not listed in query.json: together, window" in capsys.readouterr().out
+    assert (tmp_path / "window" / "all_0003.npy").is_file()
+
+
 def test_all_photos_are_asked(run, tmp_path):
     run("query", "c", "--text", "dome", "--all", "--out", tmp_path)
     assert len(list((tmp_path / "dome").glob("*.npy"))) == 4
