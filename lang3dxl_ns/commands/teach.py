@@ -82,6 +82,8 @@ class Words:
         from lang3dxl_ns.query.scene_file import keep_words
         from lang3dxl_ns.query.teach import load_words, save_words
 
+        if self.save is not None and self.save.suffix != ".json":
+            raise UserError(f"--save writes words as JSON: {self.save} is not the name of a .json file")
         scene, file = opened(self.scene)
         before = scene.words
         for name in self.forget:

@@ -72,6 +72,13 @@ def test_a_word_that_is_taught_while_another_is_forgotten_stays(place, monkeypat
     assert list(words(place)) == ["widget"]
 
 
+def test_words_are_not_saved_over_a_scene(place):
+    teach(place, "--box", DOME)
+    with pytest.raises(SystemExit, match=r"wall\.scene is not the name of a \.json file"):
+        main(["words", str(place), "--save", str(place)])
+    assert words(place)
+
+
 def test_a_mask_teaches_and_queries_say_so(place, tmp_path, capsys):
     mask = np.zeros((96, 96), np.uint8)
     mask[62:76, 62:76] = 255
