@@ -216,13 +216,16 @@ class Scene:
                 for the scene (`match_thresholds`).
 
         Raises:
-            UserError: there is no prompt, the threshold is impossible, or the scene has colors only.
+            UserError: there is no prompt, one is its own negative, the threshold is impossible, or the scene
+                has colors only.
         """
         requested = self.config.threshold if threshold is None else threshold
         if requested is not None and not 0 <= requested <= 1:
             raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
         rivals = texts_of(negatives, "a negative")
         prompts = [replace(p, negatives=(*p.negatives, *rivals)) for p in self.prompts(texts)]
+        if own := [p.text for p in prompts if known_word(p.text) in map(known_word, p.negatives)]:
+            raise UserError(f"{own[0]!r} is its own negative, so nothing can match it: name another negative")
         within = self.config.foreground if foreground is None else foreground
         everything = [*prompts, *(self.prompts(within) if within else ())]
         queries, count = self.queries(everything), len(prompts)
