@@ -38,6 +38,9 @@ from lang3dxl_ns.scene.camera import Camera
 _LEAST_PART = 1e-4
 """Share of a photo below which a separate part of a mask is no label."""
 _NEAREST = Image.Resampling.NEAREST
+_USERS = dict.fromkeys(("title", "credit", "license"), "web scene_file")
+_USERS |= {"text": "out web", "not_": "out web", "look": "out web", "vocabulary": "web", "all": "out"}
+"""What the options of `export` affect; the others affect everything."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
@@ -250,8 +253,14 @@ class Export:
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
-        if sum(target is not None for target in (self.out, self.web, self.scene_file)) != 1:
+        targets = [name for name in ("out", "web", "scene_file") if getattr(self, name) is not None]
+        if len(targets) != 1:
             raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
+        if ignored := [
+            name for name, users in _USERS.items() if getattr(self, name) and targets[0] not in users
+        ]:
+            option, target = (name.strip("_").replace("_", "-") for name in (ignored[0], targets[0]))
+            raise UserError(f"--{option} has no effect on --{target}: leave it off")
         if self.index is not None and (self.out is None or not self.text):
             raise UserError("--index lists the Gaussians that match: give --text and --out with it")
         prompts = parse_texts(self.text, self.not_)

@@ -109,6 +109,7 @@ def test_a_camera_path_is_followed(run, tmp_path):
         (("--text", " ; "), "the prompt is empty"),
         ((), "there is no --text"),
         (("--text", "dome", "--image", "x"), "no photo 'x'"),
+        (("--text", "wall; dome", "--not", "Dome"), "'dome' is its own negative"),
         (("--text", "dome", "--image", "0001", "--all"), "exclude each other"),
     ],
 )
@@ -121,6 +122,16 @@ def test_settings_are_flags(run, tmp_path):
     words = ("query", "c", "--text", "dome", "--image", "0002", "--out", tmp_path)
     run(*words, "--threshold", 1, "--synonyms", "off")
     assert not np.asarray(Image.open(tmp_path / "dome" / "right_0002.mask.png")).any()
+
+
+@pytest.mark.parametrize(
+    ("target", "option"),
+    [("--scene-file", "--text"), ("--scene-file", "--not"), ("--out", "--title"), ("--out", "--vocabulary")],
+)
+def test_export_refuses_options_without_effect(run, tmp_path, target, option):
+    name = {"--out": "a.ply", "--scene-file": "a.scene"}[target]
+    with pytest.raises(SystemExit, match=f"{option} has no effect on {target}"):
+        run("export", "c", target, tmp_path / name, option, "dome")
 
 
 def test_export_writes_the_matching_gaussians_or_all_with_scores(run, tmp_path):
