@@ -198,12 +198,12 @@ def read_scene(
     """
     path, device = expanded(path), torch.device(device or best_device())
     with _opened(path) as file:
-        splats, decoder, codes, looks, vectors = _splats(file).to(device), None, None, None, None
+        splats, decoder, codes, looks, vectors = _splats(file), None, None, None, None
         if (settings := file.about.get("decoder")) is not None:
-            decoder = _decoder(file, settings).to(device)
-            codes = _codes(file, decoder.bounded, len(splats)).to(device)
+            decoder = _decoder(file, settings)
+            codes = _codes(file, decoder.bounded, len(splats))
         if (described := file.about.get("looks")) is not None:
-            looks = _looks(file, described).to(device)
+            looks = _looks(file, described)
         if (words := file.about.get("words")) is not None:
             expect(all(isinstance(word, str) for word in words), "its words are no texts")
             rows = file.tensor("words", len(words), file.shapes["words"][1]).float()
@@ -211,10 +211,12 @@ def read_scene(
         masks = [file.mask(i) for i in range(len(file.scene.photos))]
     photos = [replace(photo, mask=mask) for photo, mask in zip(file.scene.photos, masks, strict=True)]
     background = None if file.background is None else torch.tensor(file.background, device=device)
+    # Moved to the device here, where its errors are not the file's.
+    codes = None if codes is None else codes.to(device)
     return Scene(
-        splats, replace(file.scene, photos=photos), decoder, codes,
-        looks=looks, background=background, config=config or QueryConfig(), encode_texts=encode_texts,
-        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
+        splats.to(device), replace(file.scene, photos=photos), decoder and decoder.to(device), codes,
+        looks=looks and looks.to(device), background=background, config=config or QueryConfig(),
+        encode_texts=encode_texts, vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
     ).with_words(file.taught)  # fmt: skip
 
 

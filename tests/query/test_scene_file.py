@@ -274,6 +274,13 @@ def test_cut_and_spoiled_files_are_refused_or_read_as_numbers(written):
             read_scene(path, "cpu")
 
 
+def test_errors_of_the_device_are_not_the_files(written):
+    _, path = written
+    with pytest.raises(Exception, match=r"^((?!copy it again).)*$") as error:
+        read_scene(path, "cuda:63")
+    assert not isinstance(error.value, UserError)
+
+
 def test_other_names_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"end it in .scene"):
         write_scene(tmp_path / "a.ply", painted_scene())
