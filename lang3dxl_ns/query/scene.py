@@ -504,7 +504,7 @@ class Scene:
         share = self._fill(camera, pixel)
         rows = share.nonzero().squeeze(1)
         features = self.engine.features(rows)
-        if float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
+        if not words or float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
             return []
         queries, negatives = self.text.plain_queries(words).to(self.device), self.text.config.negatives
         cosines = queries.cosines(share[rows] @ features)
@@ -617,7 +617,7 @@ class Scene:
                 f"a vector to search for has shape {list(vector.shape)}: this scene's CLIP has {width} "
                 "finite numbers, not all of them 0"
             )
-        return vector.float()
+        return (vector.double() / vector.double().norm()).float()
 
     def _one(self, text: Text, threshold: float | None = None) -> Question:
         question = self.ask(text, threshold=threshold)
