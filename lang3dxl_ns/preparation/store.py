@@ -26,8 +26,8 @@ from lang3dxl_ns.scene.photo import Photo
 logger = logging.getLogger(__name__)
 
 _HALF_MAX = torch.finfo(torch.float16).max
-_ENTRIES = (".safetensors", ".png", ".jpg")
-"""Suffixes of targets, masks, and photos at working size."""
+_ENTRY = re.compile(r".+\.[0-9a-f]{16}\.(safetensors|png|jpg)")
+"""Names of targets, masks, and photos at working size. Nothing else is ever deleted."""
 _HASHES = "photo_hashes.json"
 _SECOND = 10**9  # nanoseconds
 _LEFTOVER_AGE_S = 3600.0
@@ -159,7 +159,7 @@ class FeatureStore:
         """Count the files and bytes on disk, by kind."""
         sizes = {}
         for folder in sorted(path for path in self.root.glob("*") if path.is_dir()):
-            files = [path for path in folder.iterdir() if path.suffix in _ENTRIES]
+            files = [path for path in folder.iterdir() if _ENTRY.fullmatch(path.name)]
             sizes[folder.name] = (len(files), sum(path.stat().st_size for path in files))
         return sizes
 
@@ -169,14 +169,14 @@ class FeatureStore:
         keep = {self.path(kind, name).with_suffix("") for name in names for kind in kinds}
         files, freed = 0, 0
         for path in self.root.glob("*/*"):
-            if path.suffix in _ENTRIES and path.with_suffix("") not in keep:
+            if _ENTRY.fullmatch(path.name) and path.with_suffix("") not in keep:
                 files, freed = files + 1, freed + path.stat().st_size
                 path.unlink()
         return files, freed
 
     def remove_leftovers(self) -> None:
         """Delete temporary files of processes that were killed while writing."""
-        for path in self.root.glob("*/*.tmp"):
+        for path in self.root.glob("*/*-????????.tmp"):
             with contextlib.suppress(FileNotFoundError):  # another process may clean up too
                 if time.time() - path.stat().st_mtime > _LEFTOVER_AGE_S:
                     path.unlink()
