@@ -155,7 +155,7 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
 def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     """Link the photos under numbers, in their order; formats that COLMAP can't read become converted copies.
     COLMAP separates names by spaces, so "photo 1.jpg" would be two names."""
-    folder = work / "photos"
+    folder = work / "numbered"  # not "photos", a name that people use
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     numbers = []

@@ -155,6 +155,14 @@ def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch):
     assert len(matched) == 7 * 6 // 2 - 10
 
 
+def test_photos_in_a_folder_of_that_name_beside_the_work_stay(photos, tmp_path):
+    """As with `reconstruct --data castle/reconstruction/photos --cache-dir castle`."""
+    own = tmp_path / "reconstruction" / "photos"
+    shutil.copytree(photos / "images", own)
+    module._numbered(find_photos(own), own.parent)
+    assert find_photos(own).names == find_photos(photos).names
+
+
 def test_other_photos_begin_anew(photos):
     reconstruct_scene(photos)
     shutil.rmtree(photos / "sparse")
