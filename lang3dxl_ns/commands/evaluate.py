@@ -75,17 +75,19 @@ class EvaluateRun(_Scored):
     """
 
     run: tyro.conf.Positional[Path | None] = None
-    """Folder of the run, or its config.yml (default: the newest under outputs/). For a .scene file, its words
-    are scored with --ground-truth, which needs neither its run nor its photos."""
+    """Folder of the run, or its config.yml (default: the newest under outputs/). For a .scene file, or a
+    folder that holds one, its words are scored with --ground-truth, without its run and photos."""
     split: Literal["held-out", "seen", "test"] = "held-out"
     """Photos to score: those held out of training, labeled training photos, or the run's test views."""
     ground_truth: Path | None = None
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
 
     def main(self) -> None:
-        if self.run is not None and self.run.suffix == ".scene":
-            self._score_scene(self.run)
-            return
+        from lang3dxl_ns.query.run_file import OUTPUTS
+
+        place = self.run or OUTPUTS
+        if place.suffix == ".scene" or (any(place.glob("*.scene")) and not (place / "config.yml").exists()):
+            return self._score_scene(place)
         from lang3dxl_ns.plugin.trainer_config import open_run
 
         if self.split == "test" and (self.ground_truth is not None or self.layout != "auto"):
@@ -101,10 +103,11 @@ class EvaluateRun(_Scored):
         results = pipeline.evaluation.scored(get_std=True)
         write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
-    def _score_scene(self, file: Path) -> None:
+    def _score_scene(self, place: Path) -> None:
         from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene, score_selections
-        from lang3dxl_ns.open_scene import load_scene
+        from lang3dxl_ns.open_scene import existing_scene_file, load_scene
 
+        file = existing_scene_file(place)
         if self.ground_truth is None or self.split == "test":
             raise UserError(f"{file} is scored with --ground-truth FOLDER, --split held-out or seen")
         truth = GroundTruth(self.ground_truth, self.layout)

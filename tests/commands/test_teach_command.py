@@ -72,6 +72,12 @@ def test_a_word_that_is_taught_while_another_is_forgotten_stays(place, monkeypat
     assert list(words(place)) == ["widget"]
 
 
+def test_evaluate_takes_a_scene_or_the_folder_that_holds_it(place):
+    for given in (place, place.parent):
+        with pytest.raises(SystemExit, match=r"wall\.scene is scored with --ground-truth"):
+            main(["evaluate", "run", str(given), "--out", str(place.parent / "report")])
+
+
 def test_words_are_not_saved_over_a_scene(place):
     teach(place, "--box", DOME)
     with pytest.raises(SystemExit, match=r"wall\.scene is not the name of a \.json file"):
