@@ -23,6 +23,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
@@ -92,6 +93,7 @@ def _finite(splats: Splats, path: Path) -> Splats:
     share = 1 - float(sound.float().mean())
     if share > _MOST_DAMAGE:
         raise UserError(f"{path}: {share:.0%} of its Gaussians have NaN or infinite values; export it again")
+    say(f"{path}: {share:.2%} of its Gaussians have NaN or infinite values; they are left invisible")
     place = splats.means[sound].median(0).values
     keep = sound[:, None]
     return replace(

@@ -197,13 +197,14 @@ def test_a_run_folder_means_its_latest_splat(tmp_path):
     assert find_splats(tmp_path).parent.name == "iteration_30000"
 
 
-def test_gaussians_with_nan_keep_their_place_and_are_invisible(tmp_path):
+def test_gaussians_with_nan_keep_their_place_and_are_invisible(tmp_path, capsys):
     splats = some_splats()
     broken = splats.means.clone()
     broken[[3, 70]] = torch.tensor([torch.nan, 0, torch.inf])
     state = gsplat_state(Splats(broken, splats.quats, splats.scales, splats.opacities, splats.harmonics))
     torch.save(state, tmp_path / "a.pt")
     found = read_splats(tmp_path / "a.pt")
+    assert "a.pt: 0.67% of its Gaussians have NaN" in capsys.readouterr().out.replace("\n", " ")
     assert len(found) == len(splats) and bool(found.sound().all())
     assert float(found.opacities[[3, 70]].max()) == 0
     keep = torch.arange(len(splats)) % 67 != 3
