@@ -62,6 +62,15 @@ def test_mistakes_are_told_with_the_remedy(words, hint, tmp_path, monkeypatch):
         cli.main(words)
 
 
+def test_a_home_in_an_option_is_no_folder_called_tilde(tmp_path, monkeypatch):
+    """Shells leave the ~ of --out=~/x as it is."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="none"):
+        cli.main(["query", "none", "--text", "dome", "--out=~/found"])
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
+
+
 def test_a_text_without_its_flag_is_told(capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["query", "run", "windows", "--out", "found"])
