@@ -10,7 +10,7 @@ from numpy import ndarray as Array
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError, readable
-from lang3dxl_ns.common.pictures import NoPictureError, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, open_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 """Suffixes of pictures, lower case."""
@@ -26,11 +26,17 @@ class Truth:
     """Left, top, right and bottom in pixels of the mask, edges included; None if the labels have no boxes."""
 
 
-def read_gray(path: Path, what: str = "ground truth") -> Image.Image:
-    """Read a picture as gray values 0…255. Raises UserError if it cannot be read."""
+def read_gray(path: Path, what: str = "ground truth", behind: int = 0) -> Image.Image:
+    """Read a picture as gray values 0…255, over the value `behind` where it is transparent. Raises UserError
+    if it cannot be read."""
     problem, damage = f"{what} {path} can't be read", (OSError, NoPictureError)
     with readable(problem, "replace or remove it", damage), open_picture(path) as image:
-        return image.convert("L")
+        gray = eight_bits(image).convert("L")
+        if image.has_transparency_data:
+            gray = Image.composite(
+                gray, Image.new("L", gray.size, behind), image.convert("RGBA").getchannel("A")
+            )
+        return gray
 
 
 def check_shape(path: Path, mine: tuple[int, int], other: tuple[int, int]) -> None:

@@ -40,7 +40,7 @@ class MaskFile:
         return Truth(gray < 128 if self.dark else gray >= 128)
 
     def _read(self) -> Image.Image:
-        image = read_gray(self.path)
+        image = read_gray(self.path, behind=255 if self.dark else 0)
         if not self.dark and image.getextrema()[1] == 1:
             raise UserError(f"ground truth {self.path} holds only 0 and 1, which look black: save 0 and 255")
         return image

@@ -23,7 +23,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.pictures import NoPictureError, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, open_picture
 from lang3dxl_ns.scene.camera import HasLens, Lens, scaled_size
 
 if TYPE_CHECKING:
@@ -217,12 +217,7 @@ def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) ->
     with _readable(path, name), open_picture(path) as image:
         if at_least is not None and image.width * image.height > _LARGE:
             image.draft(None, at_least)  # does nothing for other formats
-        if image.mode == "F":
-            raise ValueError("its pixels are floating-point numbers of unknown range")
-        if image.mode.startswith("I"):  # 16-bit gray, which convert() would clip at 255
-            gray = (np.asarray(image).clip(0, 65535) / 257).round().astype(np.uint8)
-            return Image.fromarray(gray).convert("RGB")
-        return image.convert("RGB")
+        return eight_bits(image).convert("RGB")
 
 
 def _check_shape(name: str, path: Path, size: tuple[int, int], camera: tuple[int, int]) -> None:

@@ -10,7 +10,9 @@ from PIL import Image
 
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.evaluation.annotations import read_gray
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.mask_folders import MaskFile
 from lang3dxl_ns.evaluation.predictions import score_predictions
 from lang3dxl_ns.evaluation.scores import average_precision
 
@@ -63,6 +65,26 @@ def test_pictures_score_as_floats_do(scene, tmp_path):
     score[8:24, 16:48] = 255
     Image.fromarray(score).save(maps / "rose window" / "0001.png")
     assert score_predictions(GroundTruth(truth), maps)[0]["0001"] == pytest.approx(expected)
+
+
+def test_pictures_of_16_bits_are_not_clipped_at_255_and_floats_are_refused(tmp_path):
+    ramp = np.linspace(0, 65535, 1200).reshape(30, 40)
+    Image.fromarray(ramp.astype(np.uint16)).save(tmp_path / "a.png")
+    np.testing.assert_allclose(np.asarray(read_gray(tmp_path / "a.png")), ramp / 257, atol=0.51)
+    Image.fromarray((ramp > 30000).astype(np.uint16) * 255).save(tmp_path / "b.png")  # a mask of 0 and 255
+    np.testing.assert_array_equal(np.asarray(read_gray(tmp_path / "b.png")) == 255, ramp > 30000)
+    Image.fromarray((ramp / 65535).astype(np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(UserError, match=r"a\.tif.*floating-point"):
+        read_gray(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(("color", "dark"), [(255, False), (0, True)])
+def test_what_is_transparent_is_not_the_object(tmp_path, mask, color, dark):
+    """As programs that cut things out save them."""
+    colors = np.full((*mask.shape, 3), color, np.uint8)
+    cut = np.concatenate([colors, mask[..., None] * np.uint8(255)], axis=2)
+    Image.fromarray(cut).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(MaskFile(tmp_path / "a.png", dark).truth(mask.shape).mask, mask)
 
 
 def test_the_names_of_query_are_understood(scene):
