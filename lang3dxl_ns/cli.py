@@ -103,9 +103,8 @@ def _parsed(words: Sequence[str]) -> Any:
         if error.code == 2 and words[0] in ("query", "export"):
             print(_TEXTS.format(words[0], "found" if words[0] == "query" else "found.ply"), file=sys.stderr)
         raise
-    for name, value in vars(parsed).items():
-        if isinstance(value, Path):  # shells leave the ~ of --out=~/found as it is
-            setattr(parsed, name, expanded(value))
+    # Shells leave the ~ of --out=~/found as it is.
+    vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})
     return parsed
 
 

@@ -22,7 +22,7 @@ from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomi
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.doubt import doubtful
-from lang3dxl_ns.query.match import Match, save_picture, together
+from lang3dxl_ns.query.match import save_picture, together
 from lang3dxl_ns.query.query_config import QueryConfig
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.run_file import read_camera_path
@@ -112,7 +112,11 @@ class Query:
                 labels.add(place, [np.asarray(mask) for mask in masks])
             if len(matches) > 1:
                 save_picture(together(matches), shared / f"{name}.png")
-            views.append(_view_report(name, matches))
+            found = [
+                {"text": m.prompt.text, "peak": m.peak, "score": m.score, "area": m.area} for m in matches
+            ]
+            seconds = {"render_seconds": matches[0].view.seconds, "query_seconds": matches[0].seconds}
+            views.append({"view": name, **seconds, "matches": found})
         if self.coco is not None:
             write_atomically(self.coco, json.dumps(labels.content) + "\n")
         texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))
@@ -194,21 +198,9 @@ def file_names(photos: list[str]) -> list[str]:
 
 
 def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, folder: Path) -> dict:
-    return {
-        "text": prompt.text,
-        "negatives": list(prompt.negatives),
-        "synonyms": scene.synonyms(prompt),
-        "taught": prompt.taught is not None,
-        "doubt": doubt,
-        "threshold": threshold,
-        "folder": folder.name,
-    }
-
-
-def _view_report(name: str, matches: list[Match]) -> dict:
-    found = [{"text": m.prompt.text, "peak": m.peak, "score": m.score, "area": m.area} for m in matches]
-    seconds = {"render_seconds": matches[0].view.seconds, "query_seconds": matches[0].seconds}
-    return {"view": name, **seconds, "matches": found}
+    taught, synonyms = prompt.taught is not None, scene.synonyms(prompt)
+    told = {"text": prompt.text, "negatives": list(prompt.negatives), "synonyms": synonyms, "taught": taught}
+    return told | {"doubt": doubt, "threshold": threshold, "folder": folder.name}
 
 
 @showing(
@@ -256,9 +248,8 @@ class Export:
         targets = [name for name in ("out", "web", "scene_file") if getattr(self, name) is not None]
         if len(targets) != 1:
             raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
-        if ignored := [
-            name for name, users in _USERS.items() if getattr(self, name) and targets[0] not in users
-        ]:
+        ignored = [n for n, users in _USERS.items() if getattr(self, n) and targets[0] not in users]
+        if ignored:
             option, target = (name.strip("_").replace("_", "-") for name in (ignored[0], targets[0]))
             raise UserError(f"--{option} has no effect on --{target}: leave it off")
         if self.index is not None and (self.out is None or not self.text):

@@ -33,9 +33,8 @@ def read_gray(path: Path, what: str = "ground truth", behind: int = 0) -> Image.
     with readable(problem, "replace or remove it", damage), open_picture(path) as image:
         gray = eight_bits(image).convert("L")
         if image.has_transparency_data:
-            gray = Image.composite(
-                gray, Image.new("L", gray.size, behind), image.convert("RGBA").getchannel("A")
-            )
+            alpha = image.convert("RGBA").getchannel("A")
+            gray = Image.composite(gray, Image.new("L", gray.size, behind), alpha)
         return gray
 
 

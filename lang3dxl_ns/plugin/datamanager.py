@@ -136,9 +136,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             recorded = recorded_scene(config.run)
             if recorded is None or kwargs.get("test_mode", "val") == "val":
                 raise
-            CONSOLE.log(
-                f"[yellow]The cameras are taken from the run's folder, since the photos are gone: {reason}"
-            )
+            CONSOLE.log(f"[yellow]The run's own cameras are used, since the photos are gone: {reason}")
             config.dataparser, config.camera_res_scale_factor = recorded, 1.0
             super().__init__(config, *args, **kwargs)
 
@@ -226,9 +224,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """The test views as photos, with targets made with the collection's crop sizes."""
         views, config = self.test_views, self.config
         if views is None:
-            raise UserError(
-                f"{self.data_folder} has no test views: `lang3dxl demo-scene` makes scenes with them"
-            )
+            raise UserError(f"{self.data_folder} has no test views: `lang3dxl demo-scene` makes some")
         dataset = self._dataset(
             novel_outputs(views, self.train_dataparser_outputs, config.foreground != "none")
         )

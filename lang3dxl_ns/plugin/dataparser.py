@@ -80,9 +80,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
                 "--pipeline.datamanager.camera-res-scale-factor"
             )
         if not data.is_dir():
-            raise UserError(
-                f"{data} is not a folder: pass the folder that holds images/ and sparse/0 as --data"
-            )
+            raise UserError(f"{data} is not a folder: pass the one that holds images/ and sparse/0 as --data")
         named = self.config.colmap_path
         self.config.colmap_path = find_colmap_model(data, (named, *MODEL_FOLDERS, OWN_MODEL)) or named
         self.config.images_path = images_path(data, self.config.images_path)

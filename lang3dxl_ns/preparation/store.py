@@ -194,9 +194,7 @@ def _opened(path: Path, what: str) -> Iterator[Any]:
     except FileNotFoundError as error:
         raise UserError(f"{what} is not prepared: {path} does not exist; run `lang3dxl prepare`") from error
     except (SafetensorError, ValueError) as error:
-        raise UserError(
-            f"{path} ({what}) is damaged ({error}): delete it and run `lang3dxl prepare`"
-        ) from error
+        raise UserError(f"{path} ({what}) is damaged ({error}): delete it; run `lang3dxl prepare`") from error
 
 
 def _compact(tensor: Tensor, what: str) -> Tensor:
@@ -205,9 +203,7 @@ def _compact(tensor: Tensor, what: str) -> Tensor:
     if not tensor.is_floating_point():
         return tensor
     if not torch.isfinite(tensor).all():
-        raise UserError(
-            f"{what} holds NaN or infinity: the model's weights are damaged or overflow in float16"
-        )
+        raise UserError(f"{what} holds NaN or infinity: the weights are damaged or overflow in float16")
     fits = tensor.numel() == 0 or float(tensor.abs().max()) <= _HALF_MAX
     return tensor.to(torch.float16 if fits else torch.float32)
 

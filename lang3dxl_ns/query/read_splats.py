@@ -301,10 +301,7 @@ def _gsplat(parts: Mapping[str, Any]) -> Splats:
     """Build splats from what gsplat's example trainers save."""
     _check_parts(parts, ("means", "scales", "quats", "opacities"))
     if "sh0" not in parts:
-        raise UserError(
-            "this gsplat checkpoint has colors that a network makes (app_opt): train it without, or export "
-            "a PLY"
-        )
+        raise UserError("a network makes its colors (app_opt): train it without, or export a PLY")
     harmonics = torch.cat([parts["sh0"], parts["shN"]], dim=1)
     return _activated(parts["means"], parts["scales"], parts["quats"], parts["opacities"], harmonics)
 

@@ -53,10 +53,9 @@ class Example:
         """Raise UserError unless something is marked, with finite coordinates."""
         remedy = "give two numbers for a point, and four for a box"
         with readable(f"the marks in {self.photo} have a coordinate that is not a number", remedy):
-            points, others = ([_finite(p, 2) for p in some] for some in (self.points, self.not_points))
+            points, others = (tuple(_finite(p, 2) for p in some) for some in (self.points, self.not_points))
             box = None if self.box is None else _finite(self.box, 4)
-        for name, value in (("points", tuple(points)), ("not_points", tuple(others)), ("box", box)):
-            object.__setattr__(self, name, value)
+        vars(self).update(points=points, not_points=others, box=box)
         if self.mask is None and self.box is None and not self.points:
             raise UserError(f"nothing is marked in {self.photo}: give a mask, a box or a point on the word")
         if self.mask is not None and self.box is not None:

@@ -102,8 +102,7 @@ class Photo(HasLens):
         return torch.from_numpy(np.array(image))
 
     def undistort_labels(self, labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-        """Undistort 32-bit labels drawn on the file (at any size) like `read`, by nearest pixel; −1 outside
-        the photo."""
+        """Undistort 32-bit labels drawn on the file (any size) like `read`, by nearest pixel; −1 outside."""
         labels = self._drawn_upright(labels)
         if not self.lens.distorts:
             return labels
@@ -202,9 +201,7 @@ def _readable(path: Path, name: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        raise UserError(
-            f"photo {name}: there is no file {path}: put it there or leave the photo out"
-        ) from error
+        raise UserError(f"photo {name}: there is no file {path}: put it there or leave it out") from error
     except (OSError, NoPictureError) as error:
         raise UserError(
             f"photo {name}: can't read {path} ({error}): remove it, or convert it to an 8-bit JPEG or PNG"
@@ -212,8 +209,7 @@ def _readable(path: Path, name: str) -> Iterator[None]:
 
 
 def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) -> Image.Image:
-    """Decode a file as stored to 8-bit RGB, without transparency; a large JPEG may be shrunk, not below
-    `at_least`."""
+    """Decode a file as stored to 8-bit RGB without alpha; large JPEGs may be shrunk, not below `at_least`."""
     with _readable(path, name), open_picture(path) as image:
         if at_least is not None and image.width * image.height > _LARGE:
             image.draft(None, at_least)  # does nothing for other formats

@@ -1,5 +1,4 @@
-"""Photos of a folder (flat, in images/, or in sub-folders), grouped by camera; the sharpest frames of a
-video."""
+"""Photos of a folder (flat, in images/, or in sub-folders), by camera; the sharpest frames of a video."""
 
 from __future__ import annotations
 
@@ -187,9 +186,7 @@ def _duration(video: Path) -> float:
             raise KeyError("streams")
         return float(answer["format"]["duration"])
     except (ValueError, KeyError) as error:
-        raise UserError(
-            f"{video} is not a video that ffmpeg reads: {found.stderr.strip() or error}"
-        ) from error
+        raise UserError(f"{video} is not a video ffmpeg reads: {found.stderr.strip() or error}") from error
 
 
 def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
