@@ -179,7 +179,7 @@ class Scene:
             return None
         if self.looks is None:
             raise UserError("all photos of this scene share one lighting: there is no look to choose")
-        return self.looks.of_photo(photo)
+        return self.looks.of_photo(self.file.photo(photo).name)
 
     def _name(self, place: Place) -> str | None:
         return self.file.photo(place).name if isinstance(place, str) else None

@@ -72,7 +72,7 @@ def test_a_scene_survives_its_file(written):
         np.testing.assert_allclose(there.relevancy, here.relevancy, atol=2 * ATOL)
         error = (there.view.pixels.astype(float) - here.view.pixels) / 255
         assert 10 * np.log10(1 / np.square(error).mean()) > 45
-    lit = found.render("0002", look="left/0001.jpg").pixels.astype(int)
+    lit = found.render("0002", look="0001").pixels.astype(int)  # by its stem, like every photo
     assert np.abs(lit - scene.render("0002", look="left/0001.jpg").pixels).max() <= 3
     assert [asdict_of(p) for p in found.photos] == [asdict_of(p) for p in scene.photos]
     assert (found.file.clip, found.file.scale) == (scene.file.clip, scene.file.scale)
