@@ -561,7 +561,7 @@ class Scene:
         if word.examples and word.scene == Path(self.file.data).name:
             with suppress(UserError):
                 return self.teach(word.name, word.examples)
-        if word.clip != self.file.clip_identity:
+        if word.clip != self.file.clip_identity or len(word.vector) != self._semantics()[0].clip_dim:
             raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
         return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
 

@@ -201,6 +201,7 @@ def read_scene(
         splats, decoder, codes, looks, vectors = _splats(file), None, None, None, None
         if (settings := file.about.get("decoder")) is not None:
             decoder = _decoder(file, settings)
+            expect({len(w.vector) for w in file.taught} <= {decoder.clip_dim}, "a word is of another CLIP")
             codes = _codes(file, decoder.bounded, len(splats))
         if (described := file.about.get("looks")) is not None:
             looks = _looks(file, described)

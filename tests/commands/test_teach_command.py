@@ -13,7 +13,8 @@ from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands.query import CocoLabels
 from lang3dxl_ns.commands.teach import Teach, forgotten
-from lang3dxl_ns.query.scene_file import read_scene, write_scene
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.scene_file import keep_words, read_scene, write_scene
 from lang3dxl_ns.query.teach import Example, mask_of, run_lengths
 
 DOME = "61,61,77,77"
@@ -57,6 +58,17 @@ def test_a_word_is_kept_in_the_scene_and_nothing_else_changes(place, capsys):
     assert left.points == ((69, 69),) and left.not_points == ((20, 60),)
     main(["words", str(place), "--forget", "Gizmo"])
     assert not words(place)
+
+
+def test_a_word_of_another_width_is_refused_by_scenes_and_their_files(place):
+    teach(place, "--box", DOME)
+    scene = read_scene(place, "cpu")
+    wide = replace(scene.words["gizmo"], vector=torch.ones(5), examples=())
+    with pytest.raises(UserError, match="another CLIP"):
+        scene.carrying(wide)
+    keep_words(place, {"gizmo": wide})
+    with pytest.raises(UserError, match=r"wall\.scene.*another CLIP"):
+        read_scene(place, "cpu")
 
 
 def test_a_word_that_is_taught_while_another_is_forgotten_stays(place, monkeypatch):
