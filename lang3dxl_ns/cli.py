@@ -23,6 +23,7 @@ import tyro
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.settings_help import asked_for_all
 
 LAB = Path(__file__).parents[1] / "lab"
@@ -97,11 +98,14 @@ def _parsed(words: Sequence[str]) -> Any:
     _check_name(COMMANDS, words)
     try:
         choice = _choice(COMMANDS, words)
-        return tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+        parsed = tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
     except SystemExit as error:
         if error.code == 2 and words[0] in ("query", "export"):
             print(_TEXTS.format(words[0], "found" if words[0] == "query" else "found.ply"), file=sys.stderr)
         raise
+    # Shells leave the ~ of --out=~/found as it is.
+    vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})
+    return parsed
 
 
 def _check_name(commands: Mapping[str, Any], words: Sequence[str], above: str = "lang3dxl") -> None:

@@ -49,7 +49,5 @@ def train(
     trainer.setup()
     trainer.train()
     if trainer.interrupted:
-        raise UserError(
-            f"training was interrupted; to resume: ns-train with --load-dir {trainer.checkpoint_dir}"
-        )
+        raise UserError(f"training was stopped; to resume: ns-train with --load-dir {trainer.checkpoint_dir}")
     return load_scene(trainer.base_dir)

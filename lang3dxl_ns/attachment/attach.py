@@ -61,6 +61,7 @@ def attach(
         raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
     if data is None and place is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
+    path = find_splats(splat)  # before any model is downloaded
     option_prefix.set("--")
     preparation = settled(config)
     check_encoders(preparation.clip, preparation.dense)
@@ -68,7 +69,6 @@ def attach(
     stages = Stages(_SHARES if found is None else _SHARES | {"segment": 0.3})
     worker = torch.device(device or best_device())
     with stages.stage("splat"):
-        path = find_splats(splat)
         splats = read_splats(path).to(worker)
         spread = float((splats.means - splats.means.median(0).values).norm(dim=1).median())
         if spread < _SMALLEST:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ from lang3dxl_ns.common.settings_help import showing
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene
+    from lang3dxl_ns.query.text import Prompt
 
 
 @showing(
@@ -40,15 +42,17 @@ class Attach(AttachConfig):
 
     def main(self) -> None:
         from lang3dxl_ns.attachment.attach import attach
+        from lang3dxl_ns.query.text import parse_prompts
 
         self.check()
+        prompts = [prompt for text in self.text for prompt in parse_prompts(text)]  # fail before the work
         scene = attach(self.splat, self.data, self.out, self)
-        if self.text:
-            _show(scene, self.text, self.out)
+        if prompts:
+            _show(scene, prompts, self.out)
         say(f'Ask it: lang3dxl query {self.out} --text "windows" --out found')
 
 
-def _show(scene: Scene, texts: list[str], out: Path) -> None:
+def _show(scene: Scene, texts: Sequence[str | Prompt], out: Path) -> None:
     """Write a picture of the view that shows each text best, named after the text."""
     from lang3dxl_ns.common.files import slugs
     from lang3dxl_ns.query.doubt import doubtful

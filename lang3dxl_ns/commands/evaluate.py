@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, write_report
@@ -17,6 +18,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_ph
 
 REPORT = "scores"
 """Name of the report's files, without suffix."""
+_DRAWN = "draw objects white on black, or black on white for --layout holyscenes"
 
 
 @dataclass(kw_only=True)
@@ -73,17 +75,17 @@ class EvaluateRun(_Scored):
     """
 
     run: tyro.conf.Positional[Path | None] = None
-    """Folder of the run, or its config.yml (default: the newest under outputs/). For a .scene file, its words
-    are scored with --ground-truth, which needs neither its run nor its photos."""
+    """Folder of the run, or its config.yml (default: the newest under outputs/). For a .scene file, or a
+    folder that holds one, its words are scored with --ground-truth, without its run and photos."""
     split: Literal["held-out", "seen"] = "held-out"
     """Photos to score: those held out of training, or labeled training photos."""
     ground_truth: Path | None = None
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
 
     def main(self) -> None:
-        if self.run is not None and self.run.suffix == ".scene":
-            self._score_scene(self.run)
-            return
+        place = self.run or Path("outputs")
+        if place.suffix == ".scene" or (any(place.glob("*.scene")) and not (place / "config.yml").exists()):
+            return self._score_scene(place)
         from lang3dxl_ns.plugin.trainer_config import open_run
 
         if self.ground_truth is not None:
@@ -97,10 +99,11 @@ class EvaluateRun(_Scored):
         results = pipeline.evaluation.scored(get_std=True)
         write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
-    def _score_scene(self, file: Path) -> None:
+    def _score_scene(self, place: Path) -> None:
         from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene, score_selections
-        from lang3dxl_ns.open_scene import load_scene
+        from lang3dxl_ns.open_scene import existing_scene_file, load_scene
 
+        file = existing_scene_file(place)
         if self.ground_truth is None:
             raise UserError(f"{file} is scored with --ground-truth FOLDER, --split held-out or seen")
         truth = GroundTruth(self.ground_truth, self.layout)
@@ -161,6 +164,8 @@ class EvaluateSplit:
 
     def main(self) -> None:
         names = held_out_photos(GroundTruth(self.ground_truth))
+        if not names:
+            raise UserError(f"no label in {self.ground_truth} marks a pixel; {_DRAWN}")
         write_atomically(self.out, "\n".join(names) + "\n")
         print(f"Wrote {len(names)} names to {self.out}")
 
@@ -187,3 +192,5 @@ def write_scores(folder: Path, scene: str, results: dict[str, Any], device: Any 
     write_report(folder, REPORT, table, report)
     print(table)
     print(f"\nWrote {folder / REPORT}.md")
+    if "map" not in results and (empty := results["protocol"].get("photos_without_positives")):
+        raise UserError(f"no word was scored: no label marks a pixel of {some(list(empty))}; {_DRAWN}")

@@ -16,13 +16,13 @@ from PIL import Image
 from scipy.ndimage import find_objects, label
 
 from lang3dxl_ns import __version__
-from lang3dxl_ns.common.console import say, tracked
+from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomically
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.doubt import doubtful
-from lang3dxl_ns.query.match import Match, save_picture, together
+from lang3dxl_ns.query.match import save_picture, together
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import Scene
@@ -37,6 +37,9 @@ from lang3dxl_ns.scene.camera import Camera
 _LEAST_PART = 1e-4
 """Share of a photo below which a separate part of a mask is no label."""
 _NEAREST = Image.Resampling.NEAREST
+_USERS = dict.fromkeys(("title", "credit", "license"), "web scene_file")
+_USERS |= {"text": "out web", "not_": "out web", "look": "out web", "vocabulary": "web", "all": "out"}
+"""What the options of `export` affect; the others affect everything."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
@@ -84,6 +87,8 @@ class Query:
         if not prompts:
             raise UserError("there is no --text: say what to look for, such as --text windows")
         make_folder(self.out)
+        listed = self.out / "query.json"
+        before = listed.stat().st_mtime_ns if listed.is_file() else 0
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         scene = scene.with_words(()) if self.without_taught else scene
         question = scene.ask(prompts)
@@ -106,18 +111,25 @@ class Query:
                 labels.add(place, [np.asarray(mask) for mask in masks])
             if len(matches) > 1:
                 save_picture(together(matches), shared / f"{name}.png")
-            views.append(_view_report(name, matches))
+            found = [
+                {"text": m.prompt.text, "peak": m.peak, "score": m.score, "area": m.area} for m in matches
+            ]
+            seconds = {"render_seconds": matches[0].view.seconds, "query_seconds": matches[0].seconds}
+            views.append({"view": name, **seconds, "matches": found})
         if self.coco is not None:
             write_atomically(self.coco, json.dumps(labels.content) + "\n")
         texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))
         report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
-        write_atomically(self.out / "query.json", json.dumps(report, indent=2, ensure_ascii=False) + "\n")
+        write_atomically(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
         for (prompt, doubt, level, folder), (score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
             closest = "" if score > level else " (no match; this view comes closest)"
             say(f"{prompt.text}{' (taught)' if taught else ''}: {score:.2f} at {where}; {folder}{closest}")
             warnings = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
             say(*(f"  {advice}" for advice in warnings if advice))
+        old = sorted({p.parent.name for p in self.out.glob("*/*") if p.lstat().st_mtime_ns <= before})
+        if old:
+            say(f"{self.out} still has files of an earlier query, not listed in query.json: {some(old)}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
         """List file name (no suffix), camera or photo, and prompts of every requested view."""
@@ -185,21 +197,9 @@ def file_names(photos: list[str]) -> list[str]:
 
 
 def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, folder: Path) -> dict:
-    return {
-        "text": prompt.text,
-        "negatives": list(prompt.negatives),
-        "synonyms": scene.synonyms(prompt),
-        "taught": prompt.taught is not None,
-        "doubt": doubt,
-        "threshold": threshold,
-        "folder": folder.name,
-    }
-
-
-def _view_report(name: str, matches: list[Match]) -> dict:
-    found = [{"text": m.prompt.text, "peak": m.peak, "score": m.score, "area": m.area} for m in matches]
-    seconds = {"render_seconds": matches[0].view.seconds, "query_seconds": matches[0].seconds}
-    return {"view": name, **seconds, "matches": found}
+    taught, synonyms = prompt.taught is not None, scene.synonyms(prompt)
+    told = {"text": prompt.text, "negatives": list(prompt.negatives), "synonyms": synonyms, "taught": taught}
+    return told | {"doubt": doubt, "threshold": threshold, "folder": folder.name}
 
 
 @showing(
@@ -244,8 +244,13 @@ class Export:
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
-        if sum(target is not None for target in (self.out, self.web, self.scene_file)) != 1:
+        targets = [name for name in ("out", "web", "scene_file") if getattr(self, name) is not None]
+        if len(targets) != 1:
             raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
+        ignored = [n for n, users in _USERS.items() if getattr(self, n) and targets[0] not in users]
+        if ignored:
+            option, target = (name.strip("_").replace("_", "-") for name in (ignored[0], targets[0]))
+            raise UserError(f"--{option} has no effect on --{target}: leave it off")
         if self.index is not None and (self.out is None or not self.text):
             raise UserError("--index lists the Gaussians that match: give --text and --out with it")
         prompts = parse_texts(self.text, self.not_)

@@ -41,15 +41,13 @@ class Teach:
     """Point on something else: X,Y. Repeat the flag for more."""
 
     def main(self) -> None:
-        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words
+        from lang3dxl_ns.query.scene_file import keep_words
         from lang3dxl_ns.query.teach import known_word
 
         (scene, file), name = opened(self.scene), known_word(self.word)
         before = scene.words[name].examples if name in scene.words else ()
         taught = scene.teach(self.word, [*before, self._example()])
-        # Another command may have taught the file a word meanwhile.
-        others = [w for w in describe_scene_file(file)["taught"] if known_word(w.name) != name]
-        keep_words(file, [*others, taught.words[name]])
+        keep_words(file, {name: taught.words[name]})
         say(*described(taught.words[name]))
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
 
@@ -84,7 +82,10 @@ class Words:
         from lang3dxl_ns.query.scene_file import keep_words
         from lang3dxl_ns.query.teach import load_words, save_words
 
+        if self.save is not None and self.save.suffix != ".json":
+            raise UserError(f"--save writes words as JSON: {self.save} is not the name of a .json file")
         scene, file = opened(self.scene)
+        before = scene.words
         for name in self.forget:
             scene = forgotten(scene, name)
         if self.load is not None:
@@ -92,7 +93,8 @@ class Words:
                 scene = scene.carrying(word)
         words = list(scene.words.values())
         if self.forget or self.load is not None:
-            keep_words(file, words)
+            changed = {name: scene.words.get(name) for name in {**before, **scene.words}}
+            keep_words(file, {name: word for name, word in changed.items() if word is not before.get(name)})
         if self.save is not None:
             if not words:
                 raise UserError("there is no word to save: teach one with lang3dxl teach")

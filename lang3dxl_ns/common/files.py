@@ -42,7 +42,7 @@ def read_text(path: Path, most: int = _MOST_BYTES) -> str:
         content = file.read(most + 1)
     if len(content) > most:
         raise ValueError(f"it is larger than {most >> 20} MiB")
-    return content.decode()
+    return content.decode("utf-8-sig")  # without the mark that Windows' editors put first
 
 
 def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
@@ -141,7 +141,7 @@ def read_names(path: Path, what: str = "photos") -> tuple[str, ...]:
     lines and comments (#) are skipped. Raises UserError for a file that cannot be read or is empty."""
     with readable(f"the list of {what} {path} can't be read", "correct or replace it"):
         lines = read_text(expanded(path)).splitlines()
-    names = tuple(dict.fromkeys(name for line in lines if (name := line.partition("#")[0].strip())))
+    names = tuple(dict.fromkeys(name for line in lines if (name := re.sub(r"(^|\s)#.*", "", line).strip())))
     if not names:
         raise UserError(f"the list of {what} {path} is empty: write one per line")
     return names

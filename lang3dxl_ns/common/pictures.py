@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 from lang3dxl_ns.common.errors import DAMAGE
@@ -35,3 +36,14 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
         if isinstance(error, OSError) and error.errno is not None:  # an error of the disk, not of the decoder
             raise
         raise NoPictureError(str(error) or type(error).__name__) from error
+
+
+def eight_bits(image: Image.Image) -> Image.Image:
+    """Scale gray values of 16 bits, which `convert` would clip at 255, to 8 bits; others stay as they are.
+    Raises ValueError for floating-point pixels."""
+    if image.mode == "F":
+        raise ValueError("its pixels are floating-point numbers of unknown range")
+    if not image.mode.startswith("I"):
+        return image
+    values = np.asarray(image).clip(0, 65535)
+    return Image.fromarray((values / (257 if values.max() > 255 else 1)).round().astype(np.uint8))

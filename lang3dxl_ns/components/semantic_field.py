@@ -122,9 +122,7 @@ class SemanticFieldConfig:
         no input."""
         name = "default" if self.preset == "auto" else self.preset
         if name not in PRESETS:
-            raise UserError(
-                f"unknown semantic field preset {name!r}: choose one of auto, {', '.join(PRESETS)}"
-            )
+            raise UserError(f"unknown field preset {name!r}: choose one of auto, {', '.join(PRESETS)}")
         given = {field.name: getattr(self, field.name) for field in fields(FieldSettings)}
         settings = replace(PRESETS[name], **{k: v for k, v in given.items() if v is not None})
         if settings.hidden_layers < 1:

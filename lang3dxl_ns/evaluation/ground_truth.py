@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from jaxtyping import Bool
 from numpy import ndarray as Array
 
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.evaluation.layouts import (
@@ -68,6 +69,26 @@ class GroundTruth:
         path = PurePosixPath(photo)
         names = (path.with_suffix("").as_posix(), path.as_posix(), path.stem, path.name)
         return next((name for name in names if name in self._labeled), None)
+
+    def check(self, photos: Collection[str]) -> None:
+        """Check that each label belongs to one photo of the scene; warn about labels without a photo."""
+        named: dict[str, str] = {}
+        for name in photos:
+            key = self.key(name)
+            if key is not None and named.setdefault(key, name) != name:
+                raise UserError(
+                    f"the label {key} in {self.folder} fits both {named[key]} and {name}: name labels with "
+                    f"their photos' folders, or as {name}.png"
+                )
+        absent = [photo for photo in self.labeled if photo not in named]
+        if not named:
+            raise UserError(
+                f"no label in {self.folder} belongs to a photo of the scene: labels are named like photos, "
+                f"but the first are {absent[0]} and {next(iter(photos))}"
+            )
+        if absent:
+            absence = "belong to no photo of the scene and are not scored"
+            say(f"{len(absent)} labels in {self.folder} {absence}: {some(absent)}")
 
     def size(self, photo: str) -> tuple[int, int]:
         """Return height and width of a labeled photo."""

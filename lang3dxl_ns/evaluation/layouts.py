@@ -22,7 +22,7 @@ from PIL import Image, ImageDraw
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
-from lang3dxl_ns.common.pictures import NoPictureError, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, open_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 """Suffixes of pictures, lower case."""
@@ -41,11 +41,16 @@ class Truth:
     """Left, top, right and bottom in pixels of the mask, edges included; None if the labels have no boxes."""
 
 
-def read_gray(path: Path, what: str = "ground truth") -> Image.Image:
-    """Read a picture as gray values 0…255. Raises UserError if it cannot be read."""
+def read_gray(path: Path, what: str = "ground truth", behind: int = 0) -> Image.Image:
+    """Read a picture as gray values 0…255, over the value `behind` where it is transparent. Raises UserError
+    if it cannot be read."""
     problem, damage = f"{what} {path} can't be read", (OSError, NoPictureError)
     with readable(problem, "replace or remove it", damage), open_picture(path) as image:
-        return image.convert("L")
+        gray = eight_bits(image).convert("L")
+        if image.has_transparency_data:
+            alpha = image.convert("RGBA").getchannel("A")
+            gray = Image.composite(gray, Image.new("L", gray.size, behind), alpha)
+        return gray
 
 
 def check_shape(path: Path, mine: tuple[int, int], other: tuple[int, int]) -> None:
@@ -82,7 +87,7 @@ class MaskFile:
         return Truth(gray < 128 if self.dark else gray >= 128)
 
     def _read(self) -> Image.Image:
-        image = read_gray(self.path)
+        image = read_gray(self.path, behind=255 if self.dark else 0)
         if not self.dark and image.getextrema()[1] == 1:
             raise UserError(f"ground truth {self.path} holds only 0 and 1, which look black: save 0 and 255")
         return image

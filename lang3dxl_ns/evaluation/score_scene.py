@@ -36,6 +36,7 @@ def score_scene(
     """Render the labeled views of a split and score the words in them, as `ns-eval` does. Return the figures
     of each photo (`ap_{category}` etc., see `evaluation.aggregate`), and the protocol that explains them.
     Raises UserError for a scene of colors only, and if no photo of the split has a label."""
+    truth.check([photo.name for photo in scene.photos])
     photos = labeled_photos(scene, truth, split)
     scorer = LanguageScorer(truth, scene.text.vectors)
     words = [scene.words.get(known_word(category)) for category in truth.categories]

@@ -134,9 +134,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             recorded = recorded_scene(config.run)
             if recorded is None or kwargs.get("test_mode", "val") == "val":
                 raise
-            CONSOLE.log(
-                f"[yellow]The cameras are taken from the run's folder, since the photos are gone: {reason}"
-            )
+            CONSOLE.log(f"[yellow]The run's own cameras are used, since the photos are gone: {reason}")
             config.dataparser, config.camera_res_scale_factor = recorded, 1.0
             super().__init__(config, *args, **kwargs)
 

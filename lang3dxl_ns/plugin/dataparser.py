@@ -80,9 +80,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
                 "--pipeline.datamanager.camera-res-scale-factor"
             )
         if not data.is_dir():
-            raise UserError(
-                f"{data} is not a folder: pass the folder that holds images/ and sparse/0 as --data"
-            )
+            raise UserError(f"{data} is not a folder: pass the one that holds images/ and sparse/0 as --data")
         named = self.config.colmap_path
         self.config.colmap_path = find_colmap_model(data, (named, *MODEL_FOLDERS, OWN_MODEL)) or named
         self.config.images_path = images_path(data, self.config.images_path)
@@ -290,9 +288,10 @@ def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
 
 
 def check_data(data: Path | None) -> None:
-    """Raise UserError if a place does not exist, before encoders are looked for. None is accepted."""
-    place = None if data is None else expanded(data)
-    if place is not None and not place.exists() and not frames_folder(place).is_dir():
+    """Raise UserError for a place without photos, before encoders are looked for. None is accepted."""
+    place = Path() if data is None else expanded(data)
+    known = is_video(place) or (place.is_file() and place.suffix == ".json")
+    if not (known or place.is_dir() or frames_folder(place).is_dir()):
         raise UserError(f"{data} is not a folder: pass the one that holds your photos as --data, or a video")
 
 

@@ -13,10 +13,9 @@ import torch
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
-from rich.markup import escape
 from torch import Tensor
 
-from lang3dxl_ns.common.console import some, tracked
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import host_peak, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
@@ -76,30 +75,8 @@ class Evaluation:
         if folder is None or self._model.semantic_field is None:
             return None
         truth = GroundTruth(folder, self._settings.ground_truth_layout)
-        self._check_labels(truth)
+        truth.check(self._data.photos)
         return open_scorer(truth, self._data.config.clip, self._model.device)
-
-    def _check_labels(self, truth: GroundTruth) -> None:
-        """Check that each label belongs to one photo of the scene; warn about labels without a photo."""
-        named: dict[str, str] = {}
-        for name in self._data.photos:
-            key = truth.key(name)
-            if key is not None and named.setdefault(key, name) != name:
-                raise UserError(
-                    f"the label {key} in {truth.folder} fits both {named[key]} and {name}: name labels with "
-                    f"their photos' folders"
-                )
-        absent = [photo for photo in truth.labeled if photo not in named]
-        if not named:
-            raise UserError(
-                f"no label in {truth.folder} belongs to a photo of the scene: labels are named like photos, "
-                f"but the first are {absent[0]} and {next(iter(self._data.photos))}"
-            )
-        if absent:
-            CONSOLE.log(
-                f"[yellow]{len(absent)} labels in {truth.folder} belong to no photo of the scene and are not "
-                f"scored:[/yellow] {escape(some(absent))}"
-            )
 
     def evaluate(self, split: Split | None = None) -> Iterator[EvaluatedPhoto]:
         """Render and score the photos of a split (default: the configured one), with a progress bar."""

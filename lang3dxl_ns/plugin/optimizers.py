@@ -58,8 +58,7 @@ class RunAdamConfig(AdamOptimizerConfig):
     """Settings of Adam with a learning rate for the length of the run."""
 
     eps: float = 1e-15
-    """Constant in Adam's denominator: as in 3D Gaussian splatting, since codes and tables have tiny gradients
-    at first."""
+    """Constant in Adam's denominator, as in 3D Gaussian splatting: early gradients of codes are tiny."""
     short_lr: float | None = None
     """Rate for runs of up to 1,000 iterations, where `lr` is for 30,000 and more; in between, the two are
     interpolated on a logarithmic scale. None: the same as `lr`."""

@@ -72,8 +72,7 @@ class RenderingModel(SplatfactoModel):
     dense_mean: Tensor
     appearance: AppearanceField | None
     sky: Sky | None
-    """Colors of the sky's Gaussians, the first ones; None: there is no sky, or it was trained like the
-    rest."""
+    """Colors of the sky's Gaussians, the first ones; None: there is none, or it trained like the rest."""
     answers: RenderedAnswers | Conversation | None = None
     codes_have_begun = False
     """Whether training has reached the codes; part of a checkpoint's run state."""

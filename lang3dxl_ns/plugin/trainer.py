@@ -333,8 +333,7 @@ class Lang3DXLTrainer(Trainer):
         )
 
     def _after_train(self) -> None:
-        """Save, learn words, save again. After an interruption, print how to resume, and don't wait in the
-        viewer."""
+        """Save, learn words, save again. If interrupted, print how to resume, and leave the viewer."""
         self._is_ending = True
         self.stages.end()
         if self.interrupted:

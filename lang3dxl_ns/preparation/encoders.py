@@ -120,8 +120,7 @@ class ImageTextEncoder:
 
     @torch.no_grad()
     def join_sizes(self, features: Float[Tensor, "sizes rows columns d"]) -> Float[Tensor, "rows columns c"]:
-        """Make one map of those of windows of several sizes, coarse to fine: their mean, or what the head
-        reads in them."""
+        """Join maps of windows of several sizes, coarse to fine: their mean, or what the head reads."""
         if self._head is None:
             return mean_of_sizes(features)
         # A few rows at a time, because the head's input is several times as wide as its output.

@@ -147,7 +147,8 @@ def prepare(
                 left_out[task.photo.name] = trouble
     names = [task.photo.name for task in tasks if task.photo.name not in left_out]
     if not names:
-        raise UserError("no photo can be prepared: " + ("; ".join(left_out.values()) or "the scene has none"))
+        first = next(iter(left_out.values()), "the scene has none")
+        raise UserError(f"no photo can be prepared; the first of {len(photos)}: {first}")
     if left_out:
         say(f"left out {len(left_out)} of {len(photos)} photos:", *(f"  {why}" for why in left_out.values()))
     with_dense, with_regions = (

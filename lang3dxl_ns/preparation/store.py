@@ -26,8 +26,8 @@ from lang3dxl_ns.scene.photo import Photo
 logger = logging.getLogger(__name__)
 
 _HALF_MAX = torch.finfo(torch.float16).max
-_ENTRIES = (".safetensors", ".png", ".jpg")
-"""Suffixes of targets, masks, and photos at working size."""
+_ENTRY = re.compile(r".+\.[0-9a-f]{16}\.(safetensors|png|jpg)")
+"""Names of targets, masks, and photos at working size. Nothing else is ever deleted."""
 _HASHES = "photo_hashes.json"
 _SECOND = 10**9  # nanoseconds
 _LEFTOVER_AGE_S = 3600.0
@@ -160,7 +160,7 @@ class FeatureStore:
         """Count the files and bytes on disk, by kind."""
         sizes = {}
         for folder in sorted(path for path in self.root.glob("*") if path.is_dir()):
-            files = [path for path in folder.iterdir() if path.suffix in _ENTRIES]
+            files = [path for path in folder.iterdir() if _ENTRY.fullmatch(path.name)]
             sizes[folder.name] = (len(files), sum(path.stat().st_size for path in files))
         return sizes
 
@@ -170,14 +170,14 @@ class FeatureStore:
         keep = {self.path(kind, name).with_suffix("") for name in names for kind in kinds}
         files, freed = 0, 0
         for path in self.root.glob("*/*"):
-            if path.suffix in _ENTRIES and path.with_suffix("") not in keep:
+            if _ENTRY.fullmatch(path.name) and path.with_suffix("") not in keep:
                 files, freed = files + 1, freed + path.stat().st_size
                 path.unlink()
         return files, freed
 
     def remove_leftovers(self) -> None:
         """Delete temporary files of processes that were killed while writing."""
-        for path in self.root.glob("*/*.tmp"):
+        for path in self.root.glob("*/*-????????.tmp"):
             with contextlib.suppress(FileNotFoundError):  # another process may clean up too
                 if time.time() - path.stat().st_mtime > _LEFTOVER_AGE_S:
                     path.unlink()
@@ -195,9 +195,7 @@ def _opened(path: Path, what: str) -> Iterator[Any]:
     except FileNotFoundError as error:
         raise UserError(f"{what} is not prepared: {path} does not exist; run `lang3dxl prepare`") from error
     except (SafetensorError, ValueError) as error:
-        raise UserError(
-            f"{path} ({what}) is damaged ({error}): delete it and run `lang3dxl prepare`"
-        ) from error
+        raise UserError(f"{path} ({what}) is damaged ({error}): delete it; run `lang3dxl prepare`") from error
 
 
 def _compact(tensor: Tensor, what: str) -> Tensor:
@@ -206,9 +204,7 @@ def _compact(tensor: Tensor, what: str) -> Tensor:
     if not tensor.is_floating_point():
         return tensor
     if not torch.isfinite(tensor).all():
-        raise UserError(
-            f"{what} holds NaN or infinity: the model's weights are damaged or overflow in float16"
-        )
+        raise UserError(f"{what} holds NaN or infinity: the weights are damaged or overflow in float16")
     fits = tensor.numel() == 0 or float(tensor.abs().max()) <= _HALF_MAX
     return tensor.to(torch.float16 if fits else torch.float32)
 

@@ -51,9 +51,7 @@ def _colors(name: str) -> Float[Tensor, "256 3"]:
     from matplotlib import colormaps
 
     if name not in colormaps:
-        raise UserError(
-            f"there is no color map {name!r}: choose one of matplotlib's, such as turbo or viridis"
-        )
+        raise UserError(f"there is no color map {name!r}: choose one of matplotlib's, such as turbo")
     return torch.tensor(colormaps[name](torch.linspace(0, 1, 256).numpy())[:, :3], dtype=torch.float32)
 
 

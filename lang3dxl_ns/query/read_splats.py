@@ -14,6 +14,7 @@ from dataclasses import replace
 from math import isqrt
 from pathlib import Path
 from typing import Any, BinaryIO
+from zipfile import is_zipfile
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
@@ -91,6 +93,7 @@ def _finite(splats: Splats, path: Path) -> Splats:
     share = 1 - float(sound.float().mean())
     if share > _MOST_DAMAGE:
         raise UserError(f"{path}: {share:.0%} of its Gaussians have NaN or infinite values; export it again")
+    say(f"{path}: {share:.2%} of its Gaussians have NaN or infinite values; they are left invisible")
     place = splats.means[sound].median(0).values
     keep = sound[:, None]
     return replace(
@@ -120,6 +123,8 @@ def _activated(
     means, log_scales, quats, logits, harmonics = map(_tensor, (means, log_scales, quats, logits, harmonics))
     bands = harmonics.shape[1]
     expect(isqrt(bands) ** 2 == bands, f"it has {bands} harmonics per color")
+    sides = [part.shape[-1] for part in (means, log_scales, quats, harmonics)]
+    expect(sides == [3, 3, 4, 3], f"its parts have {sides} numbers a Gaussian")
     opacities, harmonics = logits.reshape(-1).sigmoid(), harmonics[:, :_ALL_BANDS].contiguous()
     return Splats(means, quats, log_scales.exp(), opacities, harmonics, antialiased)
 
@@ -277,6 +282,8 @@ _SCALARS = (
 
 
 def _checkpoint(path: Path) -> Splats:
+    if not is_zipfile(path):
+        raise UserError("it is not a checkpoint of torch 1.6 or later: save it again with a newer torch")
     try:
         with torch.serialization.safe_globals([(_NumPyScalar, name) for name in _SCALARS]):
             state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
@@ -294,10 +301,7 @@ def _gsplat(parts: Mapping[str, Any]) -> Splats:
     """Build splats from what gsplat's example trainers save."""
     _check_parts(parts, ("means", "scales", "quats", "opacities"))
     if "sh0" not in parts:
-        raise UserError(
-            "this gsplat checkpoint has colors that a network makes (app_opt): train it without, or export "
-            "a PLY"
-        )
+        raise UserError("a network makes its colors (app_opt): train it without, or export a PLY")
     harmonics = torch.cat([parts["sh0"], parts["shN"]], dim=1)
     return _activated(parts["means"], parts["scales"], parts["quats"], parts["opacities"], harmonics)
 

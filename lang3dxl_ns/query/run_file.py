@@ -150,9 +150,7 @@ class SceneFile:
                 return found[0]
         names = [photo.name for photo in self.photos]
         similar = get_close_matches(name, names, n=3) or names[:3]
-        raise UserError(
-            f"the scene has no photo {name!r}: there are {len(names)}, such as {', '.join(similar)}"
-        )
+        raise UserError(f"the scene has no photo {name!r}: it has {len(names)}, such as {', '.join(similar)}")
 
 
 def scene_from_json(content: dict[str, Any]) -> SceneFile:

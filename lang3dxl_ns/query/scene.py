@@ -178,7 +178,7 @@ class Scene:
             return None
         if self.looks is None:
             raise UserError("all photos of this scene share one lighting: there is no look to choose")
-        return self.looks.of_photo(photo)
+        return self.looks.of_photo(self.file.photo(photo).name)
 
     def _name(self, place: Place) -> str | None:
         return self.file.photo(place).name if isinstance(place, str) else None
@@ -215,13 +215,16 @@ class Scene:
                 for the scene (`match_thresholds`).
 
         Raises:
-            UserError: there is no prompt, the threshold is impossible, or the scene has colors only.
+            UserError: there is no prompt, one is its own negative, the threshold is impossible, or the scene
+                has colors only.
         """
         requested = self.config.threshold if threshold is None else threshold
         if requested is not None and not 0 <= requested <= 1:
             raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
         rivals = texts_of(negatives, "a negative")
         prompts = [replace(p, negatives=(*p.negatives, *rivals)) for p in self.prompts(texts)]
+        if own := [p.text for p in prompts if known_word(p.text) in map(known_word, p.negatives)]:
+            raise UserError(f"{own[0]!r} is its own negative, so nothing can match it: name another negative")
         within = self.config.foreground if foreground is None else foreground
         everything = [*prompts, *(self.prompts(within) if within else ())]
         queries, count = self.queries(everything), len(prompts)
@@ -500,7 +503,7 @@ class Scene:
         share = self._fill(camera, pixel)
         rows = share.nonzero().squeeze(1)
         features = self.engine.features(rows)
-        if float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
+        if not words or float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
             return []
         queries, negatives = self.text.plain_queries(words).to(self.device), self.text.config.negatives
         cosines = queries.cosines(share[rows] @ features)
@@ -557,7 +560,7 @@ class Scene:
         if word.examples and word.scene == Path(self.file.data).name:
             with suppress(UserError):
                 return self.teach(word.name, word.examples)
-        if word.clip != self.file.clip_identity:
+        if word.clip != self.file.clip_identity or len(word.vector) != self._semantics()[0].clip_dim:
             raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
         return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
 
@@ -613,7 +616,7 @@ class Scene:
                 f"a vector to search for has shape {list(vector.shape)}: this scene's CLIP has {width} "
                 "finite numbers, not all of them 0"
             )
-        return vector.float()
+        return (vector.double() / vector.double().norm()).float()
 
     def _one(self, text: Text, threshold: float | None = None) -> Question:
         question = self.ask(text, threshold=threshold)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from math import prod
@@ -129,12 +129,14 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     return len(data)
 
 
-def keep_words(path: Path, words: Iterable[TaughtWord]) -> None:
-    """Replace a scene file's taught words, and nothing else, atomically. Raises UserError as `read_scene`."""
+def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
+    """Replace some of a scene file's taught words (None: forget it), and nothing else, atomically. Words that
+    another command taught meanwhile stay. Raises UserError as `read_scene`."""
     from safetensors.numpy import save
 
     with _opened(path) as file:
-        described = file.about | {"taught": [word.to_json() for word in words]}
+        kept = {**{known_word(word.name): word for word in file.taught}, **words}
+        described = file.about | {"taught": [word.to_json() for word in kept.values() if word is not None]}
         content = {name: file.array(name) for name in file.shapes}
     write_atomically(path, save(content, {_KEY: json.dumps(described)}))
 
@@ -196,12 +198,13 @@ def read_scene(
     """
     path, device = expanded(path), torch.device(device or best_device())
     with _opened(path) as file:
-        splats, decoder, codes, looks, vectors = _splats(file).to(device), None, None, None, None
+        splats, decoder, codes, looks, vectors = _splats(file), None, None, None, None
         if (settings := file.about.get("decoder")) is not None:
-            decoder = _decoder(file, settings).to(device)
-            codes = _codes(file, decoder.bounded, len(splats)).to(device)
+            decoder = _decoder(file, settings)
+            expect({len(w.vector) for w in file.taught} <= {decoder.clip_dim}, "a word is of another CLIP")
+            codes = _codes(file, decoder.bounded, len(splats))
         if (described := file.about.get("looks")) is not None:
-            looks = _looks(file, described).to(device)
+            looks = _looks(file, described)
         if (words := file.about.get("words")) is not None:
             expect(all(isinstance(word, str) for word in words), "its words are no texts")
             rows = file.tensor("words", len(words), file.shapes["words"][1]).float()
@@ -209,10 +212,12 @@ def read_scene(
         masks = [file.mask(i) for i in range(len(file.scene.photos))]
     photos = [replace(photo, mask=mask) for photo, mask in zip(file.scene.photos, masks, strict=True)]
     background = None if file.background is None else torch.tensor(file.background, device=device)
+    # Moved to the device here, where its errors are not the file's.
+    codes = None if codes is None else codes.to(device)
     return Scene(
-        splats, replace(file.scene, photos=photos), decoder, codes,
-        looks=looks, background=background, config=config or QueryConfig(), encode_texts=encode_texts,
-        vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
+        splats.to(device), replace(file.scene, photos=photos), decoder and decoder.to(device), codes,
+        looks=looks and looks.to(device), background=background, config=config or QueryConfig(),
+        encode_texts=encode_texts, vectors=vectors, cache=path.with_name(f".{path.stem}.visible"),
     ).with_words(file.taught)  # fmt: skip
 
 
@@ -256,6 +261,7 @@ class _File:
         """Read a tensor of any type with this shape. Raises ValueError for another shape."""
         expect(self.shapes[name] == list(shape), f"{name} has the shape {self.shapes[name]}")
         values = self.array(name)
+        expect(not values.size or bool(np.isfinite(values).any()), f"no value of {name} is a number")
         return torch.from_numpy(values.astype(np.int32) if values.dtype == np.uint16 else values)
 
     def mask(self, photo: int) -> bytes | None:
@@ -275,6 +281,7 @@ class _File:
             for key, value in module.state_dict().items()
             if isinstance(value, Tensor)
         }
+        expect(all(bool(t.isfinite().all()) for t in tensors.values()), f"its {name} is not made of numbers")
         module.load_state_dict({**tensors, **(state or {})})
         return module.eval().requires_grad_(False)
 
@@ -296,7 +303,8 @@ def _opened(path: Path) -> Iterator[_File]:
     except _NewerError as error:
         raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
     except (UserError, SafetensorError, *DAMAGE) as error:
-        raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): copy it again") from error
+        remedy = "copy it again" if path.suffix == SUFFIX else "a splat becomes one with lang3dxl attach"
+        raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): {remedy}") from error
 
 
 def _splats(file: _File) -> Splats:

@@ -51,16 +51,18 @@ class Example:
 
     def __post_init__(self) -> None:
         """Raise UserError unless something is marked, with finite coordinates."""
-        numbers = [*(self.box or ()), *(x for point in (*self.points, *self.not_points) for x in point)]
-        if not all(isinstance(x, int | float) and math.isfinite(x) for x in numbers):
-            raise UserError(f"the marks in {self.photo} have a coordinate that is not a number")
+        remedy = "give two numbers for a point, and four for a box"
+        with readable(f"the marks in {self.photo} have a coordinate that is not a number", remedy):
+            points, others = (tuple(_finite(p, 2) for p in some) for some in (self.points, self.not_points))
+            box = None if self.box is None else _finite(self.box, 4)
+        vars(self).update(points=points, not_points=others, box=box)
         if self.mask is None and self.box is None and not self.points:
             raise UserError(f"nothing is marked in {self.photo}: give a mask, a box or a point on the word")
         if self.mask is not None and self.box is not None:
             raise UserError(f"{self.photo} has a mask and a box: give one of them")
         if self.mask is not None:
             if np.ndim(self.mask) != 2 or not np.any(self.mask):
-                raise UserError(f"the mask of {self.photo} is empty: mark the word in white")
+                raise UserError(f"the mask of {self.photo} is empty or not [h, w]: mark the word in white")
             object.__setattr__(self, "mask", _kept(np.asarray(self.mask, bool)))
 
     @property
@@ -97,6 +99,12 @@ class Example:
             tuple((float(x), float(y)) for x, y in content[name]) for name in ("points", "not_points")
         )
         return cls(str(content["photo"]), mask, box, points, others)
+
+
+def _finite(values: Sequence[Any], count: int) -> tuple[float, ...]:
+    numbers = tuple(float(value) for value in values)  # NumPy's too, which JSON has none of
+    expect(len(numbers) == count and all(map(math.isfinite, numbers)), f"{numbers}")
+    return numbers
 
 
 def run_lengths(mask: Bool[Array, "h w"]) -> list[int]:

@@ -28,8 +28,7 @@ from lang3dxl_ns.rendering.fused_tiles import (
 from lang3dxl_ns.rendering.gaussians import REACH_SLACK
 
 PARTS_PER_THREAD = 8
-"""Parts per thread. Tiles may stop early, by an unknown amount, so small parts spread the rest over the
-threads."""
+"""Parts per thread. Tiles may stop early, by an unknown amount; small parts spread the rest over threads."""
 LOG2_E = math.log2(math.e)
 _MOST_KEPT = 64 * 2**20  # bytes
 
@@ -107,8 +106,7 @@ class _Gradients(NamedTuple):
 
 
 def _parts(work: np.ndarray) -> list[np.ndarray]:
-    """Split the tiles into consecutive parts of about equal work, several per thread. Empty tiles count a
-    little, too."""
+    """Split the tiles into parts of about equal work, several per thread. Empty tiles count a little, too."""
     threads = torch.get_num_threads()
     parts = PARTS_PER_THREAD * threads if threads > 1 else 1
     ends = np.cumsum(work + 8.0)

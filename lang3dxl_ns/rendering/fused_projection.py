@@ -1,5 +1,4 @@
-"""Projection on the CPU in fused kernels, 16 Gaussians at a time: the same function as
-`projection.project`."""
+"""Projection on the CPU in fused kernels, 16 Gaussians at a time: the function of `projection.project`."""
 
 from __future__ import annotations
 

@@ -180,8 +180,7 @@ def _composite_with_gsplat(
     near: float,
     eps2d: float,
 ) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
-    """Composite like `_composite` by gsplat's CUDA kernels, in float32; the detached channels take a second
-    pass."""
+    """Composite like `_composite` by gsplat's kernels, in float32; detached channels in a second pass."""
     from gsplat import rasterization
 
     def render(g: Gaussians, camera: Camera, channels: Tensor, mode: str) -> tuple[Tensor, Tensor, dict]:

@@ -23,7 +23,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.pictures import NoPictureError, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, open_picture
 from lang3dxl_ns.scene.camera import HasLens, Lens, scaled_size
 
 if TYPE_CHECKING:
@@ -102,8 +102,7 @@ class Photo(HasLens):
         return torch.from_numpy(np.array(image))
 
     def undistort_labels(self, labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-        """Undistort 32-bit labels drawn on the file (at any size) like `read`, by nearest pixel; −1 outside
-        the photo."""
+        """Undistort 32-bit labels drawn on the file (any size) like `read`, by nearest pixel; −1 outside."""
         labels = self._drawn_upright(labels)
         if not self.lens.distorts:
             return labels
@@ -202,9 +201,7 @@ def _readable(path: Path, name: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        raise UserError(
-            f"photo {name}: there is no file {path}: put it there or leave the photo out"
-        ) from error
+        raise UserError(f"photo {name}: there is no file {path}: put it there or leave it out") from error
     except (OSError, NoPictureError) as error:
         raise UserError(
             f"photo {name}: can't read {path} ({error}): remove it, or convert it to an 8-bit JPEG or PNG"
@@ -212,17 +209,11 @@ def _readable(path: Path, name: str) -> Iterator[None]:
 
 
 def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) -> Image.Image:
-    """Decode a file as stored to 8-bit RGB, without transparency; a large JPEG may be shrunk, not below
-    `at_least`."""
+    """Decode a file as stored to 8-bit RGB without alpha; large JPEGs may be shrunk, not below `at_least`."""
     with _readable(path, name), open_picture(path) as image:
         if at_least is not None and image.width * image.height > _LARGE:
             image.draft(None, at_least)  # does nothing for other formats
-        if image.mode == "F":
-            raise ValueError("its pixels are floating-point numbers of unknown range")
-        if image.mode.startswith("I"):  # 16-bit gray, which convert() would clip at 255
-            gray = (np.asarray(image).clip(0, 65535) / 257).round().astype(np.uint8)
-            return Image.fromarray(gray).convert("RGB")
-        return image.convert("RGB")
+        return eight_bits(image).convert("RGB")
 
 
 def _check_shape(name: str, path: Path, size: tuple[int, int], camera: tuple[int, int]) -> None:

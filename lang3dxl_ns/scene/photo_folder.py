@@ -1,5 +1,4 @@
-"""Photos of a folder (flat, in images/, or in sub-folders), grouped by camera; the sharpest frames of a
-video."""
+"""Photos of a folder (flat, in images/, or in sub-folders), by camera; the sharpest frames of a video."""
 
 from __future__ import annotations
 
@@ -21,8 +20,8 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif")
-UNREADABLE_SUFFIXES = (".heic", ".heif", ".avif", ".dng", ".cr2", ".nef", ".arw")
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif")
+UNREADABLE_SUFFIXES = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
 """Suffixes of photos that can't be decoded here."""
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
 _NOT_PHOTOS = {
@@ -187,9 +186,7 @@ def _duration(video: Path) -> float:
             raise KeyError("streams")
         return float(answer["format"]["duration"])
     except (ValueError, KeyError) as error:
-        raise UserError(
-            f"{video} is not a video that ffmpeg reads: {found.stderr.strip() or error}"
-        ) from error
+        raise UserError(f"{video} is not a video ffmpeg reads: {found.stderr.strip() or error}") from error
 
 
 def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:

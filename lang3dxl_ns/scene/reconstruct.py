@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 _MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
 _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
-_CONVERTED = (".webp", ".gif")  # formats that Pillow reads and COLMAP does not
+_CONVERTED = (".webp", ".gif", ".avif")  # formats that Pillow reads and COLMAP does not
 _CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar; a killed process loses one step
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
@@ -155,7 +155,7 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
 def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     """Link the photos under numbers, in their order; formats that COLMAP can't read become converted copies.
     COLMAP separates names by spaces, so "photo 1.jpg" would be two names."""
-    folder = work / "photos"
+    folder = work / "numbered"  # not "photos", a name that people use
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     numbers = []

@@ -12,7 +12,7 @@ from scenes import write_scene
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.known_frames import known_frames
-from lang3dxl_ns.commands.attach import _show
+from lang3dxl_ns.commands.attach import Attach, _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.preparation.photo_collection import read_collection
@@ -145,6 +145,14 @@ def test_photos_of_something_else_are_refused_with_a_picture(place):
         attach(place / "other.ply", place / "photos", place / "other.scene", SETTINGS)
     assert (place / "other.frame.png").is_file()
     assert not (place / "other.scene").exists()
+
+
+def test_mistakes_are_told_before_a_model_is_downloaded_and_an_empty_text_before_the_work(tmp_path):
+    config = replace(SETTINGS, clip="somebody/nothing")
+    with pytest.raises(UserError, match=r"nothing\.ply does not exist"):
+        attach(tmp_path / "nothing.ply", None, tmp_path / "a.scene", config)
+    with pytest.raises(UserError, match="prompt is empty"):
+        Attach(splat=tmp_path / "nothing.ply", out=tmp_path / "a.scene", text=["dome", " "]).main()
 
 
 @pytest.mark.parametrize(

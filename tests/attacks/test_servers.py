@@ -6,6 +6,7 @@ import http.client
 import json
 import math
 import socket
+import struct
 import threading
 import time
 import urllib.parse
@@ -177,6 +178,21 @@ def test_odd_requests_are_refused_without_a_traceback(server, request_, capfd, c
     answer = reply(server, request_)
     assert b"200 OK" not in answer[:20] and b"<main>" not in answer and b"root:" not in answer
     assert "Traceback" not in capfd.readouterr().err and not caplog.records
+
+
+def test_a_connection_that_breaks_off_leaves_no_traceback(page, capfd):
+    for sent in (
+        b"",
+        b"GET / HTTP/1.1\r\n",
+        f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{page.port}\r\n\r\n".encode(),
+    ):
+        raw = socket.create_connection(("127.0.0.1", page.port))
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close with a reset
+        raw.sendall(sent)
+        time.sleep(0.2)
+        raw.close()
+    time.sleep(0.5)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", " ", "127.0.0.1.evil.example"])

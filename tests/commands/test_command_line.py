@@ -54,12 +54,22 @@ def test_without_words_the_help_is_shown(capsys):
         (["view", "none", "--host", "a" * 70], "is no address of this machine"),
         (["query", "~nosuchuser/run", "--text", "a", "--out", "found"], "no such user"),
         (["demo-scene", "--out", "~nosuchuser/scene"], "no such user"),
+        (["prepare", "--data", __file__], r"test_command_line\.py is not a folder"),
     ],
 )
 def test_mistakes_are_told_with_the_remedy(words, hint, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=hint):
         cli.main(words)
+
+
+def test_a_home_in_an_option_is_no_folder_called_tilde(tmp_path, monkeypatch):
+    """Shells leave the ~ of --out=~/x as it is."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="none"):
+        cli.main(["query", "none", "--text", "dome", "--out=~/found"])
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
 
 
 def test_a_text_without_its_flag_is_told(capsys):

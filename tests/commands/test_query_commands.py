@@ -69,6 +69,16 @@ def test_without_a_view_the_best_one_is_taken(run, tmp_path):
     assert (tmp_path / "dome" / "right_0002.npy").exists()
 
 
+def test_files_of_an_earlier_query_stay_and_are_told(run, tmp_path, capsys):
+    photo = ("--image", "all/0003.jpg", "--out", tmp_path)
+    run("query", "c", "--text", "dome; window", *photo)
+    run("query", "c", "--text", "dome; window", *photo)
+    assert "earlier query" not in capsys.readouterr().out
+    run("query", "c", "--text", "dome", *photo)
+    assert "files of an earlier query, not listed in query.json: together, window" in capsys.readouterr().out
+    assert (tmp_path / "window" / "all_0003.npy").is_file()
+
+
 def test_all_photos_are_asked(run, tmp_path):
     run("query", "c", "--text", "dome", "--all", "--out", tmp_path)
     assert len(list((tmp_path / "dome").glob("*.npy"))) == 4
@@ -99,6 +109,7 @@ def test_a_camera_path_is_followed(run, tmp_path):
         (("--text", " ; "), "the prompt is empty"),
         ((), "there is no --text"),
         (("--text", "dome", "--image", "x"), "no photo 'x'"),
+        (("--text", "wall; dome", "--not", "Dome"), "'dome' is its own negative"),
         (("--text", "dome", "--image", "0001", "--all"), "exclude each other"),
     ],
 )
@@ -111,6 +122,16 @@ def test_settings_are_flags(run, tmp_path):
     words = ("query", "c", "--text", "dome", "--image", "0002", "--out", tmp_path)
     run(*words, "--threshold", 1, "--synonyms", "off")
     assert not np.asarray(Image.open(tmp_path / "dome" / "right_0002.mask.png")).any()
+
+
+@pytest.mark.parametrize(
+    ("target", "option"),
+    [("--scene-file", "--text"), ("--scene-file", "--not"), ("--out", "--title"), ("--out", "--vocabulary")],
+)
+def test_export_refuses_options_without_effect(run, tmp_path, target, option):
+    name = {"--out": "a.ply", "--scene-file": "a.scene"}[target]
+    with pytest.raises(SystemExit, match=f"{option} has no effect on {target}"):
+        run("export", "c", target, tmp_path / name, option, "dome")
 
 
 def test_export_writes_the_matching_gaussians_or_all_with_scores(run, tmp_path):

@@ -12,8 +12,9 @@ from PIL import Image
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands.query import CocoLabels
-from lang3dxl_ns.commands.teach import Teach
-from lang3dxl_ns.query.scene_file import read_scene, write_scene
+from lang3dxl_ns.commands.teach import Teach, forgotten
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.scene_file import keep_words, read_scene, write_scene
 from lang3dxl_ns.query.teach import Example, mask_of, run_lengths
 
 DOME = "61,61,77,77"
@@ -57,6 +58,43 @@ def test_a_word_is_kept_in_the_scene_and_nothing_else_changes(place, capsys):
     assert left.points == ((69, 69),) and left.not_points == ((20, 60),)
     main(["words", str(place), "--forget", "Gizmo"])
     assert not words(place)
+
+
+def test_a_word_of_another_width_is_refused_by_scenes_and_their_files(place):
+    teach(place, "--box", DOME)
+    scene = read_scene(place, "cpu")
+    wide = replace(scene.words["gizmo"], vector=torch.ones(5), examples=())
+    with pytest.raises(UserError, match="another CLIP"):
+        scene.carrying(wide)
+    keep_words(place, {"gizmo": wide})
+    with pytest.raises(UserError, match=r"wall\.scene.*another CLIP"):
+        read_scene(place, "cpu")
+
+
+def test_a_word_that_is_taught_while_another_is_forgotten_stays(place, monkeypatch):
+    teach(place, "--box", DOME)
+
+    def meanwhile(scene, name):
+        found = forgotten(scene, name)
+        main(["teach", str(place), "--word", "widget", "--photo", "0003.jpg", "--at", "69,69"])
+        return found
+
+    monkeypatch.setattr("lang3dxl_ns.commands.teach.forgotten", meanwhile)
+    main(["words", str(place), "--forget", "gizmo"])
+    assert list(words(place)) == ["widget"]
+
+
+def test_evaluate_takes_a_scene_or_the_folder_that_holds_it(place):
+    for given in (place, place.parent):
+        with pytest.raises(SystemExit, match=r"wall\.scene is scored with --ground-truth"):
+            main(["evaluate", "run", str(given), "--out", str(place.parent / "report")])
+
+
+def test_words_are_not_saved_over_a_scene(place):
+    teach(place, "--box", DOME)
+    with pytest.raises(SystemExit, match=r"wall\.scene is not the name of a \.json file"):
+        main(["words", str(place), "--save", str(place)])
+    assert words(place)
 
 
 def test_a_mask_teaches_and_queries_say_so(place, tmp_path, capsys):

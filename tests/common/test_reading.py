@@ -19,6 +19,13 @@ def test_what_was_written_is_read(tmp_path):
     assert (read_array(tmp_path / "b.npy") == np.arange(6).reshape(2, 3)).all()
 
 
+def test_lists_saved_by_windows_and_names_with_a_hash_are_read(tmp_path):
+    (tmp_path / "list.txt").write_bytes("\ufeff0001.jpg\r\nIMG#2.jpg  # blurred\r\n# none\r\n\r\n".encode())
+    assert read_names(tmp_path / "list.txt") == ("0001.jpg", "IMG#2.jpg")
+    (tmp_path / "a.json").write_bytes(b"\xef\xbb\xbf[1]")
+    assert read_json(tmp_path / "a.json") == [1]
+
+
 def test_pipes_devices_and_folders_are_no_files(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, "/dev/zero"):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from label_sets import box_object, write_holyscenes, write_labels, write_plain
+from lang3dxl_ns.evaluation.layouts import MaskFile, read_gray
 from PIL import Image
 
 from lang3dxl_ns import cli
@@ -63,6 +64,26 @@ def test_pictures_score_as_floats_do(scene, tmp_path):
     score[8:24, 16:48] = 255
     Image.fromarray(score).save(maps / "rose window" / "0001.png")
     assert score_predictions(GroundTruth(truth), maps)[0]["0001"] == pytest.approx(expected)
+
+
+def test_pictures_of_16_bits_are_not_clipped_at_255_and_floats_are_refused(tmp_path):
+    ramp = np.linspace(0, 65535, 1200).reshape(30, 40)
+    Image.fromarray(ramp.astype(np.uint16)).save(tmp_path / "a.png")
+    np.testing.assert_allclose(np.asarray(read_gray(tmp_path / "a.png")), ramp / 257, atol=0.51)
+    Image.fromarray((ramp > 30000).astype(np.uint16) * 255).save(tmp_path / "b.png")  # a mask of 0 and 255
+    np.testing.assert_array_equal(np.asarray(read_gray(tmp_path / "b.png")) == 255, ramp > 30000)
+    Image.fromarray((ramp / 65535).astype(np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(UserError, match=r"a\.tif.*floating-point"):
+        read_gray(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(("color", "dark"), [(255, False), (0, True)])
+def test_what_is_transparent_is_not_the_object(tmp_path, mask, color, dark):
+    """As programs that cut things out save them."""
+    colors = np.full((*mask.shape, 3), color, np.uint8)
+    cut = np.concatenate([colors, mask[..., None] * np.uint8(255)], axis=2)
+    Image.fromarray(cut).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(MaskFile(tmp_path / "a.png", dark).truth(mask.shape).mask, mask)
 
 
 def test_the_names_of_query_are_understood(scene):
@@ -189,6 +210,18 @@ def test_the_list_of_photos_to_hold_out_is_a_list_of_photos_to_score(scene, tmp_
     names.write_text("# nothing\n\n")
     with pytest.raises(SystemExit, match="is empty"):
         cli.main(["evaluate", "maps", *common, "--out", str(tmp_path / "out")])
+
+
+def test_labels_that_mark_nothing_are_told(scene, tmp_path, mask):
+    truth, maps = tmp_path / "black", scene[1]
+    write_plain(truth, "rose window", "0001", np.zeros_like(mask))
+    for words in (
+        ["maps", "--maps", str(maps), "--out", str(tmp_path)],
+        ["split", "--out", str(tmp_path / "a")],
+    ):
+        with pytest.raises(SystemExit, match=r"no label .*marks a pixel.*white on black"):
+            cli.main(["evaluate", *words, "--ground-truth", str(truth)])
+    assert (tmp_path / "scores.json").is_file() and not (tmp_path / "a").exists()
 
 
 def test_the_temperature_of_maps_matters_to_the_published_processing_alone(scene):

@@ -9,8 +9,9 @@ import torch
 from painted_scene import DOME, WINDOWS, painted_scene, painted_splats
 from PIL import Image
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.evaluation.score_scene import box_iou, score_selections
+from lang3dxl_ns.evaluation.score_scene import box_iou, score_scene, score_selections
 from lang3dxl_ns.query.places import Box
 
 NAMES = ("dome", "window")
@@ -48,6 +49,20 @@ def test_a_scene_that_knows_the_answers_gets_nearly_full_marks(tmp_path):
     figures = scored(tmp_path)
     assert set(figures) >= {f"{what}_iou_{w}" for what in ("mask", "selection", "box") for w in NAMES}
     assert min(figures.values()) > 0.7, figures
+
+
+def test_a_label_that_fits_two_photos_of_a_scene_file_is_refused_and_one_that_fits_none_is_told(
+    tmp_path, capsys
+):
+    scene = painted_scene()
+    truth = label(scene, tmp_path)
+    (tmp_path / "dome" / "left" / "0009.png").write_bytes((tmp_path / "dome/left/0001.png").read_bytes())
+    score_scene(scene, GroundTruth(tmp_path, "plain"))
+    assert "1 labels" in (said := capsys.readouterr().out) and "left/0009" in said
+    index = next(i for i, photo in enumerate(scene.photos) if photo.name != "left/0001.jpg")
+    scene.file.photos[index] = replace(scene.photos[index], name="left/0001.png")
+    with pytest.raises(UserError, match=r"left/0001 in .* fits both"):
+        score_scene(scene, truth)
 
 
 def test_labels_elsewhere_get_none(tmp_path):

@@ -103,7 +103,7 @@ def test_training_leaves_a_scene_file_that_answers_like_the_run(scene, trainer):
 def test_a_resumed_run_keeps_the_words_that_were_taught(train, scene_photos):
     first = train(scene_photos, iterations=2)
     (path,) = first.base_dir.glob("*.scene")
-    keep_words(path, taught_in(path).words.values())
+    keep_words(path, taught_in(path).words)
     again = train(scene_photos, iterations=3, load_dir=first.checkpoint_dir)
     assert again.base_dir != first.base_dir
     assert len(lang3dxl_ns.load_scene(again.base_dir).words["gizmo"].examples) == 1

@@ -237,7 +237,9 @@ def test_an_unreadable_photo_is_left_out_and_named(photos, config, store, capsys
 def test_no_readable_photo_at_all_is_a_users_error(photos, config, store):
     for photo in photos:
         photo.path.unlink()
-    with pytest.raises(UserError, match=r"no photo can be prepared.*north/a\.png"):
+    with pytest.raises(
+        UserError, match=r"no photo can be prepared; the first of \d+: [^;]*north/a\.png[^;]*$"
+    ):
         run(photos, config, store)
     with pytest.raises(UserError, match="the scene has none"):
         run([], config, store)

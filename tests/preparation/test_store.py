@@ -271,3 +271,14 @@ def test_cleaning_keeps_what_is_named_and_reports_what_went(store):
     assert store.clean(["clip"], ["a.jpg"]) == (4, going)
     assert files(store) == [store.path("clip", "a.jpg").name]
     assert store.sizes()["dense"] == (0, 0)
+
+
+def test_files_of_others_in_the_folder_are_never_deleted(store):
+    """Such as the photos themselves, where the store's folder is theirs."""
+    names = ("images/0001.jpg", "masks/0001.png", "models/clip.safetensors", "notes/draft.tmp")
+    for path in map(store.root.joinpath, names):
+        path.parent.mkdir(parents=True)
+        path.write_bytes(b"mine")
+        os.utime(path, (0, 0))
+    assert store.clean([], []) == (0, 0)
+    assert all(store.root.joinpath(name).is_file() for name in names)

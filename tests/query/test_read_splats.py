@@ -197,13 +197,14 @@ def test_a_run_folder_means_its_latest_splat(tmp_path):
     assert find_splats(tmp_path).parent.name == "iteration_30000"
 
 
-def test_gaussians_with_nan_keep_their_place_and_are_invisible(tmp_path):
+def test_gaussians_with_nan_keep_their_place_and_are_invisible(tmp_path, capsys):
     splats = some_splats()
     broken = splats.means.clone()
     broken[[3, 70]] = torch.tensor([torch.nan, 0, torch.inf])
     state = gsplat_state(Splats(broken, splats.quats, splats.scales, splats.opacities, splats.harmonics))
     torch.save(state, tmp_path / "a.pt")
     found = read_splats(tmp_path / "a.pt")
+    assert "a.pt: 0.67% of its Gaussians have NaN" in capsys.readouterr().out.replace("\n", " ")
     assert len(found) == len(splats) and bool(found.sound().all())
     assert float(found.opacities[[3, 70]].max()) == 0
     keep = torch.arange(len(splats)) % 67 != 3
@@ -255,6 +256,17 @@ def test_every_bad_file_ends_in_one_sentence(tmp_path, capsys):
         assert name in str(error.value), error.value
         assert "\n" not in str(error.value)
     assert capsys.readouterr().out == ""
+
+
+def test_checkpoints_in_the_old_format_and_of_other_shapes_are_told(tmp_path):
+    state = gsplat_state(some_splats(20))
+    torch.save(state, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    with pytest.raises(UserError, match=r"old\.pt: it is not a checkpoint of torch 1\.6 or later: save it"):
+        read_splats(tmp_path / "old.pt")
+    state["splats"]["quats"] = state["splats"]["quats"][:, :3]
+    torch.save(state, tmp_path / "flat.pt")
+    with pytest.raises(UserError, match=r"flat\.pt.*\[3, 3, 3, 3\] numbers a Gaussian"):
+        read_splats(tmp_path / "flat.pt")
 
 
 def test_a_ply_cut_anywhere_is_refused(tmp_path):

@@ -22,6 +22,7 @@ from painted_scene import (
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering.rasterize import rasterize
@@ -133,10 +134,18 @@ def test_a_negative_takes_its_pixels_away(scene):
     np.testing.assert_array_equal(argument.relevancy, against.relevancy)
 
 
+def test_one_picture_shows_one_view(scene):
+    here, same, other = (scene.query("dome", photo) for photo in ("0002", "0002", "0003"))
+    assert together([here, same]).ndim == 3
+    for matches in ([], [here, other]):
+        with pytest.raises(UserError, match="prompts of one view"):
+            together(matches)
+
+
 def test_a_vector_is_searched_for_like_its_text(scene):
     vector = encode_texts(["dome"])[0]
     words = scene.query("dome", "right/0002.jpg")
-    for same in (vector, vector.numpy(), 5 * vector, scene.encode("dome")):
+    for same in (vector, vector.numpy(), 5 * vector, 1e30 * vector, 1e-30 * vector, scene.encode("dome")):
         np.testing.assert_allclose(scene.query(same, "right/0002.jpg").relevancy, words.relevancy, atol=1e-5)
     np.testing.assert_allclose(scene.relevancy(vector), scene.relevancy("dome"), atol=1e-5)
     assert (scene.find(vector).gaussians == scene.find("dome").gaussians).all()
@@ -177,6 +186,7 @@ def test_a_pixel_is_named(scene):
     (word, score), *_ = scene.what_is("right/0002.jpg", column, row, words=["wall", "dome", "window"])
     assert word == "dome" and score > 0.9
     assert scene.what_is("0003", 0, 0, size=96, words=["wall"]) == []  # beside the wall
+    assert scene.what_is("0003", 48, 48, size=96, words=[]) == []
     assert len(scene.what_is("right/0002.jpg", column, row, most=3)) == 3
     with pytest.raises(UserError, match="outside the view"):
         scene.what_is("0003", 5000, 3)

@@ -18,6 +18,8 @@ from painted_scene import (
     painted_splats,
 )
 from PIL import Image
+from safetensors import safe_open
+from safetensors.numpy import save
 
 from lab.baselines import BASELINES
 from lang3dxl_ns.commands.view import Info
@@ -27,6 +29,7 @@ from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import Provenance, describe_scene_file, read_scene, write_scene
+from lang3dxl_ns.query.splat_file import write_splats
 
 ATOL = 1e-4 * TEMPERATURE
 """Of relevancies, whose slope is a quarter of the temperature: files hold half the digits."""
@@ -69,7 +72,7 @@ def test_a_scene_survives_its_file(written):
         np.testing.assert_allclose(there.relevancy, here.relevancy, atol=2 * ATOL)
         error = (there.view.pixels.astype(float) - here.view.pixels) / 255
         assert 10 * np.log10(1 / np.square(error).mean()) > 45
-    lit = found.render("0002", look="left/0001.jpg").pixels.astype(int)
+    lit = found.render("0002", look="0001").pixels.astype(int)  # by its stem, like every photo
     assert np.abs(lit - scene.render("0002", look="left/0001.jpg").pixels).max() <= 3
     assert [asdict_of(p) for p in found.photos] == [asdict_of(p) for p in scene.photos]
     assert (found.file.clip, found.file.scale) == (scene.file.clip, scene.file.scale)
@@ -231,6 +234,25 @@ def test_tensors_of_wrong_shapes_are_refused(written, name):
         read_scene(path, "cpu")
 
 
+@pytest.mark.parametrize(
+    ("name", "rows", "said"),
+    [
+        ("means", slice(None), "no value of means is a number"),
+        ("words", slice(None), "no value of words is a number"),
+        ("decoder.output.bias", slice(1), "its decoder is not made of numbers"),
+    ],
+)
+def test_a_scene_without_numbers_is_refused_rather_than_answered_with_0(written, name, rows, said):
+    _, path = written
+    with safe_open(path, "np") as file:
+        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    tensors[name] = tensors[name].copy()
+    tensors[name][rows] = np.nan
+    path.write_bytes(save(tensors, metadata))
+    with pytest.raises(UserError, match=rf"wall\.scene is not a readable scene \({said}\)"):
+        read_scene(path, "cpu")
+
+
 def test_cut_and_spoiled_files_are_refused_or_read_as_numbers(written):
     """Every change of a byte gives a scene, or one sentence."""
     _, path = written
@@ -252,8 +274,18 @@ def test_cut_and_spoiled_files_are_refused_or_read_as_numbers(written):
             read_scene(path, "cpu")
 
 
+def test_errors_of_the_device_are_not_the_files(written):
+    _, path = written
+    with pytest.raises(Exception, match=r"^((?!copy it again).)*$") as error:
+        read_scene(path, "cuda:63")
+    assert not isinstance(error.value, UserError)
+
+
 def test_other_names_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"end it in .scene"):
         write_scene(tmp_path / "a.ply", painted_scene())
+    write_splats(tmp_path / "a.ply", painted_splats())
+    with pytest.raises(UserError, match=r"a\.ply is not a readable scene .*: a splat .* lang3dxl attach"):
+        read_scene(tmp_path / "a.ply")
     with pytest.raises(UserError, match="not a file"):
         read_scene(tmp_path / "none.scene")

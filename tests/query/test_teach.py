@@ -1,5 +1,6 @@
 """Words taught by example, on a scene with known answers."""
 
+import json
 import os
 from dataclasses import replace
 
@@ -169,6 +170,9 @@ EVERYTHING = np.ones((96, 96), bool)
         (lambda: Example(ALL, EVERYTHING[:50]), "the whole photo"),
         (lambda: Example(ALL, points=((float("nan"), 1),)), "not a number"),
         (lambda: Example(ALL, box=(1, 2, float("inf"), 4)), "not a number"),
+        (lambda: Example(ALL, box=(1, 2, 3)), "four for a box"),
+        (lambda: Example(ALL, points=(5, 5)), "two numbers for a point"),
+        (lambda: Example(ALL, np.ones((4, 4, 3))), r"not \[h, w\]"),
         (lambda: Example(ALL, points=((96.5, 1),)), "outside"),
         (lambda: Example(ALL, points=((1, 1),), not_points=((1, -1),)), "outside"),
         (lambda: Example(ALL, box=(50, 2, 40, 4)), "marks nothing"),
@@ -185,6 +189,13 @@ def test_marks_that_teach_nothing_are_one_sentence(scene, example, message):
 def test_a_word_needs_an_example(scene):
     with pytest.raises(UserError, match="no example"):
         scene.teach("gizmo", [])
+
+
+def test_numbers_of_numpy_are_coordinates(scene):
+    points = np.array([[3, 4]], np.int64)
+    example = Example(ALL, points=points, box=np.float32([1, 2, 3, 4]))
+    assert example.points == ((3.0, 4.0),) and example.box == (1.0, 2.0, 3.0, 4.0)
+    json.dumps(example.to_json())
 
 
 def test_one_marked_pixel_is_a_mark(scene):

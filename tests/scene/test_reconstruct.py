@@ -96,13 +96,16 @@ def test_names_with_spaces_formats_of_the_web_and_odd_bytes(photos):
         (folder / f"photo_{i:03d}.jpg").rename(folder / f"Foto {i} (ä).jpg")
     with Image.open(folder / "photo_006.jpg") as image:
         image.save(folder / "one more.webp", quality=95)
+    with Image.open(folder / "Foto 5 (ä).jpg") as image:
+        image.save(folder / "five.avif", quality=95)
+    os.remove(folder / "Foto 5 (ä).jpg")
     os.rename(folder / "photo_006.jpg", os.fsencode(folder) + b"/caf\xe9.jpg")
     report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
     assert report.registered == 7
     (odd,) = (name for name, why in report.left_out.items() if "rename" in why)
     assert odd.startswith("caf")
     names = set(read_reconstruction(photos / "sparse" / "0").photos)
-    assert names == {*(f"Foto {i} (ä).jpg" for i in range(6)), "one more.webp"}
+    assert names == {*(f"Foto {i} (ä).jpg" for i in range(5)), "one more.webp", "five.avif"}
     assert all(line.isprintable() for line in report.lines())
 
 
@@ -153,6 +156,14 @@ def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch):
     reconstruct_scene(photos)
     assert sorted(extracted) == [f"{i:06d}.jpg" for i in range(7)]  # each once
     assert len(matched) == 7 * 6 // 2 - 10
+
+
+def test_photos_in_a_folder_of_that_name_beside_the_work_stay(photos, tmp_path):
+    """As with `reconstruct --data castle/reconstruction/photos --cache-dir castle`."""
+    own = tmp_path / "reconstruction" / "photos"
+    shutil.copytree(photos / "images", own)
+    module._numbered(find_photos(own), own.parent)
+    assert find_photos(own).names == find_photos(photos).names
 
 
 def test_other_photos_begin_anew(photos):

@@ -85,6 +85,11 @@ class Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "lang3dxl", ""
     timeout = _PATIENCE
 
+    def handle(self) -> None:
+        """Answer requests until the connection ends, however abruptly the browser ends it."""
+        with contextlib.suppress(ConnectionError):
+            super().handle()
+
     def do_GET(self) -> None:
         """Answer the request, unless access is refused."""
         refused = self.server.access.refusal(self.path, self.headers)
@@ -102,8 +107,7 @@ class Handler(BaseHTTPRequestHandler):
         for name, value in {**_HEADERS, **headers, "Content-Length": str(len(content))}.items():
             self.send_header(name, value)
         self.end_headers()
-        with contextlib.suppress(ConnectionError):  # the browser closed the connection
-            self.wfile.write(content)
+        self.wfile.write(content)
 
     def log_message(self, *_: object) -> None:
         """Log nothing, where the parent would log every request."""
