@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from label_sets import box_object, write_holyscenes, write_labels, write_plain
-from lang3dxl_ns.evaluation.layouts import MaskFile, read_gray
 from PIL import Image
 
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.layouts import MaskFile, read_gray
 from lang3dxl_ns.evaluation.predictions import score_predictions
 from lang3dxl_ns.evaluation.scores import average_precision
 
