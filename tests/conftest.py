@@ -7,7 +7,6 @@
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
   `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
   told `--pipeline.model.decoder.compression.steps 40`.
-- `wheel`: the package's wheel, built once per session.
 - `worker_tasks`: work for several processes; tests that need a Ray cluster belong into test_ray.py, which
   has one.
 """
@@ -15,7 +14,6 @@
 import gc
 import inspect
 import os
-import subprocess
 import sys
 from collections import Counter
 from copy import deepcopy
@@ -23,7 +21,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from filelock import FileLock
 from scenes import write_scene
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
@@ -90,25 +87,6 @@ def tiny_clip(tmp_path_factory) -> Path:
 def tiny_dense(tmp_path_factory) -> Path:
     """Directory of a DINOv2 of random weights."""
     return make_tiny_dinov2(tmp_path_factory.mktemp("models") / "dinov2")
-
-
-def build_wheel(folder: Path, source: Path) -> Path:
-    """The wheel of a source tree or sdist, built in a folder."""
-    words = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source]
-    subprocess.run(words, check=True, timeout=500)
-    (wheel,) = folder.glob("*.whl")
-    return wheel
-
-
-@pytest.fixture(scope="session")
-def wheel(tmp_path_factory) -> Path:
-    """The package's wheel, built once for all processes that test."""
-    shared = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        shared = shared.parent
-    folder = shared / "wheel"
-    with FileLock(shared / "wheel.lock"):
-        return next(folder.glob("*.whl"), None) or build_wheel(folder, Path(__file__).parents[1])
 
 
 @pytest.fixture(scope="session")
