@@ -1,9 +1,10 @@
 """What tests share: small scenes, tiny encoders, and short training runs.
 
 - `scene`, `tiny_clip`, `tiny_dense`: read-only, made once per process that tests.
-- `train`: a short training with settings of your own, a small sky, and 40 small steps of learning codes. It
-  takes a second and 15 ms per step: take as few as the law needs, and a module's fixture where several tests
-  only look at the same run.
+- `train`: a short training with settings of your own, a small sky, and 40 small steps of learning codes of
+  three numbers (after so few steps three often seem not enough, and four and six take five times as long). It
+  takes half a second and 15 ms per step: take as few as the law needs, and a module's fixture where several
+  tests only look at the same run.
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
   `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
   told `--pipeline.model.decoder.compression.steps 40`.
@@ -133,6 +134,7 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, meth
     config.pipeline.model.sky_gaussians = 400
     compression = config.pipeline.model.decoder.compression
     compression.steps, compression.batch = 40, 512
+    config.pipeline.model.semantic_field.code_dim = 3
     for path, value in changes.items():
         *owners, name = path.split("__")
         owner = config
