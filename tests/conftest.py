@@ -1,7 +1,7 @@
 """What tests share: small scenes, tiny encoders, and short training runs.
 
 - `scene`, `tiny_clip`, `tiny_dense`: read-only, made once per process that tests.
-- `train`: a short training with settings of your own, a small sky, and 40 small steps of learning codes of
+- `train`: a short training with settings of your own, a small sky, and 20 small steps of learning codes of
   three numbers (after so few steps three often seem not enough, and four and six take five times as long). It
   takes half a second and 15 ms per step: take as few as the law needs, and a module's fixture where several
   tests only look at the same run.
@@ -133,7 +133,7 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, meth
     config.viewer.quit_on_train_completion = True
     config.pipeline.model.sky_gaussians = 400
     compression = config.pipeline.model.decoder.compression
-    compression.steps, compression.batch = 40, 512
+    compression.steps, compression.batch = 20, 512
     config.pipeline.model.semantic_field.code_dim = 3
     for path, value in changes.items():
         *owners, name = path.split("__")
