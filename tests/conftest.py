@@ -1,13 +1,13 @@
 """What tests share: small scenes, tiny encoders, and short training runs.
 
 - `scene`, `tiny_clip`, `tiny_dense`: read-only, made once per process that tests.
-- `train`: a short training with settings of your own, a small sky, and 40 small steps of learning codes. It
-  takes a second and 15 ms per step: take as few as the law needs, and a module's fixture where several tests
-  only look at the same run.
+- `train`: a short training with settings of your own, a small sky, and 20 small steps of learning codes of
+  three numbers (after so few steps three often seem not enough, and four and six take five times as long). It
+  takes half a second and 15 ms per step: take as few as the law needs, and a module's fixture where several
+  tests only look at the same run.
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
   `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
   told `--pipeline.model.decoder.compression.steps 40`.
-- `wheel`: the package's wheel, built once per session.
 - `worker_tasks`: work for several processes; tests that need a Ray cluster belong into test_ray.py, which
   has one.
 """
@@ -15,7 +15,6 @@
 import gc
 import inspect
 import os
-import subprocess
 import sys
 from collections import Counter
 from copy import deepcopy
@@ -23,7 +22,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from filelock import FileLock
 from scenes import write_scene
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
@@ -92,25 +90,6 @@ def tiny_dense(tmp_path_factory) -> Path:
     return make_tiny_dinov2(tmp_path_factory.mktemp("models") / "dinov2")
 
 
-def build_wheel(folder: Path, source: Path) -> Path:
-    """The wheel of a source tree or sdist, built in a folder."""
-    words = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source]
-    subprocess.run(words, check=True, timeout=500)
-    (wheel,) = folder.glob("*.whl")
-    return wheel
-
-
-@pytest.fixture(scope="session")
-def wheel(tmp_path_factory) -> Path:
-    """The package's wheel, built once for all processes that test."""
-    shared = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        shared = shared.parent
-    folder = shared / "wheel"
-    with FileLock(shared / "wheel.lock"):
-        return next(folder.glob("*.whl"), None) or build_wheel(folder, Path(__file__).parents[1])
-
-
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory) -> Path:
     """A collection of twelve photos of mixed sizes with a COLMAP model."""
@@ -154,7 +133,8 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, meth
     config.viewer.quit_on_train_completion = True
     config.pipeline.model.sky_gaussians = 400
     compression = config.pipeline.model.decoder.compression
-    compression.steps, compression.batch = 40, 512
+    compression.steps, compression.batch = 20, 512
+    config.pipeline.model.semantic_field.code_dim = 3
     for path, value in changes.items():
         *owners, name = path.split("__")
         owner = config

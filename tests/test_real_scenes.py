@@ -9,7 +9,7 @@ from lang3dxl_ns.preparation.physical_scale import pixel_sizes, propose_scale_ra
 from lang3dxl_ns.scene.colmap import read_reconstruction
 
 
-@pytest.fixture(params=["sceaux", "sceaux_wild"])
+@pytest.fixture(params=[pytest.param("sceaux", marks=pytest.mark.nightly), "sceaux_wild"])
 def real_scene(request, real_scenes, tmp_path):
     """A copy, since targets are kept beside the photos."""
     return shutil.copytree(

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -10,21 +11,52 @@ from pathlib import Path
 import pytest
 from build import ProjectBuilder
 from build.env import DefaultIsolatedEnv
-from conftest import build_wheel
+from filelock import FileLock
 from scenes import write_scene
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
 
 
-def test_the_sdist_is_reproducible_and_makes_the_same_wheel(wheel, tmp_path):
-    with DefaultIsolatedEnv() as environment:  # as of `python -m build`, for both
-        builder = ProjectBuilder.from_isolated_env(environment, ROOT)
-        environment.install(builder.build_system_requires)
-        environment.install(builder.get_requires_for_build("sdist"))
-        sources = [Path(builder.build("sdist", tmp_path / name)) for name in ("one", "two")]
-    assert sources[0].read_bytes() == sources[1].read_bytes()
-    assert build_wheel(tmp_path / "wheel", sources[0]).read_bytes() == wheel.read_bytes()
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """A folder with all that `python -m build` makes: the wheel of the checkout, two sdists, and the wheel of
+    one of them. Made once for all processes that test, in one isolated environment."""
+    shared = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent
+    with FileLock(shared / "built.lock"):
+        if not (shared / "built").exists():
+            build(tmp_path_factory.mktemp("built")).rename(shared / "built")
+    return shared / "built"
+
+
+def build(folder: Path) -> Path:
+    with DefaultIsolatedEnv() as environment:
+        checkout = ProjectBuilder.from_isolated_env(environment, ROOT)
+        environment.install(checkout.build_system_requires)
+        for kind in ("sdist", "wheel"):
+            environment.install(checkout.get_requires_for_build(kind))
+        checkout.build("wheel", folder / "wheel")
+        sdist, _ = (checkout.build("sdist", folder / f"sdist-{number}") for number in (1, 2))
+        shutil.unpack_archive(sdist, folder / "unpacked")
+        (source,) = (folder / "unpacked").iterdir()
+        ProjectBuilder.from_isolated_env(environment, source).build("wheel", folder / "wheel-of-sdist")
+    return folder
+
+
+@pytest.fixture
+def wheel(built) -> Path:
+    return next((built / "wheel").iterdir())
+
+
+def test_the_sdist_is_reproducible_and_makes_the_same_wheel(built):
+    def content(folder: str) -> bytes:
+        (path,) = (built / folder).iterdir()
+        return path.read_bytes()
+
+    assert content("sdist-1") == content("sdist-2")
+    assert content("wheel-of-sdist") == content("wheel")
 
 
 def test_commands_run_from_it_alone(wheel, tmp_path):

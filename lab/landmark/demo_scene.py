@@ -9,6 +9,9 @@ from typing import Literal
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
 
+FOLDER, CAMERAS = "test_views", "cameras.json"
+"""Folder of a scene's test views, and the file in it that lists their cameras."""
+
 
 @showing("out", "photos", "seed", "family")
 @dataclass

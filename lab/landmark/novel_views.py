@@ -12,14 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from lab.landmark.demo_scene import CAMERAS, FOLDER
 from lang3dxl_ns.common.errors import readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.scene.camera import Lens, check_pose
 from lang3dxl_ns.scene.colmap import TrackedPhoto
-
-FOLDER = "test_views"
-CAMERAS = "cameras.json"
 
 
 @dataclass(frozen=True)

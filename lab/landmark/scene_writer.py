@@ -1,4 +1,8 @@
-"""Generator of demo scenes: a procedural landmark as photos, COLMAP model, masks and ground truth."""
+"""Generator of demo scenes: a procedural landmark as photos, COLMAP model, masks and ground truth.
+
+The processes that take the photos import this module, but not torch, which takes them longer to load than
+several photos; so what needs torch is imported where it is used.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +16,15 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
-from lab.landmark.demo_scene import DemoScene
+from lab.landmark.demo_scene import CAMERAS, FOLDER, DemoScene
 from lab.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
 from lab.landmark.landmark import Landmark
 from lab.landmark.novel_cameras import choose_cameras
-from lab.landmark.novel_views import CAMERAS, FOLDER
 from lab.landmark.photography import (
     Shot,
     View,
@@ -41,8 +45,9 @@ from lab.landmark.sparse_model import (
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.scene.camera import Lens
-from lang3dxl_ns.scene.colmap import TrackedPhoto
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.scene.colmap import TrackedPhoto
 
 HELD_OUT_EVERY = 8
 """Interval of nerfstudio's split: of the photos sorted by name, 0, 8, 16 … are held out."""
@@ -90,10 +95,11 @@ def write_scene(scene: DemoScene) -> Path:
     size = scene.width, scene.height
     points = int(np.clip(POINTS // scene.photos, 40, 400))
     cameras = choose_cameras(landmark, scene.test_views, scene.wild, size)
-    numbered = [(i + 1, None) for i in range(scene.photos)] + [(i + 1, c) for i, c in enumerate(cameras)]
+    places: list[tuple[Path, int, Camera | None]] = [(unfinished, i + 1, None) for i in range(scene.photos)]
+    places += [(unfinished / FOLDER, i + 1, camera) for i, camera in enumerate(cameras)]
     orders = [
-        _Order(number, scene.seed, landmark.family, scene.wild, size, points, unfinished, camera)
-        for number, camera in numbered
+        _Order(number, scene.seed, landmark.family, scene.wild, size, points, folder, camera)
+        for folder, number, camera in places
     ]
     taken = list(_taken(orders, scene.workers))
     photos, views = taken[: scene.photos], taken[scene.photos :]
@@ -179,17 +185,20 @@ def _take_test_view(landmark: Landmark, camera: Camera, order: _Order) -> TakenP
     masks = {f"ground_truth/{c}": mask for c, mask in category_masks(shot.parts, shot.elements).items()}
     masks = {place: mask for place, mask in masks.items() if mask.mean() >= SMALLEST_POSITIVE}
     for place, mask in {"masks": building_mask(shot.parts), **masks}.items():
-        (order.folder / FOLDER / place).mkdir(parents=True, exist_ok=True)
-        Image.fromarray(mask).save(order.folder / FOLDER / place / name)
-    (order.folder / FOLDER / "images").mkdir(exist_ok=True)
+        (order.folder / place).mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(order.folder / place / name)
+    (order.folder / "images").mkdir(exist_ok=True)
     picture = Image.fromarray(shot.image)
-    picture.save(order.folder / FOLDER / "images" / f"{order.name}.jpg", quality=93, subsampling=0)
+    picture.save(order.folder / "images" / f"{order.name}.jpg", quality=93, subsampling=0)
     rng = np.random.default_rng([order.seed, 6, order.number])
     return TakenPhoto(order.number, *order.size, camera, *sample_points(shot, camera, TEST_POINTS, rng))
 
 
 def _tracked(view: TakenPhoto, similarity: Similarity) -> TrackedPhoto:
     """Convert a test view's camera to the COLMAP model's world."""
+    from lang3dxl_ns.scene.camera import Lens
+    from lang3dxl_ns.scene.colmap import TrackedPhoto
+
     focal, points = view.camera.focal * max(view.width, view.height), similarity.apply(view.points)
     return TrackedPhoto(
         name=f"{view.number:04d}.jpg",

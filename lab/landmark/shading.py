@@ -130,8 +130,10 @@ def light(
 ) -> Float[Array, "h w 3"]:
     """Compute the linear colors of all pixels: lit hits, and sky elsewhere."""
     height, width = traced.depth.shape
-    rays = _flat(camera, width, height)
-    color = _sky(rays, weather)
+    rays, sky = _flat(camera, width, height), np.ones(height * width, bool)
+    sky[traced.pixel] = False
+    color = np.empty((height * width, 3), np.float32)
+    color[sky] = _sky(rays[sky], weather)
     color[traced.pixel] = _lit(traced, materials, camera, weather, rays[traced.pixel], shadows)
     return color.reshape(height, width, 3)
 
@@ -153,7 +155,7 @@ def _lit(
 
     color = np.empty((len(ray), 3), np.float32)
     gloss = np.zeros(len(ray), np.float32)
-    for i in np.unique(hits.material):
+    for i in np.flatnonzero(np.bincount(hits.material)):
         own = np.flatnonzero(hits.material == i)
         color[own] = materials[i].reflectance(*hits.texture[:, own], footprint[own])
         gloss[own] = materials[i].gloss

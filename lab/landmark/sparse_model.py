@@ -13,7 +13,6 @@ from numpy import ndarray as Array
 from lab.landmark.labels import PART
 from lab.landmark.photography import Shot
 from lab.landmark.raycast import Camera
-from lang3dxl_ns.scene.colmap import load_pycolmap
 
 POINTS = 24_000
 """Number of candidate points over the whole collection. Those found in too few photos are dropped."""
@@ -183,6 +182,8 @@ def write_model(
     """Write cameras.bin, images.bin and points3D.bin (and COLMAP's rigs.bin, frames.bin) to `folder`. Photos
     are named NNNN.jpg, with NNNN as COLMAP image number. With `one_camera`, all share the first photo's
     camera."""
+    from lang3dxl_ns.scene.colmap import load_pycolmap  # not in the processes that take photos
+
     pycolmap = load_pycolmap()
     model = pycolmap.Reconstruction()
     elements: list[list[tuple[int, int]]] = [[] for _ in tracks.points]

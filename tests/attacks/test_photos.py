@@ -182,9 +182,8 @@ def test_training_without_usable_points_says_so(folder, xyz, tiny_clip, tiny_den
 
 def test_training_without_points_can_start_at_random(folder, tiny_clip, tiny_dense, tmp_path):
     change_points(folder, None)
-    trainer = make_trainer(
-        folder, tiny_clip, tiny_dense, tmp_path / "out", 2, pipeline__model__random_init=True
-    )
+    random = {"pipeline__model__random_init": True, "pipeline__model__num_random": 500}
+    trainer = make_trainer(folder, tiny_clip, tiny_dense, tmp_path / "out", 2, **random)
     trainer.setup()
     trainer.train()
     assert trainer.pipeline.model.means.isfinite().all()

@@ -1,20 +1,16 @@
 """Benchmarks of the laboratory: available in a checkout, and what they report. lab/tests has more."""
 
-import json
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 from painted_scene import painted_scene
-from scenes import write_scene
 
-from lab.benchmarks import attach, training
+from lab.benchmarks import attach
 from lab.benchmarks.published import HolyScenes, published_figures
 from lab.benchmarks.scale import ScaleBenchmark, Stage, markdown
 from lab.benchmarks.teaching import ways
 from lang3dxl_ns import cli
-from lang3dxl_ns.methods import run_config
 
 OF_LAB = ["numerics", "demo-scene", *(f"benchmark {name}" for name in cli.BENCHMARKS)]
 
@@ -85,20 +81,3 @@ def test_marks_lie_on_the_word(name):
     if example.box is not None:
         assert example.box == (60, 20, 100, 40)
     assert example.points or example.complete
-
-
-def test_the_report_of_training_has_the_parts_of_a_step(tmp_path, tiny_clip, tiny_dense, monkeypatch):
-    def quick(*arguments):
-        config = run_config(*arguments)
-        config.pipeline.model.decoder.compression.steps = 40  # 15 seconds otherwise
-        return config
-
-    monkeypatch.setattr("lang3dxl_ns.methods.run_config", quick)
-    monkeypatch.setattr(training, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
-    data = write_scene(tmp_path / "scene", photos=4, points=60)
-    models = str(tiny_clip), str(tiny_dense)
-    training.TrainingBenchmark(data, tmp_path / "out", *models, iterations=3, scale=1.0).main()
-    found = json.loads((tmp_path / "out/training.json").read_text())
-    assert {"render", "backward", "optimizer"} <= set(found["rgb only"]["split_seconds"])
-    assert all(seconds > 0 for run in found.values() for seconds in run["split_seconds"].values())
-    assert "| backward (ms) |" in (tmp_path / "out/training.md").read_text()

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 SCENE = {"photos": 8, "test_views": 3, "quick": True, "wild": False}
-FEW = "--pipeline.model.decoder.compression.steps 40"
+FEW = "--pipeline.model.decoder.compression.steps 40 --pipeline.model.semantic-field.code-dim 3"
 """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 
 

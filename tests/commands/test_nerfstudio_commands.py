@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 FEW = (
     *("--pipeline.model.decoder.compression.steps", 40),
     *("--pipeline.model.decoder.compression.batch", 512),
+    *("--pipeline.model.semantic-field.code-dim", 3),
 )
 """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
 

@@ -41,6 +41,7 @@ def test_help_and_the_doctor_load_no_heavy_library():
     commands = [["--help"], ["no-such-command"], ["doctor"], ["benchmark", "--help"]]
     commands += [[name, "--help"] for name in cli.COMMANDS if name not in own]
     commands += [["evaluate", kind, "--help"] for kind in ("maps", "run", "pool", "split")]
+    commands += [["demo-scene", "--out", "scene", "--photos", "2"]]  # each of its workers imports as much
     found = loaded(*commands, ["preset", "holyscenes/milano"])
     assert {command: names for command, names in found.items() if names} == {}
 

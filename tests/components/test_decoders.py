@@ -115,7 +115,7 @@ def test_alignment_moves_clip_towards_dense_and_not_the_other_way():
 
 
 def test_autoencoder_of_langsplat_tells_the_features_of_a_scene_apart(monkeypatch):
-    monkeypatch.setattr(langsplat, "_STEPS", 300)
+    monkeypatch.setattr(langsplat, "_STEPS", 120)
     generator = torch.Generator().manual_seed(0)
     prototypes = torch.randn(4, CLIP, generator=generator)
     targets = [4 * prototypes[torch.randint(4, (9, 8), generator=generator)] for _ in range(3)]

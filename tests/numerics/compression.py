@@ -25,7 +25,7 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
     """Features of a few kinds of things, one of them rare; masses and sizes of all magnitudes."""
     note = f"decoded, against the features; a kind on {RARE:.1%} of the Gaussians counts as much as all"
     problems: dict[str, Callable[[], Problem]] = {
-        "one material": partial(_problem, kinds=1),
+        "one material": partial(_problem, kinds=1, steps=100 if quick else 1_000),
         "12 kinds": _problem,
         "features of 1e4": partial(_problem, size=1e4),
         "features of 1e-6": partial(_problem, size=1e-6),
@@ -54,7 +54,9 @@ def compress(
     return assign(gathered, field, fit(sample, field, config, generator))
 
 
-def _problem(kinds: int = KINDS, size: float = 1.0, masses: float = 0.0, unseen: float = 0.0) -> Problem:
+def _problem(
+    kinds: int = KINDS, size: float = 1.0, masses: float = 0.0, unseen: float = 0.0, steps: int = 1_000
+) -> Problem:
     generator = torch.Generator().manual_seed(0)
     kind = torch.arange(COUNT) % max(kinds - 1, 1)
     rare = torch.arange(COUNT) < RARE * COUNT
@@ -72,7 +74,7 @@ def _problem(kinds: int = KINDS, size: float = 1.0, masses: float = 0.0, unseen:
             SemanticFieldConfig("short"), CHANNELS, generator=torch.Generator().manual_seed(0)
         ).to(given["features"])
         weight = torch.where(seen.to(given["mass"].device), given["mass"], 0.0)
-        config = CompressionConfig(batch=512)
+        config = CompressionConfig(steps, batch=512)
         batches = torch.Generator().manual_seed(0)
         codes = compress(given["features"].detach(), weight.detach(), field, config, batches)
         assert bool(codes[~seen].isnan().all()), "Gaussians in no photo are unknown"

@@ -10,7 +10,8 @@ from conftest import make_trainer
 from label_sets import write_plain
 from PIL import Image
 
-from lab.landmark.novel_views import FOLDER, read_novel_views
+from lab.landmark.demo_scene import FOLDER
+from lab.landmark.novel_views import read_novel_views
 from lab.landmark.novel_views_of_runs import evaluate_novel_views, novel_dataset
 from lab.landmark.scene_writer import write_novel_cameras
 from lang3dxl_ns.common.errors import UserError

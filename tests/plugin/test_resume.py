@@ -10,7 +10,8 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
     "pipeline__model__decode_size": (24, 32),
-    "pipeline__model__densify_grad_thresh": 1e-7,  # at every second step, with random splits
+    "pipeline__model__densify_grad_thresh": 1e-7,  # with random splits
+    "pipeline__model__densify_every": 0.2,  # at every fourth step, where their number doubles
     "pipeline__model__densify_until": 0.75,
     "pipeline__model__appearance__use": "on",
     "pipeline__model__camera_optimization": "on",
@@ -42,10 +43,10 @@ def last_checkpoint(trainer) -> dict:
 
 @pytest.fixture(scope="module")
 def whole(scene, tiny_clip, tiny_dense, tmp_path_factory):
-    """An uninterrupted run of 24 steps with a checkpoint every five."""
+    """An uninterrupted run of 20 steps with a checkpoint every five."""
     folder = tmp_path_factory.mktemp("whole")
     changes = EVERYTHING | {"steps_per_save": 5, "save_only_latest_checkpoint": False}
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 24, **changes)
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 20, **changes)
     trainer.setup()
     trainer.train()
     return trainer
@@ -53,9 +54,9 @@ def whole(scene, tiny_clip, tiny_dense, tmp_path_factory):
 
 @pytest.mark.parametrize("step", [5, 10])
 def test_resumed_at_a_step_the_run_ends_as_if_it_had_never_stopped(train, scene, whole, step):
-    """Densification follows both steps, and its statistics are half collected at 5."""
+    """Densification follows both steps, and its statistics are partly collected at either."""
     middle = whole.checkpoint_dir / f"step-{step:09d}.ckpt"
-    resumed = train(scene, iterations=24, load_checkpoint=middle, **EVERYTHING)
+    resumed = train(scene, iterations=20, load_checkpoint=middle, **EVERYTHING)
     assert resumed._start_step == step + 1
     before = len(torch.load(middle, weights_only=True)["pipeline"]["_model.gauss_params.means"])
     assert resumed.pipeline.model.num_points > before
@@ -65,7 +66,7 @@ def test_resumed_at_a_step_the_run_ends_as_if_it_had_never_stopped(train, scene,
 def test_one_seed_twice_gives_equal_checkpoints(train, scene, whole, tmp_path):
     """Whether or not the targets already existed."""
     fresh = {"pipeline__datamanager__cache_dir": tmp_path / "targets"}
-    again = train(scene, iterations=24, **EVERYTHING, **fresh)
+    again = train(scene, iterations=20, **EVERYTHING, **fresh)
     assert same(last_checkpoint(whole), last_checkpoint(again)) == []
 
 
@@ -101,7 +102,7 @@ def test_a_damaged_photo_does_not_change_the_order_of_the_others(train, scene, w
 
 
 FROM_PHOTOS = EVERYTHING | {"pipeline__model__codes_from": "photos", "pipeline__model__warm_up": 0.4}
-"""Codes start at iteration 9.6 of 24."""
+"""Codes start at iteration 8 of 20."""
 
 
 @pytest.fixture(scope="module")
@@ -116,10 +117,10 @@ def starts():
 
 @pytest.fixture(scope="module")
 def whole_from_photos(starts, scene, tiny_clip, tiny_dense, tmp_path_factory):
-    """An uninterrupted run of 24 steps whose codes start from photos, with a checkpoint every five."""
+    """An uninterrupted run of 20 steps whose codes start from photos, with a checkpoint every five."""
     changes = FROM_PHOTOS | {"steps_per_save": 5, "save_only_latest_checkpoint": False}
     folder = tmp_path_factory.mktemp("from_photos")
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 24, **changes)
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 20, **changes)
     trainer.setup()
     trainer.train()
     assert starts == [trainer.pipeline]
@@ -132,8 +133,8 @@ def test_codes_start_from_photos_once_also_if_the_run_is_interrupted(
 ):
     starts.clear()
     middle = whole_from_photos.checkpoint_dir / f"step-{step:09d}.ckpt"
-    resumed = train(scene, iterations=24, load_checkpoint=middle, **FROM_PHOTOS)
-    assert len(starts) == (1 if step < 9.6 else 0)
+    resumed = train(scene, iterations=20, load_checkpoint=middle, **FROM_PHOTOS)
+    assert len(starts) == (1 if step < 8 else 0)
     assert same(last_checkpoint(whole_from_photos), last_checkpoint(resumed)) == []
 
 

@@ -97,6 +97,7 @@ def test_warm_up_trains_no_code(train, scene):
 def test_codes_from_photos_say_at_once_what_noise_has_to_learn(train, scene):
     def clip_loss(start: str) -> float:
         settings = {"codes_from": start, "warm_up": 0.9, "semantic_ramp": 0.0}
+        settings["decoder__compression__steps"] = 40
         changes = {f"pipeline__model__{name}": value for name, value in settings.items()}
         changes["pipeline__datamanager__crops"] = "pyramid"  # the same targets from both starts
         return float(train(scene, iterations=20, **changes).pipeline.last_losses["clip"])

@@ -413,7 +413,7 @@ def test_a_slow_machine_draws_drafts_until_nothing_changes(page):
     picture(page)
     width = page.evaluate("document.querySelector('#frame canvas').width")
     draft = page.evaluate("""async () => {
-      lang3dxl.view.cost = 2e4;
+      lang3dxl.view.cost = 8e3;  // a draft for two seconds
       lang3dxl.view.wake();
       await new Promise(requestAnimationFrame);
       await new Promise(requestAnimationFrame);
@@ -513,14 +513,15 @@ def test_lightings_are_files_of_a_page_or_answers_of_a_server(monkeypatch):
 TWO_LIGHTINGS = """async () => {
   const look = document.getElementById("look"), names = [...look.options].map((one) => one.value);
   const { fetch } = window, wait = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds));
-  let delay = 1, shown = 0;
-  window.fetch = async (file) => (await wait(delay--), fetch(file));
+  const delays = [0.5, 0];
+  let shown = 0;
+  window.fetch = async (file) => (await wait(delays.shift()), fetch(file));
   lang3dxl.view.light = () => shown++;
   for (const name of names.filter(Boolean).slice(0, 2)) {
     look.value = name;
     look.dispatchEvent(new Event("change"));
   }
-  await wait(3);
+  await wait(1.5);
   return shown;
 }"""
 
