@@ -231,8 +231,9 @@ def test_a_host_open_to_others_needs_a_token(host):
 def test_beyond_this_machine_nothing_is_served_without_the_token(wide):
     for path in ("/", "/index.html", "/api/encode?text=x", "/?token=", "/?token=wrong", "/?token=%ff"):
         assert get(wide, path).status == 403
-    for cookie in (f"viewer-{wide.port}=wrong", "viewer=\x80;;="):
-        assert get(wide, "/", Cookie=cookie).status == 403
+    assert get(wide, "/", Cookie=f"viewer-{wide.port}=wrong").status == 403
+    with contextlib.suppress(http.client.RemoteDisconnected):  # so websockets 16.1 answers such a header
+        assert get(wide, "/", Cookie="viewer=\x80;;=").status == 403
     with pytest.raises(InvalidStatus, match="403"):
         session(wide)
 
