@@ -37,9 +37,10 @@ from lang3dxl_ns.scene.camera import Camera
 _LEAST_PART = 1e-4
 """Share of a photo below which a separate part of a mask is no label."""
 _NEAREST = Image.Resampling.NEAREST
-_USERS = dict.fromkeys(("title", "credit", "license"), "web scene_file")
-_USERS |= {"text": "out web", "not_": "out web", "look": "out web", "vocabulary": "web", "all": "out"}
-"""What the options of `export` affect; the others affect everything."""
+_READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
+_READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
+_READ_BY |= {"vocabulary": ("web",), "all": ("out",)}
+"""Targets of `export` that read an option. Options that are not listed are read by every target."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
@@ -247,8 +248,7 @@ class Export:
         targets = [name for name in ("out", "web", "scene_file") if getattr(self, name) is not None]
         if len(targets) != 1:
             raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
-        ignored = [n for n, users in _USERS.items() if getattr(self, n) and targets[0] not in users]
-        if ignored:
+        if ignored := [n for n, by in _READ_BY.items() if getattr(self, n) and targets[0] not in by]:
             option, target = (name.strip("_").replace("_", "-") for name in (ignored[0], targets[0]))
             raise UserError(f"--{option} has no effect on --{target}: leave it off")
         if self.index is not None and (self.out is None or not self.text):
