@@ -83,7 +83,9 @@ class EvaluateRun(_Scored):
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
 
     def main(self) -> None:
-        place = self.run or Path("outputs")
+        from lang3dxl_ns.query.run_file import OUTPUTS
+
+        place = self.run or OUTPUTS
         if place.suffix == ".scene" or (any(place.glob("*.scene")) and not (place / "config.yml").exists()):
             return self._score_scene(place)
         from lang3dxl_ns.plugin.trainer_config import open_run

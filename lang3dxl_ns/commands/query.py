@@ -128,8 +128,8 @@ class Query:
             say(f"{prompt.text}{' (taught)' if taught else ''}: {score:.2f} at {where}; {folder}{closest}")
             warnings = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
             say(*(f"  {advice}" for advice in warnings if advice))
-        old = sorted({p.parent.name for p in self.out.glob("*/*") if p.lstat().st_mtime_ns <= before})
-        if old:
+        ours = [*self.out.glob("*/*.npy"), *shared.glob("*.png")]  # a user may have other folders there
+        if old := sorted({path.parent.name for path in ours if path.lstat().st_mtime_ns <= before}):
             say(f"{self.out} still has files of an earlier query, not listed in query.json: {some(old)}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:

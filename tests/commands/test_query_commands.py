@@ -71,6 +71,8 @@ def test_without_a_view_the_best_one_is_taken(run, tmp_path):
 
 def test_files_of_an_earlier_query_stay_and_are_told(run, tmp_path, capsys):
     photo = ("--image", "all/0003.jpg", "--out", tmp_path)
+    (tmp_path / "holidays").mkdir()
+    (tmp_path / "holidays" / "list.txt").write_text("no file of a query")
     run("query", "c", "--text", "dome; window", *photo)
     run("query", "c", "--text", "dome; window", *photo)
     assert "earlier query" not in capsys.readouterr().out
