@@ -65,6 +65,17 @@ def _reason() -> str:
     return "it sees no device: check CUDA_VISIBLE_DEVICES"
 
 
+@functools.cache
+def multiplies_bfloat16() -> bool:
+    """Whether this machine's CPU does. Elsewhere bfloat16 is slower than float32."""
+    try:
+        from llvmlite.binding import get_host_cpu_features
+    except ImportError:
+        return False
+    features = get_host_cpu_features()
+    return bool(features.get("avx512bf16") or features.get("amx-bf16"))
+
+
 def in_full_precision(function: Function) -> Function:
     """Run a function outside autocast, with 16-bit tensor arguments widened to float32. This is for sums over
     thousands of pixels, differences of large numbers, and positions, which 16 bits would make wrong, not just

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
@@ -27,6 +28,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
@@ -110,15 +112,24 @@ class Lang3DXLTrainer(Trainer):
     _run_state: dict[str, Any] | None = None
 
     def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
-        """Set up mixed precision: bfloat16 where the GPU has it. Its range is float32's, so gradients need no
-        scale, and no step is lost or waits for one. Older GPUs (before Ampere) use float16 with a scale."""
-        super().__init__(config, local_rank, world_size)
+        """Set up mixed precision: bfloat16 where the hardware has it. Its range is float32's, so gradients
+        need no scale, and no step is lost or waits for one. Older GPUs (before Ampere) use float16 with a
+        scale. Raises UserError for a CPU without bfloat16, on which nerfstudio would ignore the setting."""
+        super().__init__(replace(config, mixed_precision=False), local_rank, world_size)
+        self.config, self.mixed_precision = config, config.mixed_precision
         self.stages = Stages({"prepare": 0.3, "train": 0.6, "words": 0.1})
         if self.mixed_precision:
-            wide = torch.cuda.is_bf16_supported(including_emulation=False)
-            torch.set_autocast_dtype("cuda", torch.bfloat16 if wide else torch.float16)
+            on_cpu = self.device == "cpu"
+            if on_cpu and not multiplies_bfloat16():
+                raise UserError("--mixed-precision True gains nothing: this CPU does not multiply bfloat16")
+            wide = on_cpu or torch.cuda.is_bf16_supported(including_emulation=False)
+            torch.set_autocast_dtype(config.machine.device_type, torch.bfloat16 if wide else torch.float16)
             self.use_grad_scaler = config.use_grad_scaler or not wide
             self.grad_scaler = GradScaler(enabled=self.use_grad_scaler)
+            if on_cpu:
+                CONSOLE.print(
+                    "It is enabled after all: this CPU multiplies bfloat16."
+                )  # after nerfstudio's line
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up, then seed, so that preparation does not affect the run's randomness. A scene description is

@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.dense_map import mean_of_sizes
 from lang3dxl_ns.preparation.families import (
@@ -320,19 +320,8 @@ def _resize(
 def _precision_of_images(device: torch.device) -> torch.autocast:
     """16 bits where the hardware multiplies them: float16 on a GPU, bfloat16 on some CPUs."""
     if device.type == "cpu":
-        return torch.autocast("cpu", dtype=torch.bfloat16, enabled=_multiplies_bfloat16())
+        return torch.autocast("cpu", dtype=torch.bfloat16, enabled=multiplies_bfloat16())
     return _half_precision_on_cuda(device)
-
-
-@cache
-def _multiplies_bfloat16() -> bool:
-    """Whether this machine's CPU does. Elsewhere bfloat16 is slower than float32."""
-    try:
-        from llvmlite.binding import get_host_cpu_features
-    except ImportError:
-        return False
-    features = get_host_cpu_features()
-    return bool(features.get("avx512bf16") or features.get("amx-bf16"))
 
 
 def _half_precision_on_cuda(device: torch.device) -> torch.autocast:

@@ -7,7 +7,9 @@ import torch
 from conftest import make_trainer
 
 import lab.baselines  # noqa: F401, which registers fmgs
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import METHODS, lang3dxl_paper
+from lang3dxl_ns.plugin import trainer as trainer_module
 from lang3dxl_ns.plugin.optimizers import RunSchedule
 
 ITERATIONS = 70_000
@@ -122,6 +124,25 @@ def trained(scene, tiny_clip, tiny_dense, tmp_path_factory):
     trainer.setup()
     trainer.train()
     return trainer
+
+
+def test_mixed_precision_trains_in_bfloat16_on_a_cpu_that_multiplies_it(
+    scene, tiny_clip, tiny_dense, tmp_path, monkeypatch
+):
+    def losses(multiplies: bool, **changes) -> torch.Tensor:
+        monkeypatch.setattr(trainer_module, "multiplies_bfloat16", lambda: multiplies)
+        changes |= {"pipeline__datamanager__regions": "none", "pipeline__model__downsampler__hidden": 16}
+        trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path, 2, method="lang3dxl-paper", **changes)
+        trainer.setup()
+        trainer.train()
+        assert not trainer.grad_scaler.is_enabled()
+        return torch.stack([trainer.pipeline.last_losses[name] for name in ("rgb", "clip", "dense")]).detach()
+
+    exact, mixed = losses(False), losses(True, mixed_precision=True)
+    assert (mixed != exact)[1:].all()
+    assert torch.allclose(mixed, exact, rtol=0.1)  # one step of Adam enlarges what rounding leaves
+    with pytest.raises(UserError, match="does not multiply bfloat16"):
+        losses(False, mixed_precision=True)
 
 
 def test_every_loss_of_the_paper_is_part_of_a_step(trained):

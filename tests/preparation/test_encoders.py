@@ -38,7 +38,7 @@ def test_bfloat16_changes_image_embeddings_by_two_of_its_roundings_at_most_and_t
     crops = torch.rand(9, 3, 48, 48, generator=torch.Generator().manual_seed(0))
     found = []
     for multiplies in (False, True):
-        monkeypatch.setattr(encoders, "_multiplies_bfloat16", lambda it=multiplies: it)
+        monkeypatch.setattr(encoders, "multiplies_bfloat16", lambda it=multiplies: it)
         found.append((clip.encode_images(crops), clip.encode_texts(["dome"])))
     (exact, text), (rounded, same) = found
     assert rounded.dtype == torch.float32 and torch.equal(text, same)

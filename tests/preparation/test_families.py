@@ -36,7 +36,7 @@ def load(folders, monkeypatch):
     """An encoder in full precision, and transformers' own model."""
     from transformers import AutoModel
 
-    monkeypatch.setattr(encoders, "_multiplies_bfloat16", lambda: False)
+    monkeypatch.setattr(encoders, "multiplies_bfloat16", lambda: False)
 
     def loaded(name: str) -> tuple[ImageTextEncoder, torch.nn.Module]:
         return load_image_text_encoder(folders(name), "cpu"), AutoModel.from_pretrained(folders(name)).eval()
@@ -204,7 +204,7 @@ def test_bfloat16_turns_features_by_a_few_degrees_at_most(load, name, monkeypatc
     encoder, _ = load(name)
     pictures = random_picture(3, 3, encoder.crop_size, encoder.crop_size)
     exact = encoder.encode_images(pictures), encoder.encode_patches(pictures)
-    monkeypatch.setattr(encoders, "_multiplies_bfloat16", lambda: True)
+    monkeypatch.setattr(encoders, "multiplies_bfloat16", lambda: True)
     for before, after in zip(
         exact, (encoder.encode_images(pictures), encoder.encode_patches(pictures)), strict=True
     ):

@@ -25,7 +25,7 @@ SIZES = 3
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A CLIP with a random head for windows of three sizes."""
-    monkeypatch.setattr(encoders, "_multiplies_bfloat16", lambda: False)
+    monkeypatch.setattr(encoders, "multiplies_bfloat16", lambda: False)
     clip = make_tiny_clip(tmp_path / "clip")
     channels, width = CLIPModel.from_pretrained(clip).visual_projection.weight.shape
     torch.manual_seed(0)
