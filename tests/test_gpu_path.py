@@ -154,7 +154,7 @@ def test_code_maps_are_decoded_at_five_sizes(default):
     model = default.pipeline.model
     sizes = set()
     for model.step in range(200):
-        sizes.add(model._random_size())
+        sizes.add(model.decoded_side)
     assert len(sizes) == 5
     assert (min(sizes), max(sizes)) == model.config.decode_size
 

@@ -20,7 +20,7 @@ from lab.benchmarks.interleaved import interleaved_times
 from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.common.image import fitted_size, resize_nearest
+from lang3dxl_ns.common.image import fitted_size
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, centered_cosine
@@ -31,7 +31,7 @@ from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldCo
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, gather
-from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.scene.camera import Camera, at_size
 
 CLIP = 512
 """Channels of the features whose cost is measured."""
@@ -157,7 +157,7 @@ def step(count: int, size: tuple[int, int], paper: bool = False, looks: bool = F
     optimizer = torch.optim.Adam([*parameters.values(), *networks], lr=1e-4)
     draw = torch.Generator().manual_seed(1)
     target = torch.rand(size[1], size[0], 3, generator=draw).cuda()
-    small = fitted_size(target, 120)
+    small = fitted_size(target.shape, 120)
     wanted = torch.randn(*small, CLIP, generator=draw).cuda()
     state: dict[str, Any] = {}
 
@@ -167,13 +167,16 @@ def step(count: int, size: tuple[int, int], paper: bool = False, looks: bool = F
         if looks:
             everything = torch.arange(count, device=colors.device)
             colors, gaussians = look(gaussians, colors, look.vector("photo"), everything, 0)
-        state["drawn"] = rasterize(gaussians, camera, colors, features=parameters.get("codes"))
+        state["photo"] = rasterize(gaussians, camera, colors).image
+        if paper:
+            at_fewer = at_size(camera, *small)
+            blur = 0.3 * small[0] * small[1] / (size[0] * size[1])
+            state["codes"] = rasterize(gaussians, at_fewer, parameters["codes"], eps2d=blur).image
 
     def loss() -> None:
-        state["loss"] = rgb_loss(state["drawn"].image, target)
+        state["loss"] = rgb_loss(state["photo"], target)
         if paper:
-            decoded = field.decode_clip(resize_nearest(state["drawn"].features, small))
-            state["loss"] = state["loss"] + (decoded - wanted).abs().mean()
+            state["loss"] = state["loss"] + (field.decode_clip(state["codes"]) - wanted).abs().mean()
 
     work = {"render": render, "loss": loss, "backward": lambda: state["loss"].backward()}
     torch.cuda.reset_peak_memory_stats()
@@ -273,10 +276,10 @@ def times_of_parts(parts: dict[str, Callable[[], object]], repeats: int = 20) ->
 def still(count: int, size: tuple[int, int], prompts: int) -> dict[str, float]:
     """Milliseconds of a frame with heat maps of some prompts, and the peak of its memory, GB."""
     raw, camera = cloud(count, size)
-    heat = raw["colors"][:, :1].sigmoid().expand(-1, prompts).contiguous() if prompts else None
     torch.cuda.reset_peak_memory_stats()
     gaussians, colors = _gaussians(raw), raw["colors"].sigmoid()
-    frame = lambda: rasterize(gaussians, camera, colors, features=heat, render_depth=True)  # noqa: E731
+    carried = torch.cat([colors, colors[:, :1].expand(-1, prompts)], dim=1)
+    frame = lambda: rasterize(gaussians, camera, carried, render_depth=True)  # noqa: E731
     seconds = median(interleaved_times({"frame": frame}, repeats=20)["frame"])
     return {"frame": 1e3 * seconds, "memory (GB)": torch.cuda.max_memory_allocated() / 1e9}
 

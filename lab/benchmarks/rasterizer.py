@@ -39,10 +39,12 @@ from lab.reports import command_line
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
-from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering import rasterize
 from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.scene.camera import Camera, at_size
 
 OURS, TORCH, DENSE, GSPLAT = "lang3dxl", "torch kernels", "dense tiles", "gsplat"
 """Methods that can be compared."""
@@ -98,7 +100,8 @@ def error_against(
 
 
 def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
-    """Forward and backward of colors with and without features, in one pass and in two."""
+    """Forward and backward of colors with and without features: in one pass, in a second one, and in a second
+    one at a fifth of the size, in which training draws what it decodes."""
     gaussians, camera, background = problem.gaussians, problem.camera, problem.background[:COLORS]
     colors, features = (
         part.clone().requires_grad_()
@@ -106,28 +109,29 @@ def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
     )
     color_gradient, feature_gradient = problem.image_gradient.split([COLORS, CHANNELS - COLORS], dim=2)
     leaves = (*problem.leaves[:-1], colors, features)
+    small = at_size(camera, -(-camera.height // 5), -(-camera.width // 5))
+    blur = 0.3 * small.width * small.height / (camera.width * camera.height)
 
-    def one_pass(detach: bool) -> object:
-        result = rasterize(gaussians, camera, colors, background, features=features, detach_features=detach)
-        outputs: Any = (result.image, result.alpha, result.features)
-        return torch.autograd.grad(
-            outputs, leaves, (color_gradient, problem.alpha_gradient, feature_gradient)
-        )
+    def one_pass() -> object:
+        black = torch.zeros(CHANNELS - COLORS).to(background)
+        values = torch.cat([colors, features], dim=1)
+        result = rasterize(gaussians, camera, values, torch.cat([background, black]))
+        upstream = problem.image_gradient, problem.alpha_gradient
+        return torch.autograd.grad((result.image, result.alpha), leaves, upstream)
 
-    def passes(second: Gaussians | None) -> object:
+    def passes(second: Camera | None, eps2d: float = 0.3) -> object:
         first = rasterize(gaussians, camera, colors, background)
         outputs, upstream = [first.image, first.alpha], [color_gradient, problem.alpha_gradient]
         if second is not None:
-            outputs.append(rasterize(second, camera, features).image)
-            upstream.append(feature_gradient)
+            outputs.append(rasterize(gaussians, second, features, eps2d=eps2d).image)
+            upstream.append(resize_nearest(feature_gradient, (second.height, second.width)))
         return torch.autograd.grad(outputs, leaves, upstream, allow_unused=True)
 
     return {
         "colors alone": lambda: passes(None),
-        "one pass, features detached": lambda: one_pass(True),
-        "one pass, features move the geometry": lambda: one_pass(False),
-        "two passes, features detached": lambda: passes(gaussians.detach()),
-        "two passes, features move the geometry": lambda: passes(gaussians),
+        "features in one pass": one_pass,
+        "features in a second pass": lambda: passes(camera),
+        "features in a small second pass": lambda: passes(small, blur),
     }
 
 

@@ -22,8 +22,6 @@ def rasterize_reference(
     channels: Float[Tensor, "n c"],
     background: Float[Tensor, " c"] | None = None,
     *,
-    features: Float[Tensor, "n d"] | None = None,
-    detach_features: bool = True,
     render_depth: bool = False,
     antialiased: bool = False,
     near: float = 0.01,
@@ -38,18 +36,16 @@ def rasterize_reference(
         opacities = opacities * sharp * torch.linalg.det(whitening).abs()
     order = torch.argsort(depths, stable=True)
     order = order[depths[order] > near]
-    attached = torch.cat([channels, torch.ones_like(depths)[:, None], depths[:, None]], dim=1)
-    detached = channels[:, :0] if features is None else features
-    maps, detached_maps = composite_reference(
-        means2d[order], whitening[order], opacities[order], attached[order], detached[order],
-        camera.width, camera.height, detach=detach_features,
-    )  # fmt: skip
+    values = torch.cat([channels, torch.ones_like(depths)[:, None], depths[:, None]], dim=1)
+    maps = composite_reference(
+        means2d[order], whitening[order], opacities[order], values[order], camera.width, camera.height
+    )
 
     image, alpha, depth = maps.split([channels.shape[1], 1, 1], dim=2)
     if background is not None:
         image = image + (1 - alpha) * background
     expected_depth = torch.where(alpha > 0, depth / alpha.clamp_min(1e-12), 0.0) if render_depth else None
-    return Raster(image, None if features is None else detached_maps, alpha, expected_depth)
+    return Raster(image, alpha, expected_depth)
 
 
 def project_reference(
@@ -93,33 +89,25 @@ def composite_reference(
     means2d: Float[Tensor, "n 2"],
     whitening: Float[Tensor, "n 2 2"],
     opacities: Float[Tensor, " n"],
-    attached: Float[Tensor, "n c"],
-    detached: Float[Tensor, "n d"],
+    values: Float[Tensor, "n c"],
     width: int,
     height: int,
-    *,
-    detach: bool,
-) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w d"]]:
-    """Composite Gaussians that are sorted front to back over black.
-
-    With `detach`, the gradient of the second map reaches only `detached`.
-    """
+) -> Float[Tensor, "h w c"]:
+    """Composite Gaussians that are sorted front to back over black."""
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     pixels = torch.stack([x, y], dim=-1).view(-1, 2).to(means2d)
 
-    def block_maps(block: Tensor, *splats: Tensor) -> tuple[Tensor, Tensor]:
-        weights = pixel_weights(block, *splats[:3])
-        return weights @ splats[3], (weights.detach() if detach else weights) @ splats[4]
+    def block_maps(block: Tensor, *splats: Tensor) -> Tensor:
+        return pixel_weights(block, *splats[:3]) @ splats[3]
 
     maps = []
     for block in pixels.split(PIXELS_AT_A_TIME):
         # Dropping Gaussians skipped in every pixel of the block changes nothing and saves memory.
         with torch.no_grad():
             used = (pixel_alphas(block, means2d, whitening, opacities) > 0).any(0)
-        splats = [value[used] for value in (means2d, whitening, opacities, attached, detached)]
+        splats = [value[used] for value in (means2d, whitening, opacities, values)]
         maps.append(checkpoint(block_maps, block, *splats, use_reentrant=False))
-    first, second = (torch.cat(parts) for parts in zip(*maps, strict=True))
-    return first.view(height, width, -1), second.view(height, width, second.shape[1])
+    return torch.cat(maps).view(height, width, -1)
 
 
 def pixel_weights(

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
 
-def fitted_size(codes: Float[Tensor, "H W 3"], longer_side: int) -> tuple[int, int]:
-    """Compute rows and columns of a map of at most `longer_side` pixels."""
-    height, width = codes.shape[:2]
+def fitted_size(shape: Sequence[int], longer_side: int) -> tuple[int, int]:
+    """Compute rows and columns of a map of at most `longer_side` pixels, from those of a larger one."""
+    height, width = shape[:2]
     scale = min(longer_side / max(height, width), 1.0)
     return max(round(height * scale), 1), max(round(width * scale), 1)
 

@@ -42,8 +42,6 @@ from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import Batch
 
-DECODE_SIZES = 5
-"""Number of sizes at which code maps are decoded in training."""
 LONGER_SIDE = 1_600
 """Longer side in pixels to which larger photos are reduced for gathering: a CLIP crop covers hundreds of
 pixels, and time and memory grow with their number."""
@@ -168,8 +166,7 @@ class Lang3DXLModel(RenderingModel):
         c = self.config
         assert c.dense_weight is not None
         ramp = semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
-        size = fitted_size(codes, self._random_size())
-        clip, dense, small_mask = self._decode_small(codes, mask, size)
+        clip, dense, small_mask = self._decode_small(codes, mask, (codes.shape[0], codes.shape[1]))
         assert self.semantic_field is not None and self.downsampler is not None
         with part("downsample"):
             predicted, target, weight = self.downsampler.match(
@@ -195,15 +192,6 @@ class Lang3DXLModel(RenderingModel):
         with part("decode"):
             clip, dense = self.semantic_field(resize_nearest(codes, size))
         return clip, dense, None if mask is None else resize_nearest(mask, size)
-
-    def _random_size(self) -> int:
-        """Draw the longer side at which this iteration decodes. It is one of a few, since a GPU's libraries
-        prepare for every new size, and the same after a resume."""
-        assert self.config.decode_size is not None
-        smallest, largest = self.config.decode_size
-        generator = torch.Generator().manual_seed(self.step)
-        place = int(torch.randint(DECODE_SIZES, (), generator=generator)) / (DECODE_SIZES - 1)
-        return round(smallest + place * (largest - smallest))
 
     def get_metrics_dict(self, outputs: dict, batch: Batch) -> dict[str, Tensor]:
         """Compute numbers for the log: PSNR of the step's photo, and the number of Gaussians."""
@@ -271,12 +259,12 @@ class Lang3DXLModel(RenderingModel):
         assert decoder is not None and carried is not None
         if not decoder.per_gaussian:
             codes = self.composite(camera, carried)
-            return self._decode_small(codes, mask, fitted_size(codes, longer_side))
+            return self._decode_small(codes, mask, fitted_size(codes.shape, longer_side))
         # The last layer is linear, so hidden activations are composited and divided by coverage.
         known = carried.isfinite().all(1, keepdim=True)
         hidden = torch.where(known, decoder.hidden(torch.where(known, carried, 0.0)), 0.0)
         maps = self.composite(camera, torch.cat([hidden, known.to(hidden)], dim=1))
-        size = fitted_size(maps, longer_side)
+        size = fitted_size(maps.shape, longer_side)
         maps = resize_nearest(maps, size)
         clip, head = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3), decoder.clip_head()
         small_mask = None if mask is None else resize_nearest(mask, size)

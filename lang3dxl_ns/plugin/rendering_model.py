@@ -16,6 +16,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.common.image import fitted_size
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
@@ -36,7 +37,10 @@ from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 from lang3dxl_ns.rendering.splats import harmonics_of
-from lang3dxl_ns.scene.camera import in_view
+from lang3dxl_ns.scene.camera import at_size, in_view
+
+DECODE_SIZES = 5
+"""Number of sizes at which what Gaussians carry is drawn and decoded in training."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +214,7 @@ class RenderingModel(SplatfactoModel):
     def _training_outputs(self, camera: Cameras) -> dict[str, Tensor]:
         carried = self.carried if self.learns_from_renderings and self._warm_up_is_over else None
         with part("render"):
-            raster, background = self._raster(camera, carried)
+            raster, background, codes = self._raster(camera, carried)
         if self.means.requires_grad:
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, raster.info
@@ -220,7 +224,7 @@ class RenderingModel(SplatfactoModel):
             "accumulation": raster.alpha,
             "background": background,
         }
-        return outputs if raster.features is None else outputs | {"codes": raster.features}
+        return outputs if codes is None else outputs | {"codes": codes}
 
     @property
     def _warm_up_is_over(self) -> bool:
@@ -247,8 +251,11 @@ class RenderingModel(SplatfactoModel):
         scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
         return Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1))
 
-    def _raster(self, camera: Cameras, features: Tensor | None) -> tuple[Raster, Float[Tensor, "3"]]:
-        """Render a training step, with gradients."""
+    def _raster(
+        self, camera: Cameras, carried: Tensor | None
+    ) -> tuple[Raster, Float[Tensor, "3"], Float[Tensor, "h w d"] | None]:
+        """Render a training step, with gradients: the photo, its background, and what Gaussians carry, at the
+        size that the step decodes."""
         g, pose = self.gauss_params, self._pose(camera)
         view, pose = to_rasterizer(camera, pose), to_device(pose, self.device)
         background = self._get_background_color()
@@ -265,18 +272,29 @@ class RenderingModel(SplatfactoModel):
                 colors, in_photo = self.appearance(gaussians, colors, vector, visible, self.step)
         antialiased = self.config.rasterize_mode == "antialiased"
         settings: dict[str, Any] = {"backend": self.backend, "antialiased": antialiased}
-        moves = self.config.feature_gradient_to_geometry
-        together = None if moves or in_photo is not gaussians else features
-        photo = rasterize(in_photo.seen_from(view), view, colors, background, features=together, **settings)
-        if features is None or together is features:
-            return photo, background
-        # Semantics and coverage belong to the scene, not to a photo, so they keep the scene's opacities.
-        if moves:
+        photo = rasterize(in_photo.seen_from(view), view, colors, background, **settings)
+        if carried is None:
+            return photo, background, None
+        # Semantics belong to the scene, not to a photo, so they keep the scene's opacities.
+        if self.config.feature_gradient_to_geometry:
             gaussians = replace(gaussians, opacities=gaussians.opacities.detach())
         else:
             gaussians, view = gaussians.detach(), view.detach()
-        scene = rasterize(gaussians.seen_from(view), view, features, **settings)
-        return replace(photo, features=scene.image, alpha=scene.alpha), background
+        # A photo has many times the pixels that are decoded. The same ellipses are drawn at these alone.
+        small = at_size(view, *fitted_size((view.height, view.width), self.decoded_side))
+        blur = 0.3 * small.width * small.height / (view.width * view.height)
+        codes = rasterize(gaussians.seen_from(view), small, carried, eps2d=blur, **settings).image
+        return photo, background, codes
+
+    @property
+    def decoded_side(self) -> int:
+        """The longer side at which this iteration decodes: one of a few, since a GPU's libraries prepare for
+        every new size, and the same after a resume."""
+        assert self.config.decode_size is not None
+        smallest, largest = self.config.decode_size
+        generator = torch.Generator().manual_seed(self.step)
+        place = int(torch.randint(DECODE_SIZES, (), generator=generator)) / (DECODE_SIZES - 1)
+        return round(smallest + place * (largest - smallest))
 
     def _vector(self, camera: Cameras, pose: Float[Tensor, "3 4"]) -> Float[Tensor, " v"]:
         """Return the training photo's appearance vector, or for other views the one that the rule chooses."""

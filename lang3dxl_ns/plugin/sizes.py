@@ -35,7 +35,7 @@ def bytes_of(model: Lang3DXLModel, pixels: int) -> tuple[float, float]:
     words = WORDS if model.semantic_field is not None and model.semantic_field.needs_lifting else 0.0
     codes = model.gauss_params.get("codes") if model.learns_from_renderings else None
     of_codes = 0.0 if codes is None else PER_CODE * codes.shape[1]
-    fixed = PER_PARAMETER * others + max((PER_PIXEL + of_codes) * pixels, words)
+    fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words)
     looks = 0.0 if model.appearance is None else PER_LOOK
     return fixed, PER_PARAMETER * numbers + PER_GAUSSIAN + of_codes + looks
 

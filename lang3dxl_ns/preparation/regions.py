@@ -199,4 +199,4 @@ def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
 
 def _shrunk(image: Float[Tensor, "h w 3"], longer_side: int) -> Float[Tensor, "hs ws 3"]:
     """Average an image down to at most `longer_side` pixels, and return it on the CPU."""
-    return resize(image, fitted_size(image, longer_side)).contiguous().clamp(0, 1).cpu()
+    return resize(image, fitted_size(image.shape, longer_side)).contiguous().clamp(0, 1).cpu()

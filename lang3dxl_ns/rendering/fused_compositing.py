@@ -55,9 +55,9 @@ class FusedCompositing(torch.autograd.Function):
     """Compositing as in `torch_rasterizer.Compositing`, compiled. The variances get no gradient."""
 
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
-        plan, (means2d, conics, opacities, channels, detached, *_) = make_plan(*inputs), inputs
-        ctx.sizes = channels.shape[1], detached.shape[1], 1
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        plan, (means2d, conics, opacities, channels, *_) = make_plan(*inputs), inputs
+        ctx.sizes = channels.shape[1], 1
         maps = tuple(channels.new_empty(plan.height, plan.width, size) for size in ctx.sizes)
         rows, keep = np.diff(plan.starts), any(ctx.needs_input_grad)
         waves = -(-rows // WAVE) if keep else np.zeros_like(rows)
@@ -69,7 +69,7 @@ class FusedCompositing(torch.autograd.Function):
         ctx.save_for_backward(means2d, conics, opacities)
         ctx.set_materialize_grads(False)
         ctx.plan, ctx.trace = plan, trace
-        return maps[0], maps[1], maps[2]
+        return maps[0], maps[1]
 
     @staticmethod
     @once_differentiable
@@ -89,7 +89,7 @@ class FusedCompositing(torch.autograd.Function):
         sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
         in_threads(backward_tiles, [(tiles, plan, maps, ctx.trace, sums[k]) for k, tiles in enumerate(dealt)])
         found = [torch.zeros_like(part) for part in (positions, conics, opacities)]
-        found += [opacities.new_zeros(len(opacities), size) for size in ctx.sizes[:2]]
+        found.append(opacities.new_zeros(len(opacities), ctx.sizes[0]))
         arrays = plan, conics.numpy(), opacities.numpy(), sums, _Gradients(*(g.numpy() for g in found))
         in_threads(_collect, [(*part, *arrays) for part in ranges(len(plan.order), least=4096)])
         return found[0].view_as(means2d), *found[1:], *[None] * 4
@@ -102,7 +102,6 @@ class _Gradients(NamedTuple):
     conic: Float[np.ndarray, "n 3"]
     opacity: Float[np.ndarray, " n"]
     channels: Float[np.ndarray, "n c"]
-    detached: Float[np.ndarray, "n d"]
 
 
 def _parts(work: np.ndarray) -> list[np.ndarray]:
@@ -130,8 +129,6 @@ def _collect(first, last, plan, conics, opacities, sums, found) -> None:
         found.opacity[g] = row[5] / opacities[g]
         for k in range(found.channels.shape[1]):
             found.channels[g, k] = row[CHANNELS_FROM + k]
-        for k in range(found.detached.shape[1]):
-            found.detached[g, k] = row[CHANNELS_FROM + plan.attached + k]
 
 
 class Plan(NamedTuple):
@@ -141,10 +138,7 @@ class Plan(NamedTuple):
     """Indices of the Gaussians, front to back."""
     splats: Float[np.ndarray, "v 6"]
     table: Float[np.ndarray, "v c"]
-    """Channels with a gradient to the geometry, a one for alpha, and zeros up to a multiple of four; then the
-    detached channels, padded likewise."""
-    attached: int
-    """Number of columns of the table before the detached ones."""
+    """Channels, a one for alpha, and zeros up to a multiple of four."""
     starts: Int[np.ndarray, " tiles+1"]
     """First row of each tile."""
     ranks: Int[np.ndarray, " rows"]
@@ -158,7 +152,6 @@ def make_plan(
     conics: Float[Tensor, "n 3"],
     opacities: Float[Tensor, " n"],
     channels: Float[Tensor, "n c"],
-    detached: Float[Tensor, "n d"],
     variances: Float[Tensor, "n 2"],
     depths: Float[Tensor, " n"],
     width: int,
@@ -166,9 +159,8 @@ def make_plan(
 ) -> Plan:
     """Find the Gaussians that reach 1/255 in some pixel, and sort them by depth and into tiles."""
     columns, rows = -(-width // TILE), -(-height // TILE)
-    positions, form, spread, opacity, attached_channels, detached_channels = (
-        part.detach().contiguous().numpy()
-        for part in (means2d[0], conics, variances, opacities, channels, detached)
+    positions, form, spread, opacity, values = (
+        part.detach().contiguous().numpy() for part in (means2d[0], conics, variances, opacities, channels)
     )
     boxes = np.empty((len(opacities), 4), np.int32)
     visible = np.empty(len(opacities), np.int64)
@@ -176,10 +168,9 @@ def make_plan(
     seen = torch.from_numpy(visible[:count])
     order = seen.index_select(0, depth_order(depths.detach().index_select(0, seen))).numpy()
 
-    attached = _rounded_up(channels.shape[1] + 1)
     splats = np.empty((count, SPLAT_COLUMNS), positions.dtype)
-    table = np.empty((count, attached + _rounded_up(detached.shape[1])), positions.dtype)
-    arrays = order, positions, form, spread, opacity, attached_channels, detached_channels, attached
+    table = np.empty((count, -(-(channels.shape[1] + 1) // UNROLL) * UNROLL), positions.dtype)
+    arrays = order, positions, form, spread, opacity, values
     in_threads(_pack, [(*part, *arrays, splats, table) for part in ranges(count, least=4096)])
 
     sizes = np.zeros(columns * rows + 1, np.int64)
@@ -188,17 +179,13 @@ def make_plan(
     starts = np.cumsum(sizes)
     ranks = np.empty(starts[-1], np.int32)
     in_threads(_fill_rows, [(order, boxes, columns, *band, starts, ranks) for band in bands])
-    return Plan(order, splats, table, attached, starts, ranks, width, height)
+    return Plan(order, splats, table, starts, ranks, width, height)
 
 
 def depth_order(depths: Float[Tensor, " v"]) -> Int[Tensor, " v"]:
     """Return indices front to back. Positive floats sort like their bits, and integers have a radix sort."""
     keys = depths.view(torch.int32) if depths.dtype == torch.float32 else depths
     return torch.sort(keys, stable=True).indices
-
-
-def _rounded_up(count: int) -> int:
-    return -(-count // UNROLL) * UNROLL
 
 
 @kernel
@@ -230,9 +217,7 @@ def _find_visible(means2d, variances, opacities, width, height, boxes, visible):
 
 
 @kernel
-def _pack(
-    first, last, order, means2d, conics, variances, opacities, channels, detached, attached, splats, table
-) -> None:
+def _pack(first, last, order, means2d, conics, variances, opacities, channels, splats, table) -> None:
     """Gather the compositing data of a range of Gaussians, contiguous and in depth order."""
     for rank in range(first, last):
         g = order[rank]
@@ -246,8 +231,6 @@ def _pack(
         for c in range(channels.shape[1]):
             table[rank, c] = channels[g, c]
         table[rank, channels.shape[1]] = 1
-        for c in range(detached.shape[1]):
-            table[rank, attached + c] = detached[g, c]
 
 
 @kernel

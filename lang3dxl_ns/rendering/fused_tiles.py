@@ -52,7 +52,6 @@ class Maps(NamedTuple):
     """Composited maps, or their gradients."""
 
     image: Float[np.ndarray, "h w c"]
-    features: Float[np.ndarray, "h w d"]
     alphas: Float[np.ndarray, "h w 1"]
 
 
@@ -181,7 +180,7 @@ def _blend(transmittance, at, alpha):
 @kernel
 def composite_tiles(tiles, plan, maps, trace, keep):
     """Composite some tiles of a `Plan` into the maps. `keep` also fills the trace for a backward pass."""
-    channels, features_from = plan.table.shape[1], plan.attached
+    channels = plan.table.shape[1]
     transmittance, sums = _aligned(PIXELS, plan.splats), _aligned(channels * PIXELS, plan.splats)
     across, down, lines = _pixel_centers(plan.splats)
     masks = np.empty(WAVE, np.int64)
@@ -225,8 +224,6 @@ def composite_tiles(tiles, plan, maps, trace, keep):
                 for c in range(colors):
                     maps.image[py, px, c] = sums[c * LANES + at]
                 maps.alphas[py, px, 0] = sums[colors * LANES + at]
-                for c in range(maps.features.shape[2]):
-                    maps.features[py, px, c] = sums[(features_from + c) * LANES + at]
 
 
 @kernel
@@ -299,15 +296,13 @@ def _read_upstream(plan, maps, corner_x, corner_y, upstream):
         for c in range(colors):
             upstream[c * LANES + at] = maps.image[py, px, c] if within else 0
         upstream[colors * LANES + at] = maps.alphas[py, px, 0] if within else 0
-        for c in range(maps.features.shape[2]):
-            upstream[(plan.attached + c) * LANES + at] = maps.features[py, px, c] if within else 0
 
 
 @numba.njit(forceinline=True)
 def _add_values(plan, upstream, rank, first, last, found):
-    """Compute Σ channel × upstream of a row, over the channels that have a gradient to the geometry."""
+    """Compute Σ channel × upstream of a row."""
     channels = plan.table.shape[1]
-    for c in range(0, plan.attached, UNROLL):
+    for c in range(0, channels, UNROLL):
         column = rank * channels + c
         for slot in range(first, last):
             at = entry(found.places, slot) * channels + c * LANES

@@ -95,8 +95,6 @@ class Raster:
 
     image: Float[Tensor, "h w c"]
     """Channels composited over the background."""
-    features: Float[Tensor, "h w d"] | None
-    """Features composited over black, not divided by alpha."""
     alpha: Float[Tensor, "h w 1"]
     """Accumulated opacity, 0…1."""
     depth: Float[Tensor, "h w 1"] | None

@@ -29,8 +29,6 @@ def rasterize(
     channels: Float[Tensor, "n c"],
     background: Float[Tensor, " c"] | None = None,
     *,
-    features: Float[Tensor, "n d"] | None = None,
-    detach_features: bool = True,
     render_depth: bool = False,
     antialiased: bool = False,
     near: float = 0.01,
@@ -39,17 +37,15 @@ def rasterize(
 ) -> Raster:
     """Render Gaussians by alpha compositing (3D Gaussian Splatting, Kerbl et al. 2023; gsplat's rules).
 
-    The result is differentiable in the Gaussians, channels, features, background and the camera's view
-    matrix. Gaussians with a NaN or infinite value, also in their channels or features, are not rendered and
-    get no gradient, because one would spoil every pixel of its tiles.
+    The result is differentiable in the Gaussians, channels, background and the camera's view matrix.
+    Gaussians with a NaN or infinite value, also in their channels, are not rendered and get no gradient,
+    because one would spoil every pixel of its tiles.
 
     Args:
         gaussians: the Gaussians, world frame.
         camera: where to render them from.
         channels: values to composite over the background, such as activated colors.
         background: one value per channel; black by default.
-        features: values composited over black, not divided by alpha.
-        detach_features: the features' gradient reaches only `features`, not geometry or opacity.
         render_depth: also render the expected depth, world units.
         antialiased: dim small Gaussians by what the screen-space blur adds to their area.
         near: Gaussians with centers nearer than this are left out, world units.
@@ -63,7 +59,7 @@ def rasterize(
             a GPU the check would force a synchronization).
         UserError: gsplat was requested but is not available.
     """
-    _check_sizes(gaussians, channels, background, features)
+    _check_sizes(gaussians, channels, background)
     parts = camera.view_matrix, camera.intrinsics
     if not all(part.is_cuda or bool(part.isfinite().all()) for part in parts):
         raise ValueError("the camera has a NaN or infinite value: nothing can be rendered from it")
@@ -76,26 +72,15 @@ def rasterize(
     # gsplat's kernels cannot be launched on empty input.
     by_gsplat = backend == "gsplat" and len(channels) > 0
     composite = _composite_with_gsplat if by_gsplat else partial(_composite, backend)
-    if by_gsplat and not torch.is_grad_enabled():
-        detach_features = False  # spares a second pass
-    gaussians, channels, features = _without_broken(gaussians, channels, features)
+    gaussians, channels = _without_broken(gaussians, channels)
     camera, place = camera.at_origin(gaussians.means)
-    attached, detached, sizes = channels, channels[:, :0], [channels.shape[1]]
-    if features is not None and detach_features:
-        detached = features
-    elif features is not None:
-        attached = torch.cat([channels, features], dim=1)
-        sizes.append(features.shape[1])
-    maps, detached_map, alpha, info = composite(
-        gaussians.moved(-place), camera, attached, detached,
+    maps, alpha, info = composite(
+        gaussians.moved(-place), camera, channels,
         depth=render_depth, antialiased=antialiased, near=near, eps2d=eps2d,
     )  # fmt: skip
-    image, *others = maps.split([*sizes, 1] if render_depth else sizes, dim=2)
-    depth = others.pop() / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None
-    feature_map = None
-    if features is not None:
-        feature_map = detached_map if detach_features else others[0]
-    return Raster(image + (1 - alpha) * background, feature_map, alpha, depth, info)
+    depth = maps[..., -1:] / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None
+    image = maps[..., : channels.shape[1]] + (1 - alpha) * background
+    return Raster(image, alpha, depth, info)
 
 
 def _best_backend(means: Tensor) -> Backend:
@@ -105,34 +90,27 @@ def _best_backend(means: Tensor) -> Backend:
 
 
 def _without_broken(
-    gaussians: Gaussians, channels: Float[Tensor, "n c"], features: Float[Tensor, "n d"] | None
-) -> tuple[Gaussians, Float[Tensor, "n c"], Float[Tensor, "n d"] | None]:
+    gaussians: Gaussians, channels: Float[Tensor, "n c"]
+) -> tuple[Gaussians, Float[Tensor, "n c"]]:
     """Make Gaussians with a NaN or infinite value transparent and black, without gradient."""
     g = gaussians
     with torch.no_grad():
         total = g.means.sum(1) + g.quats.sum(1) + g.scales.sum(1) + g.opacities + channels.sum(1)
-        if features is not None:
-            total = total + features.sum(1)
         sound = torch.isfinite(total)
     # On a GPU, checking would force a synchronization, which costs more than cleaning unconditionally.
     if not sound.is_cuda and bool(sound.all()):
-        return gaussians, channels, features
+        return gaussians, channels
 
     def clean(values: Tensor) -> Tensor:
         return torch.where(sound.view(-1, *[1] * (values.dim() - 1)), values, 0.0)
 
-    features = None if features is None else clean(features)
-    return gaussians.mapped(clean), clean(channels), features
+    return gaussians.mapped(clean), clean(channels)
 
 
-def _check_sizes(
-    gaussians: Gaussians, channels: Tensor, background: Tensor | None, features: Tensor | None
-) -> None:
+def _check_sizes(gaussians: Gaussians, channels: Tensor, background: Tensor | None) -> None:
     count = len(gaussians.means)
     parts = {"channels": channels, **vars(gaussians)}
     sizes = {name: len(part) for name, part in parts.items() if isinstance(part, Tensor)}
-    if features is not None:
-        sizes["features"] = len(features)
     wrong = {name: size for name, size in sizes.items() if size != count}
     if wrong:
         raise ValueError(f"there are {count} means, but {wrong}")
@@ -144,15 +122,14 @@ def _composite(
     backend: Backend,
     gaussians: Gaussians,
     camera: Camera,
-    attached: Float[Tensor, "n c"],
-    detached: Float[Tensor, "n d"],
+    channels: Float[Tensor, "n c"],
     depth: bool,
     antialiased: bool,
     near: float,
     eps2d: float,
-) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
-    """Composite channels over black: those with a gradient to the geometry (then the depth, if requested),
-    those without, and alpha, [h, w, …] each. The last value is `Raster.info`."""
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Composite channels (then the depth, if requested) over black, and alpha, [h, w, …] each. The last value
+    is `Raster.info`."""
     to_screen: Callable[..., Ellipses] = project
     compositing: type[torch.autograd.Function] = Compositing
     if backend == "numba":
@@ -161,42 +138,34 @@ def _composite(
 
         to_screen, compositing = fused_project, FusedCompositing
     ellipses = to_screen(gaussians, camera, near=near, eps2d=eps2d, antialiased=antialiased)
-    maps, detached_map, alpha = compositing.apply(
+    maps, alpha = compositing.apply(
         ellipses.means2d, ellipses.conics, ellipses.opacities,
-        torch.cat([attached, ellipses.depths[:, None]], dim=1) if depth else attached, detached,
+        torch.cat([channels, ellipses.depths[:, None]], dim=1) if depth else channels,
         ellipses.variances, ellipses.depths, camera.width, camera.height,
     )  # fmt: skip
     info = {"width": camera.width, "height": camera.height, "n_cameras": 1, "gaussian_ids": None}
-    return maps, detached_map, alpha, {**info, "radii": ellipses.radii, "means2d": ellipses.means2d}
+    return maps, alpha, {**info, "radii": ellipses.radii, "means2d": ellipses.means2d}
 
 
 def _composite_with_gsplat(
     gaussians: Gaussians,
     camera: Camera,
-    attached: Float[Tensor, "n c"],
-    detached: Float[Tensor, "n d"],
+    channels: Float[Tensor, "n c"],
     depth: bool,
     antialiased: bool,
     near: float,
     eps2d: float,
-) -> tuple[Tensor, Tensor, Tensor, dict[str, Any]]:
-    """Composite like `_composite` by gsplat's kernels, in float32; detached channels in a second pass."""
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Composite like `_composite` by gsplat's kernels, in float32."""
     from gsplat import rasterization
 
-    def render(g: Gaussians, camera: Camera, channels: Tensor, mode: str) -> tuple[Tensor, Tensor, dict]:
-        device = g.means.device
-        maps, alpha, info = rasterization(
-            means=g.means.float(), quats=g.quats.float(), scales=g.scales.float(),
-            opacities=g.opacities.float(), colors=channels.float(),
-            viewmats=to_device(camera.view_matrix, device).float()[None],
-            Ks=to_device(camera.intrinsics, device).float()[None], width=camera.width, height=camera.height,
-            packed=False, near_plane=near, eps2d=eps2d, render_mode=mode,
-            rasterize_mode="antialiased" if antialiased else "classic",
-        )  # fmt: skip
-        return maps[0], alpha[0], info
-
-    maps, alpha, info = render(gaussians, camera, attached, "RGB+D" if depth else "RGB")
-    detached_map = maps[..., :0]
-    if detached.shape[1]:
-        detached_map, _, _ = render(gaussians.detach(), camera.detach(), detached, "RGB")
-    return maps, detached_map, alpha, {key: info[key] for key in _STRATEGY_KEYS}
+    device = gaussians.means.device
+    maps, alpha, info = rasterization(
+        means=gaussians.means.float(), quats=gaussians.quats.float(), scales=gaussians.scales.float(),
+        opacities=gaussians.opacities.float(), colors=channels.float(),
+        viewmats=to_device(camera.view_matrix, device).float()[None],
+        Ks=to_device(camera.intrinsics, device).float()[None], width=camera.width, height=camera.height,
+        packed=False, near_plane=near, eps2d=eps2d, render_mode="RGB+D" if depth else "RGB",
+        rasterize_mode="antialiased" if antialiased else "classic",
+    )  # fmt: skip
+    return maps[0], alpha[0], {key: info[key] for key in _STRATEGY_KEYS}

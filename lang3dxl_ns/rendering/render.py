@@ -40,14 +40,20 @@ def render(
     """Render Gaussians in their own colors over a background (0…1, by default black), and composite further
     `channels`, one row per Gaussian. This is safe to call from any thread. Raises ValueError like
     `rasterize`."""
+    carried = splats.colors(camera.position)
+    if channels is not None:
+        carried = torch.cat([carried, channels], dim=1)
+    behind = carried.new_zeros(carried.shape[1])
+    if background is not None:
+        behind[:3] = background
     raster = rasterize(
-        splats.seen_from(camera), camera, splats.colors(camera.position),
-        None if background is None else background.to(splats.means), features=channels, render_depth=True,
-        antialiased=splats.antialiased, backend=backend,
+        splats.seen_from(camera), camera, carried, behind,
+        render_depth=True, antialiased=splats.antialiased, backend=backend,
     )  # fmt: skip
     assert raster.depth is not None
+    colors, others = raster.image[..., :3].clamp(0.0, 1.0), raster.image[..., 3:]
     return Rendering(
-        camera, raster.image.clamp(0.0, 1.0), raster.alpha[..., 0], raster.depth[..., 0], raster.features
+        camera, colors, raster.alpha[..., 0], raster.depth[..., 0], None if channels is None else others
     )
 
 

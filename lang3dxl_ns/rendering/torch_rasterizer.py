@@ -32,11 +32,10 @@ MOST_TILES = 4096
 
 
 class Compositing(torch.autograd.Function):
-    """Compositing of screen ellipses front to back over black, to image, detached image and alpha.
+    """Compositing of screen ellipses front to back over black, to image and alpha, [h, w, …] each.
 
-    The maps are [h, w, …] each. The rules are gsplat's: alpha is at most 0.999 and skipped below 1/255, and a
-    pixel stops before its transmittance reaches 1e-4. The gradient of the detached image reaches only
-    `detached`.
+    The rules are gsplat's: alpha is at most 0.999 and skipped below 1/255, and a pixel stops before its
+    transmittance reaches 1e-4.
     """
 
     @staticmethod
@@ -46,25 +45,24 @@ class Compositing(torch.autograd.Function):
         conics: Tensor,
         opacities: Tensor,
         channels: Tensor,
-        detached: Tensor,
         variances: Tensor,
         depths: Tensor,
         width: int,
         height: int,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        parts = (means2d[0], conics[:, :2], variances[:, 1:], opacities[:, None], detached, channels)
+    ) -> tuple[Tensor, Tensor]:
+        parts = (means2d[0], conics[:, :2], variances[:, 1:], opacities[:, None], channels)
         boxes, order = _visible(means2d[0], variances, depths, opacities, width, height)
         # In depth order, with a transparent Gaussian at the end, which pads tiles with fewer rows.
         table = F.pad(torch.cat([part[order] for part in parts], dim=1), (0, 1, 0, 1))
         table[:-1, -1] = 1  # accumulates alpha
         table[-1, 2:5] = 1
         columns, tiles = -(-width // TILE), -(-width // TILE) * -(-height // TILE)
-        sizes = detached.shape[1], channels.shape[1], 1
+        sizes = channels.shape[1], 1
         maps = table.new_zeros(tiles, TILE * TILE, sum(sizes))
         passing = table.new_ones(tiles, TILE * TILE)
         chunks = []
         for chunk in _chunks(boxes, passing, columns):
-            found, behind = _composite(table[chunk.ranks], chunk, columns, sizes[0])
+            found, behind = _composite(table[chunk.ranks], chunk, columns)
             maps[chunk.tiles] += found
             passing[chunk.tiles] = behind
             chunks.append(chunk)
@@ -73,20 +71,20 @@ class Compositing(torch.autograd.Function):
         ctx.chunks, ctx.columns, ctx.size = chunks, columns, (height, width)
         ctx.sizes, ctx.widths = sizes, [part.shape[1] for part in parts]
         image = maps.view(-1, columns, TILE, TILE, sum(sizes)).transpose(1, 2).flatten(2, 3).flatten(0, 1)
-        features, image, alpha = (part.contiguous() for part in image[:height, :width].split(sizes, dim=2))
-        return image, features, alpha
+        image, alpha = (part.contiguous() for part in image[:height, :width].split(sizes, dim=2))
+        return image, alpha
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, image: Tensor | None, features: Tensor | None, alpha: Tensor | None) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, image: Tensor | None, alpha: Tensor | None) -> Any:  # type: ignore[override]
         means2d, table, order = ctx.saved_tensors
-        upstream = _in_tiles((features, image, alpha), ctx.sizes, table, ctx.columns, ctx.size)
+        upstream = _in_tiles((image, alpha), ctx.sizes, table, ctx.columns, ctx.size)
         g_table, g_passing = torch.zeros_like(table), table.new_zeros(upstream.shape[:2])
         for chunk in reversed(ctx.chunks):
             rows = table[chunk.ranks].requires_grad_()
             chunk = chunk._replace(before=chunk.before.detach().requires_grad_())
             with torch.enable_grad():
-                found = _composite(rows, chunk, ctx.columns, ctx.sizes[0])
+                found = _composite(rows, chunk, ctx.columns)
             slopes = upstream[chunk.tiles], g_passing[chunk.tiles]
             g_rows, g_before = torch.autograd.grad(found, (rows, chunk.before), slopes)
             g_passing[chunk.tiles] = g_before
@@ -96,9 +94,9 @@ class Compositing(torch.autograd.Function):
             return values.new_zeros(means2d.shape[1], values.shape[1]).index_copy_(0, order, values[:-1])
 
         gradients = (scattered(part) for part in g_table[:, :-1].split(ctx.widths, dim=1))
-        means, conics, variances, opacities, detached, channels = gradients
+        means, conics, variances, opacities, channels = gradients
         conics, variances = F.pad(conics, (0, 1)), F.pad(variances, (1, 0))  # unused by `forward`
-        return means[None], conics, opacities[:, 0], channels, detached, variances, *[None] * 3
+        return means[None], conics, opacities[:, 0], channels, variances, *[None] * 3
 
 
 class _Chunk(NamedTuple):
@@ -112,11 +110,11 @@ class _Chunk(NamedTuple):
 
 
 def _composite(
-    rows: Float[Tensor, "b k columns"], chunk: _Chunk, columns: int, detached: int
+    rows: Float[Tensor, "b k columns"], chunk: _Chunk, columns: int
 ) -> tuple[Float[Tensor, "b pixels c"], Float[Tensor, "b pixels"]]:
-    """Composite a chunk onto its tiles' maps, and return what it adds and the transmittance behind it. In the
-    first `detached` maps, only the channels have a gradient. The quadratic form is steepness·(dx + shear·dy)²
-    + dy²/variance. Unlike the conic itself, it stays accurate in float32 far from the center of a needle."""
+    """Composite a chunk onto its tiles' maps, and return what it adds and the transmittance behind it. The
+    quadratic form is steepness·(dx + shear·dy)² + dy²/variance. Unlike the conic itself, it stays accurate in
+    float32 far from the center of a needle."""
     x, y, a, b, variance, opacity = rows[..., :6, None].unbind(2)
     pixel = torch.arange(TILE * TILE, device=rows.device)
     dx = (chunk.tiles % columns * TILE)[:, None, None] + pixel % TILE + 0.5 - x
@@ -127,10 +125,8 @@ def _composite(
     after = chunk.before[:, None] * torch.cumprod(1 - alpha, dim=1)
     before = torch.cat([chunk.before[:, None], after[:, :-1]], dim=1)
     weights = torch.where(after > TRANSMITTANCE_MIN, alpha * before, 0.0).mT
-    values = rows[..., 6:]
-    maps = [weights.detach() @ values[..., :detached], weights @ values[..., detached:]]
     after = torch.where(after[:, -1] > TRANSMITTANCE_MIN, after[:, -1], 0.0)
-    return torch.cat(maps, dim=2), after
+    return weights @ rows[..., 6:], after
 
 
 def _visible(

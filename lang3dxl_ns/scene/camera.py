@@ -215,6 +215,11 @@ def with_longer_side(camera: Camera, pixels: int) -> Camera:
             f"a picture of {width} × {height} pixels takes about {needed / 1e9:.1f} GB, over half of this "
             f"machine's memory: give at most {int(pixels * (most / needed) ** 0.5)} pixels"
         )
+    return at_size(camera, height, width)
+
+
+def at_size(camera: Camera, height: int, width: int) -> Camera:
+    """Return the view in another number of pixels, stretched if the aspect ratio is another."""
     zoom = camera.intrinsics.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
     return replace(camera, intrinsics=camera.intrinsics * zoom, width=width, height=height)
 

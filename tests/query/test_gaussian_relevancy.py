@@ -81,8 +81,8 @@ def slab(count: int, seed: int = 0) -> tuple[Gaussians, Camera]:
 
 def map_of(engine, asked, gaussians, camera):
     carried = engine.channels(asked).double()
-    drawn = rasterize(gaussians, camera, torch.zeros(len(carried), 1).double(), features=carried)
-    return engine.maps(drawn.features, asked), drawn.alpha[..., 0]
+    drawn = rasterize(gaussians, camera, carried)
+    return engine.maps(drawn.image, asked), drawn.alpha[..., 0]
 
 
 def test_a_composited_relevancy_is_the_mean_of_the_gaussians_by_their_weight():

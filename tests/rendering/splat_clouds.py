@@ -30,11 +30,9 @@ class Cloud:
         return Camera(view, self.intrinsics.to(view), self.width, self.height)
 
     def render(self, rasterizer: Callable[..., Raster], leaves: dict[str, Tensor], **settings: Any) -> Raster:
-        """Image over the background, features and depth."""
-        return rasterizer(
-            gaussians(leaves), self.camera(leaves), leaves["channels"], leaves["background"],
-            **{"features": leaves["features"], "render_depth": True, **settings},
-        )  # fmt: skip
+        """Image over the background, and depth."""
+        parts = gaussians(leaves), self.camera(leaves), leaves["channels"], leaves["background"]
+        return rasterizer(*parts, **{"render_depth": True, **settings})
 
 
 def gaussians(leaves: dict[str, Tensor]) -> Gaussians:
@@ -61,9 +59,8 @@ def make_cloud(count: int, width: int, height: int, *, seed: int = 0, size: floa
         "quats": normal(count, 4),
         "scales": size * torch.exp(0.6 * normal(count, 3)),
         "opacities": torch.sigmoid(2 * normal(count)),
-        "channels": uniform(count, 3),
-        "features": normal(count, 2),
-        "background": uniform(3),
+        "channels": torch.cat([uniform(count, 3), normal(count, 2)], dim=1),
+        "background": uniform(5),
         "view_matrix": view_matrix,
     }
     intrinsics = torch.tensor(
@@ -73,7 +70,7 @@ def make_cloud(count: int, width: int, height: int, *, seed: int = 0, size: floa
 
 
 def maps(rendering: Raster) -> dict[str, Tensor]:
-    found = {name: getattr(rendering, name) for name in ("image", "features", "alpha", "depth")}
+    found = {name: getattr(rendering, name) for name in ("image", "alpha", "depth")}
     return {name: value for name, value in found.items() if value is not None}
 
 

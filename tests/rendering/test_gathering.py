@@ -43,8 +43,7 @@ def whole(values: torch.Tensor) -> Pixels:
 
 def composite(camera: Camera, carried: torch.Tensor) -> torch.Tensor:
     scene = gaussians()
-    rendering = rasterize(scene, camera, torch.zeros(len(carried), 1).double(), features=carried)
-    return rendering.features
+    return rasterize(scene, camera, carried).image
 
 
 def test_a_lifted_feature_is_the_mean_of_the_pixels_weighted_by_the_contribution():

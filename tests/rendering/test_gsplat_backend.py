@@ -31,12 +31,11 @@ def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, heigh
     return image[None], rendering.alpha[None], {**rendering.info, "tile_size": 16}
 
 
-@pytest.mark.parametrize("detach", [True, False])
 @pytest.mark.parametrize("depth", [True, False])
-def test_the_maps_and_gradients_come_back_in_their_places(monkeypatch, detach, depth):
+def test_the_maps_and_gradients_come_back_in_their_places(monkeypatch, depth):
     monkeypatch.setattr("gsplat.rasterization", stand_in)
     cloud = make_cloud(200, 40, 30)
-    settings = {"detach_features": detach, "render_depth": depth, "antialiased": True, "near": 1.0}
+    settings = {"render_depth": depth, "antialiased": True, "near": 1.0}
     torch_leaves, gsplat_leaves = cloud.leaves(torch.float32), cloud.leaves(torch.float32)
     expected = cloud.render(rasterize, torch_leaves, backend="torch", **settings)
     found = cloud.render(rasterize, gsplat_leaves, backend="gsplat", **settings)
@@ -57,17 +56,17 @@ def test_tensors_on_the_cpu_are_rendered_by_torch(monkeypatch):
 
 @pytest.mark.cuda
 @needs_gpu
-@pytest.mark.parametrize("detach", [True, False])
 @pytest.mark.parametrize("antialiased", [True, False])
-def test_both_backends_render_the_same_function(detach, antialiased):
+def test_both_backends_render_the_same_function(antialiased):
     cloud = make_cloud(3000, 160, 120, size=0.03)
     cloud.tensors = {name: value.cuda() for name, value in cloud.tensors.items()}
     cloud.intrinsics = cloud.intrinsics.cuda()
-    settings = {"detach_features": detach, "antialiased": antialiased}
     renderings, found = {}, {}
     for backend in ("torch", "gsplat"):
         leaves = cloud.leaves(torch.float32)
-        rendering = renderings[backend] = cloud.render(rasterize, leaves, backend=backend, **settings)
+        rendering = renderings[backend] = cloud.render(
+            rasterize, leaves, backend=backend, antialiased=antialiased
+        )
         rendering.info["means2d"].retain_grad()
         found[backend] = gradients(rendering, leaves)
     # gsplat cuts at three standard deviations, rounded out to tiles of 16; the torch backend where alpha

@@ -1,19 +1,20 @@
 """The tiled rasterizer against the dense reference, and the laws of compositing."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from splat_clouds import Cloud, gaussians, gradients, make_cloud, maps, relative_error
+from splat_clouds import Cloud, gradients, make_cloud, maps, relative_error
 
 from lab.numerics.rasterizer_reference import rasterize_reference
 from lang3dxl_ns.rendering import rasterize
+from lang3dxl_ns.scene.camera import at_size
 
 pytestmark = pytest.mark.usefixtures("backend")
 MODES = [
     {},
-    {"detach_features": False},
     {"antialiased": True},
     {"near": 1.5, "eps2d": 0.1},
 ]
@@ -98,49 +99,42 @@ def test_gradients_equal_finite_differences(antialiased):
     names = list(leaves)
 
     def rendered(*values):
-        out = cloud.render(
-            rasterize, dict(zip(names, values, strict=True)), detach_features=False, antialiased=antialiased
-        )
+        out = cloud.render(rasterize, dict(zip(names, values, strict=True)), antialiased=antialiased)
         return tuple(maps(out).values())
 
     assert bool(cloud.render(rasterize, leaves).alpha.mean() > 0.1)
     assert torch.autograd.gradcheck(rendered, tuple(leaves.values()), eps=1e-7, atol=1e-5, fast_mode=True)
 
 
-def test_the_gradient_of_detached_features_reaches_only_the_features():
-    cloud = make_cloud(200, 40, 30)
-    leaves = cloud.leaves()
-    cloud.render(rasterize, leaves).features.square().sum().backward()
-    assert leaves["features"].grad.norm() > 0
-    for name in ("means", "quats", "scales", "opacities", "view_matrix"):
-        assert leaves[name].grad is None or not leaves[name].grad.any(), name
-
-
-def test_the_gradient_of_attached_features_reaches_geometry_and_opacity():
-    cloud = make_cloud(200, 40, 30)
-    leaves = cloud.leaves()
-    cloud.render(rasterize, leaves, detach_features=False).features.square().sum().backward()
-    for name in ("means", "quats", "scales", "opacities", "view_matrix", "features"):
-        assert leaves[name].grad.norm() > 0, name
-
-
-@pytest.mark.parametrize("detach", [True, False])
-def test_features_in_one_pass_equal_a_rendering_of_their_own(detach):
+def test_every_channel_is_rendered_as_alone_and_reaches_geometry_and_opacity():
     cloud = make_cloud(300, 40, 30)
     leaves = cloud.leaves(torch.float32)
-    together = cloud.render(rasterize, leaves, detach_features=detach)
-    alone = rasterize(gaussians(leaves), cloud.camera(leaves), leaves["features"])
-    torch.testing.assert_close(together.features, alone.image, atol=1e-6, rtol=1e-5)
-    without = cloud.render(rasterize, leaves, features=None)
-    assert without.features is None
-    torch.testing.assert_close(together.image, without.image, atol=1e-6, rtol=1e-5)
+    together = cloud.render(rasterize, leaves)
+    for some in (slice(0, 3), slice(3, 5)):
+        part = leaves | {name: leaves[name][..., some] for name in ("channels", "background")}
+        alone = cloud.render(rasterize, part).image
+        torch.testing.assert_close(together.image[..., some], alone, atol=1e-6, rtol=1e-5)
+        slopes = torch.autograd.grad(alone.square().sum(), list(leaves.values()), retain_graph=True)
+        assert all(slope.norm() > 0 for slope in slopes)
+
+
+def test_at_fewer_pixels_the_same_ellipses_are_drawn():
+    """With the blur of the large picture, a picture of every fifth pixel is its every fifth pixel."""
+    cloud = make_cloud(300, 45, 35)
+    leaves = cloud.leaves()
+    large = cloud.render(rasterize, leaves, antialiased=True)
+    small = replace(cloud, width=9, height=7)
+    small.intrinsics = at_size(cloud.camera(leaves), 7, 9).intrinsics
+    found = small.render(rasterize, leaves, eps2d=0.3 / 25, antialiased=True)
+    for name, value in maps(found).items():
+        torch.testing.assert_close(value, getattr(large, name)[2::5, 2::5], atol=1e-10, rtol=0)
 
 
 def test_the_order_in_which_gaussians_are_given_does_not_matter():
     cloud = make_cloud(300, 40, 30)
     shuffled = make_cloud(300, 40, 30)
     order = torch.randperm(300, generator=torch.Generator().manual_seed(2))
-    for name in ("means", "quats", "scales", "opacities", "channels", "features"):
+    for name in ("means", "quats", "scales", "opacities", "channels"):
         shuffled.tensors[name] = shuffled.tensors[name][order]
     a, b = (scene.render(rasterize, scene.leaves(torch.float32)) for scene in (cloud, shuffled))
     for name, value in maps(a).items():
@@ -182,13 +176,13 @@ def test_the_gradient_of_screen_positions_is_that_of_shifting_the_principal_poin
     rendering = cloud.render(rasterize, leaves)
     means2d = rendering.info["means2d"]
     means2d.retain_grad()
-    rendering.image.square().sum().backward()
+    rendering.image[..., :3].square().sum().backward()
     assert means2d.grad.shape == (1, 200, 2)
 
     def loss(shift: float) -> float:
         moved = Cloud(cloud.tensors, cloud.intrinsics.clone(), cloud.width, cloud.height)
         moved.intrinsics[0, 2] += shift
-        return float(moved.render(rasterize, moved.tensors).image.square().sum())
+        return float(moved.render(rasterize, moved.tensors).image[..., :3].square().sum())
 
     # The principal point also moves the clamp of the Jacobian, but only for Gaussians far outside.
     numeric = (loss(1e-5) - loss(-1e-5)) / 2e-5

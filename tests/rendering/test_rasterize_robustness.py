@@ -25,7 +25,7 @@ def test_any_image_size_equals_the_reference(width, height):
     cloud = make_cloud(60, width, height, size=0.3)
     ours, theirs = cloud.leaves(), cloud.leaves()
     expected, found = cloud.render(rasterize_reference, theirs), cloud.render(rasterize, ours)
-    assert found.image.shape == (height, width, 3)
+    assert found.image.shape == (height, width, 5)
     torch.testing.assert_close(found.image, expected.image, atol=1e-10, rtol=0)
     expected_gradients = gradients(expected, theirs)
     for name, value in gradients(found, ours).items():
@@ -88,9 +88,9 @@ def test_broken_gaussians_are_left_out_and_get_no_gradient(name, broken):
         assert found[parameter][10:].any()
 
 
-@pytest.mark.parametrize("name", ["channels", "features"])
+@pytest.mark.parametrize("channel", [0, 4])
 @pytest.mark.parametrize("broken", [float("nan"), float("inf"), float("-inf")])
-def test_a_gaussian_of_broken_colors_is_left_out_alone(name, broken):
+def test_a_gaussian_of_broken_colors_is_left_out_alone(channel, broken):
     """The picture is that of the others: no pixel of its tiles is spoiled."""
     cloud = make_cloud(40, 24, 20, size=0.3)
     without = cloud.leaves(torch.float32)
@@ -99,7 +99,7 @@ def test_a_gaussian_of_broken_colors_is_left_out_alone(name, broken):
     expected = cloud.render(rasterize, without)
     ours = cloud.leaves(torch.float32)
     with torch.no_grad():
-        ours[name][3] = broken
+        ours["channels"][3, channel] = broken
     found = cloud.render(rasterize, ours)
     for key, value in maps(found).items():
         torch.testing.assert_close(value, maps(expected)[key])
@@ -187,17 +187,15 @@ def test_gaussians_close_to_the_camera_do_not_blow_up_the_memory(monkeypatch):
 def test_no_pair_of_tile_and_gaussian_that_reaches_the_threshold_is_culled():
     cloud = make_cloud(300, 70, 50, size=0.06)
     leaves = cloud.leaves()
-    single = cloud.render(rasterize, leaves, features=torch.eye(300, dtype=torch.float64), render_depth=False)
-    alone = cloud.render(
-        rasterize_reference, leaves, features=torch.eye(300, dtype=torch.float64), render_depth=False
-    )
-    assert bool(((alone.features > 0) == (single.features > 0)).all())
+    parts = gaussians(leaves), cloud.camera(leaves), torch.eye(300, dtype=torch.float64)
+    single, alone = rasterize(*parts), rasterize_reference(*parts)
+    assert bool(((alone.image > 0) == (single.image > 0)).all())
 
 
 def test_sizes_that_do_not_fit_are_reported_with_both_numbers():
     cloud = make_cloud(5, 8, 8)
     leaves = cloud.leaves()
-    with pytest.raises(ValueError, match=r"there are 5 means, but \{'features': 4\}"):
-        cloud.render(rasterize, leaves, features=leaves["features"][:4])
-    with pytest.raises(ValueError, match=r"3 channels, but a background of shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"there are 5 means, but \{'channels': 4\}"):
+        cloud.render(rasterize, leaves | {"channels": leaves["channels"][:4]})
+    with pytest.raises(ValueError, match=r"5 channels, but a background of shape \(2,\)"):
         rasterize(gaussians(leaves), cloud.camera(leaves), leaves["channels"], torch.zeros(2))

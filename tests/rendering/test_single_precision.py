@@ -23,14 +23,11 @@ class NoDoubles(TorchDispatchMode):
         return out
 
 
-@pytest.mark.parametrize("detach", [True, False])
-def test_nothing_but_the_camera_is_in_float64(detach):
+def test_nothing_but_the_camera_is_in_float64():
     cloud = make_cloud(100, 24, 16)
     leaves = cloud.leaves(torch.float32)
     with NoDoubles():
-        rendering = cloud.render(
-            rasterize, leaves, backend="torch", detach_features=detach, render_depth=True, antialiased=True
-        )
+        rendering = cloud.render(rasterize, leaves, backend="torch", antialiased=True)
         sum(value.square().mean() for value in maps(rendering).values()).backward()
     assert all(leaf.grad is None or torch.isfinite(leaf.grad).all() for leaf in leaves.values())
     assert leaves["means"].grad.abs().max() > 0
