@@ -66,7 +66,7 @@ class ModelSettings(SplatfactoModelConfig):
     in runs of under 5,000 iterations."""
     feature_gradient_to_geometry: bool = False
     """Let the semantic losses also move Gaussians, as in the authors' code; opacities still follow the colors
-    alone. This costs a second rendering."""
+    alone."""
     view_dependence: Literal["auto", "on", "off"] = "auto"
     """Let colors depend on the viewing direction (spherical harmonics of `sh_degree`). `off` leaves one color
     and a quarter of the numbers per Gaussian. `auto` decides by measuring the scene."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.device import in_full_precision
 
@@ -67,4 +69,22 @@ def spherical_harmonics(
             f"Gaussian; there are {coefficients.shape[1]}"
         )
     basis = _basis(degree, F.normalize(directions, dim=1))
-    return torch.einsum("nk,nkc->nc", basis, coefficients[:, :count])
+    return _Sum.apply(basis, coefficients[:, :count])
+
+
+class _Sum(torch.autograd.Function):
+    """Sum of coefficients by their basis. Autograd's own gradient is a matrix product per Gaussian, which takes
+    twice as long."""
+
+    @staticmethod
+    def forward(ctx: Any, basis: Tensor, coefficients: Tensor) -> Float[Tensor, "n 3"]:  # type: ignore[override]
+        ctx.save_for_backward(basis, coefficients)
+        return torch.einsum("nk,nkc->nc", basis, coefficients)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, Tensor | None]:  # type: ignore[override]
+        basis, coefficients = ctx.saved_tensors
+        moves, learns = ctx.needs_input_grad
+        of_basis = torch.einsum("nc,nkc->nk", slope, coefficients) if moves else None
+        return of_basis, basis[:, :, None] * slope[:, None] if learns else None
