@@ -73,8 +73,8 @@ def spherical_harmonics(
 
 
 class _Sum(torch.autograd.Function):
-    """Sum of coefficients by their basis. Autograd's own gradient is a matrix product per Gaussian, which takes
-    twice as long."""
+    """Sum of coefficients by their basis. Autograd's own gradient, a matrix product per Gaussian, takes twice
+    as long."""
 
     @staticmethod
     def forward(ctx: Any, basis: Tensor, coefficients: Tensor) -> Float[Tensor, "n 3"]:  # type: ignore[override]
