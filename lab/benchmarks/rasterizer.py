@@ -41,8 +41,7 @@ from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
-from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering import Backend, Gaussians, rasterize
 
 OURS, TORCH, DENSE, GSPLAT = "lang3dxl", "torch kernels", "dense tiles", "gsplat"
 """Methods that can be compared."""

@@ -17,9 +17,7 @@ from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, regist
 from lang3dxl_ns.common.console import progress, tracked
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes
-from lang3dxl_ns.rendering.rasterize import rasterize
-from lang3dxl_ns.rendering.render import render
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats, rasterize, render
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 

@@ -26,8 +26,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.rendering.render import composite
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.scene.camera import Camera, camera_to_world, resized
 from lang3dxl_ns.scene.photo import Photo
 

@@ -14,8 +14,8 @@ from lang3dxl_ns.preparation.segmentation import TextSegmenter
 from lang3dxl_ns.query.learn_word import MARK_SIDE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.teach import Example
+from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
-from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.photo import Photo
 

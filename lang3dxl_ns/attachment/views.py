@@ -23,10 +23,9 @@ from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.visibility import fingerprint
+from lang3dxl_ns.rendering import Rendering, Splats, composite, render
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.rendering.projection import rotations
-from lang3dxl_ns.rendering.render import Rendering, composite, render
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, Lens, resized
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo

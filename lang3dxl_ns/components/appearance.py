@@ -22,10 +22,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.components.hash_grid import HashGrid
 from lang3dxl_ns.components.linear import linear
-from lang3dxl_ns.rendering.gaussians import Gaussians
-from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import Rendering, render
-from lang3dxl_ns.rendering.splats import Splats, harmonics_of
+from lang3dxl_ns.rendering import Backend, Gaussians, Rendering, Splats, harmonics_of, render
 from lang3dxl_ns.scene.camera import Camera, in_view
 
 HIDDEN = 64

@@ -19,8 +19,7 @@ from torch import Tensor
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.losses import rgb_loss
-from lang3dxl_ns.rendering.rasterize import Backend, rasterize
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Backend, Splats, rasterize
 from lang3dxl_ns.scene.camera import Camera, in_view
 
 STEPS = 64

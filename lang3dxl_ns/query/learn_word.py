@@ -25,10 +25,8 @@ from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.teach import MASK_SIDE, Example, TaughtWord
+from lang3dxl_ns.rendering import Backend, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_parts
-from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import composite
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import resized
 
 MARK_SIDE = 320

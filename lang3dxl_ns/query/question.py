@@ -23,7 +23,7 @@ from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.text import Prompt, TextConfig
-from lang3dxl_ns.rendering.render import Rendering
+from lang3dxl_ns.rendering import Rendering
 
 EVEN = 0.5
 """Relevancy where prompt and negatives match equally well."""

@@ -35,10 +35,8 @@ from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, texts_of
 from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
 from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, searched, shipped_vocabulary
+from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
-from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import Rendering, composite
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 
 _ROWS = 65_536

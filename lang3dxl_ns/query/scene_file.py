@@ -40,7 +40,7 @@ from lang3dxl_ns.query.splat_file import log_scales, logits
 from lang3dxl_ns.query.teach import TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
 
 Module = TypeVar("Module", bound=torch.nn.Module)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 
 LEAST_OPACITY = 1e-6
 """Smallest distance of stored opacities from 0 and 1, where logits are infinite."""

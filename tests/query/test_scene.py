@@ -25,8 +25,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.rendering.rasterize import rasterize
-from lang3dxl_ns.rendering.render import composite
+from lang3dxl_ns.rendering import composite, rasterize
 from lang3dxl_ns.scene.camera import camera_to_world
 
 
@@ -118,7 +117,7 @@ def test_a_view_of_at_most_the_training_size_takes_one_pass(scene, monkeypatch, 
         return rasterize(gaussians, camera, *args, **settings)
 
     question = scene.ask("dome; window")
-    monkeypatch.setattr(sys.modules["lang3dxl_ns.rendering.render"], "rasterize", counted)
+    monkeypatch.setattr(sys.modules["lang3dxl_ns.rendering.splats"], "rasterize", counted)
     match, _ = scene.matches(question, "all/0003.jpg", size)
     assert drawn == [size, 96][:passes]
     if passes == 1:

@@ -22,7 +22,7 @@ from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.splat_file import array_of
 from lang3dxl_ns.query.visibility import VisibleGaussians
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.camera import Camera
 
 _LOG_SCALES = (-12.0, 9.0)
