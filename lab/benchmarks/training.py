@@ -97,7 +97,7 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
 
 def _time_parts(trainer: Any) -> None:
     """Wrap the trainer's own methods to time them."""
-    from lang3dxl_ns.common.timing import part
+    from lang3dxl_ns.common.reports import part
 
     def timed(name, function):
         def run(*args, **kwargs):

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.timing import part
+from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.decoders import make_decoder

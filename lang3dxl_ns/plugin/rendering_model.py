@@ -16,7 +16,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
-from lang3dxl_ns.common.timing import part
+from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.feature_decoder import Decoder
