@@ -17,7 +17,7 @@ from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.preparation.crop_plan import plan_crops
+from lang3dxl_ns.preparation.crop_sizes import plan_crops
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection

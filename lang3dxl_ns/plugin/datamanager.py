@@ -34,7 +34,7 @@ from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parse
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
-from lang3dxl_ns.preparation.crop_plan import CropPlan, plan_crops
+from lang3dxl_ns.preparation.crop_sizes import CropPlan, plan_crops
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
