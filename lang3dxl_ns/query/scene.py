@@ -276,9 +276,9 @@ class Scene:
     def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
         """Find matches of a question's prompts in one view; see `query`.
 
-        Relevancies are composited with at most as many pixels as the training photos have. If the view has
-        more, they are rendered in a separate pass and enlarged: nothing was learned between these pixels, and
-        Gaussians too thin for them would stand out as lines.
+        Relevancies are composited with at most as many pixels as the training photos have, and enlarged for a
+        larger view: nothing was learned between these pixels, and Gaussians too thin for them would stand out
+        as lines.
         """
         start = time.perf_counter()
         channels = question.channels
@@ -287,8 +287,7 @@ class Scene:
         small = resized(camera, self.trained_side)
         enlarged = small.width < camera.width
         view = self._view(camera, name, channels=None if enlarged else channels)
-        rendered = time.perf_counter()
-        rendering = view.rendering
+        rendered, rendering = time.perf_counter(), view.rendering
         if enlarged:
             rendering = replace(rendering, channels=composite(self.splats, small, channels, self.backend))
         foreground = None if name is None else self.file.photo(name).foreground()
@@ -303,7 +302,7 @@ class Scene:
 
     @torch.no_grad()
     def relevancy_maps(self, camera: Camera, queries: Queries) -> Float[Tensor, "q h w"]:
-        """Compute the relevancy of every pixel to every query, 0…1, as it is scored, without a foreground."""
+        """Compute every pixel's relevancy to every query, 0…1, as it is scored, without a foreground."""
         rendering = self.draw(camera, self.engine.channels(queries))
         assert rendering.channels is not None
         return self.engine.maps(rendering.channels, queries)
@@ -414,15 +413,13 @@ class Scene:
         for name, camera in tracked(cameras.items(), what):
             if self.watch is not None:
                 self.watch(f"{what}: view {len(views) + 1} of {len(cameras)}")
-            views[name] = self._visible(name, camera)
+            size = camera.height, camera.width
+            mask = self.file.photo(name).foreground(size)
+            weight = torch.ones(size) if mask is None else mask.float()
+            views[name] = VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
         if self.cache is not None:
             save_visible(self.cache, views, key)
         return views
-
-    def _visible(self, name: str, camera: Camera) -> VisibleGaussians:
-        mask = self.file.photo(name).foreground((camera.height, camera.width))
-        weight = torch.ones(camera.height, camera.width) if mask is None else mask.float()
-        return VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
 
     def _fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
         drawn = partial(composite, self.splats, camera, backend=self.backend)
@@ -517,10 +514,8 @@ class Scene:
     def teach(
         self, word: str, examples: Example | Sequence[Example], selection: Bool[Tensor, " n"] | None = None
     ) -> Scene:
-        """Return a scene that also knows a word from examples, as `scene.words[word]`; this one is unchanged.
-
-        `query`, `find`, `relevancy` and `export` of the new scene use what it learned wherever the word is a
-        prompt. Examples that the word had before are replaced.
+        """Return a scene that also knows a word, as `scene.words[word]`, and uses what it learned wherever
+        the word is a prompt; this scene is unchanged. Examples that the word had before are replaced.
 
         Args:
             word: the word, in any case.
