@@ -63,8 +63,7 @@ _VOCABULARIES = (
 
 
 class ImageTextEncoder:
-    """Images and texts in one space: CLIP, SigLIP, TIPSv2 … Embeddings are projected, float32 and *not*
-    normalized.
+    """Images and texts in one space: CLIP, SigLIP, TIPSv2 … Embeddings are projected, float32, not normalized.
 
     `dim`: channels; `crop_size`: side in pixels of the pictures that the vision tower was trained on;
     `patch_size`: side of its patches; `identity`: of the weights; `brightness`: mean value of the photos that
@@ -197,9 +196,7 @@ class DenseEncoder:
 
     def __init__(self, model: Any, tokens: int, identity: str) -> None:
         self.dim: int = model.config.hidden_size
-        self.tokens = tokens
-        self.identity = identity
-        self._model = model
+        self.tokens, self.identity, self._model = tokens, identity, model
         self._side = tokens * model.config.patch_size
         self._device = next(model.parameters()).device
         own = model.config.model_type in _NORMALIZE_THEMSELVES
@@ -270,8 +267,7 @@ def _image_processor(files: ModelFiles) -> Any:
             f"{files.folder} has no preprocessor_config.json: copy it from the model that this one was "
             "fine-tuned from"
         )
-    path = files.folder / "preprocessor_config.json"
-    with whole(f"{path} can't be read", "download the model again"):
+    with whole(f"{files.folder / 'preprocessor_config.json'} can't be read", "download the model again"):
         return AutoImageProcessor.from_pretrained(
             files.folder, local_files_only=True, trust_remote_code=False
         )

@@ -136,9 +136,7 @@ def _windows(
 ) -> tuple[Float[Tensor, "3 H W t t"], Int[Tensor, " ny"], Int[Tensor, " nx"]]:
     """Return a crop at every pixel (views of the photo padded with black, which take no memory each), and the
     rows and columns at which the required crops begin."""
-    half = _half(side)
-    padding: list[int] = []
-    starts = []
+    half, padding, starts = _half(side), list[int](), []
     for length in (photo.shape[1], photo.shape[0]):  # F.pad counts from the last axis, the width
         centers = crop_centers(length, side, steps).to(photo.device)
         before = max(0, half - int(centers[0]))
@@ -177,10 +175,8 @@ def choose_crops(
     input_side: int,
     quality: Quality,
 ) -> Crops:
-    """Choose a photo's crops: those of the scales, without crops too small for the encoder.
-
-    If there are more than the quality allows, fine crops first move apart, from a third to half of their
-    side; then the crops grow.
+    """Choose a photo's crops: those of the scales, without crops too small for the encoder. If there are more
+    than the quality allows, fine crops first move apart, from a third to half of their side; then all grow.
 
     Args:
         scales: sides in world units, or in photo widths.

@@ -104,17 +104,14 @@ class TargetReader:
 
 
 def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:
-    """Compute statistics over all maps' pixels, merged map by map in float64 (Chan, Golub & LeVeque 1983)."""
-    count, mean, squares = 0, torch.zeros(()), torch.zeros(())
+    """Compute statistics over all maps' pixels. Sums in float64 are exact enough for values of 16 bits."""
+    count, total, squares = 0, torch.zeros(()), torch.zeros(())
     for values in maps:
         pixels = values.flatten(0, 1).double()
-        variance, own_mean = torch.var_mean(pixels, dim=0, correction=0)
-        both = count + len(pixels)
-        step = own_mean - mean
-        mean = mean + step * len(pixels) / both
-        squares = squares + variance * len(pixels) + step**2 * count * len(pixels) / both
-        count = both
-    std = (squares / count).sqrt()
+        count, total = count + len(pixels), total + pixels.sum(0)
+        squares = squares + pixels.square().sum(0)
+    mean = total / count
+    std = (squares / count - mean.square()).clamp_min(0).sqrt()
     floor = max(_STD_FLOOR * float(std.mean()), torch.finfo(torch.float32).eps)
     return ChannelStatistics(mean.float(), std.clamp_min(floor).float())
 
