@@ -30,12 +30,9 @@ _LEAST, _MOST = 1e-3, 0.9
 def segmented(
     scene: Scene, word: str, segmenter: TextSegmenter, photos: Sequence[Photo], cameras: Mapping[str, Camera]
 ) -> Scene:
-    """Teach a scene a word by a segmenter; if that finds nothing, say so and return the same scene.
-
-    Each photo votes about the Gaussians that it shows, so the others outvote an error in one photo. The word
-    is then learned from the Gaussians with a majority, as from marks by a person. `cameras` holds the photos'
-    cameras, at the files' resolution, in the scene's frame.
-    """
+    """Teach a scene a word by a segmenter; if that finds nothing, say so and return the same scene. Each
+    photo votes about the Gaussians that it shows, and the word is learned from those with a majority, as from
+    marks by a person. `cameras` holds the photos' cameras, at the files' resolution, in the scene's frame."""
     masks: dict[str, Bool[Tensor, "h w"]] = {}
 
     def views() -> Iterator[tuple[Composite, Pixels]]:

@@ -1,8 +1,7 @@
 """Half-image protocol: the look of an unseen photo is fitted on its left half, and its right half is scored.
 
-The lighting of an unseen photo is unknown, so comparing the whole photo mostly measures how well its lighting
-was guessed. NeRF in the Wild (Martin-Brualla et al. 2021), WildGaussians and NerfBaselines therefore fit the
-lighting on half of the photo.
+Comparing the whole of an unseen photo mostly measures how well its lighting was guessed. NeRF in the Wild
+(Martin-Brualla et al. 2021), WildGaussians and NerfBaselines therefore fit it on half of the photo.
 """
 
 from __future__ import annotations
