@@ -63,7 +63,8 @@ _VOCABULARIES = (
 
 
 class ImageTextEncoder:
-    """Images and texts in one space (CLIP, SigLIP, TIPSv2 …). Embeddings are projected, float32, unnormalized.
+    """Images and texts in one space (CLIP, SigLIP, TIPSv2 …). Embeddings are projected, float32,
+    unnormalized.
 
     `dim`: channels; `crop_size`: side in pixels of the pictures that the vision tower was trained on;
     `patch_size`: side of its patches; `identity`: of the weights; `brightness`: mean value of the photos that

@@ -82,11 +82,9 @@ class Weights:
 def learn(
     name: str, examples: Sequence[Example], weights: Sequence[Weights], engine: QueryEngine, queries: Queries
 ) -> TaughtWord:
-    """Learn a word from examples, whose order doesn't matter, and from what the marks of each show.
-
-    queries: the query of the word's text, without synonyms. Raises UserError if there is no example, or the
-    marks show nothing, or everything.
-    """
+    """Learn a word from examples, whose order doesn't matter, from what the marks of each show, and from the
+    query of the word's text, without synonyms. Raises UserError if there is no example, or the marks show
+    nothing, or everything."""
     if not examples:
         raise UserError(f"there is no example of {name!r}: mark it in a photo")
     for example, one in zip(examples, weights, strict=True):

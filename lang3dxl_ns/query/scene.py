@@ -138,15 +138,9 @@ class Scene:
     def render(
         self, place: Place, size: int | None = None, fov: float | None = None, look: str | None = None
     ) -> View:
-        """Render the scene from a photo's viewpoint, a camera or a pose.
-
-        Args:
-            place, size, fov: see `camera`.
-            look: training photo whose lighting is used; by default the scene's rule chooses for this view.
-
-        Raises:
-            UserError: see `camera`; or there is no look of this photo.
-        """
+        """Render the scene from a photo's viewpoint, a camera or a pose; see `camera`. look: training photo
+        whose lighting is used; by default the scene's rule chooses for this view. Raises UserError as
+        `camera` does, and if there is no look of this photo."""
         return self._view(self.camera(place, size, fov), self._name(place), look)
 
     def draw(
@@ -182,10 +176,8 @@ class Scene:
         return self.file.photo(place).name if isinstance(place, str) else None
 
     def baked(self, look: str | None = None) -> Splats:
-        """Return the Gaussians with a training photo's look in their colors, for viewers that know no looks.
-
-        look: the photo; by default the overview photo. Raises UserError if there is no look of this photo.
-        """
+        """Return the Gaussians with the look of a training photo (default: the overview photo) in their
+        colors, for viewers that know no looks. Raises UserError if there is no look of this photo."""
         chosen = self._look(look)
         if self.looks is None:
             return self.splats
@@ -315,15 +307,9 @@ class Scene:
         threshold: float | None = None,
         most: int = 10,
     ) -> Any:
-        """Find matches in the scene: return a `Found` for one prompt, a list of them for several.
-
-        Args:
-            texts, negatives, threshold: see `ask`.
-            most: number of views to return at most, at least 1.
-
-        Raises:
-            UserError: see `ask`; or `most` is below 1.
-        """
+        """Find matches in the scene: return a `Found` with at most `most` views for one prompt, a list of
+        them for several. For the other arguments see `ask`. Raises UserError as `ask` does, and if `most` is
+        below 1."""
         if most < 1:
             raise UserError(f"{most} views are requested: give 1 or more")
         found = self.places(self.ask(texts, negatives=negatives, threshold=threshold), most)
@@ -367,7 +353,6 @@ class Scene:
         many were written.
 
         Args:
-            path: the file.
             text: prompt; only the Gaussians that match it are written. None: all Gaussians are written.
             threshold: see `ask`.
             everything: with a text, write all Gaussians; a PLY has their relevancy as a property.
@@ -383,14 +368,13 @@ class Scene:
             return write_splats(Path(path), splats)
         question = self._one(text, threshold)
         relevancy, keep = question.relevancy[0], question.gaussians[0]
+        if not everything and not keep.any():
+            best, level = float(relevancy.max()), question.thresholds[0]
+            raise UserError(
+                f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
+                f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
+            )
         if not everything:
-            if not keep.any():
-                level = question.thresholds[0]
-                raise UserError(
-                    f"no Gaussian matches {question.prompts[0].text!r}: the best reaches "
-                    f"{float(relevancy.max()):.2f}; lower --threshold, now {level:.2f}, or write all with "
-                    "their relevancy (--all)"
-                )
             splats, relevancy = splats.select(keep), relevancy[keep]
         if index is not None:
             write_index(Path(index), keep)
@@ -475,19 +459,12 @@ class Scene:
         most: int = 5,
         size: int | None = None,
     ) -> list[tuple[str, float]]:
-        """Find the words that match a pixel best; return them with their relevancy, best first.
+        """Find at most `most` of the `words` (default: the shipped vocabulary of buildings) that match a
+        pixel best, with their relevancy, best first. x, y: its column and row in the view; see `camera`.
 
         The result is empty where the scene's Gaussians hardly cover the pixel or have no meaning, and at the
-        sky: where the sky or a generic phrase matches best, and no word is clearly better.
-
-        Args:
-            place, size: the view, see `camera`.
-            x, y: column and row in pixels of that view.
-            words: the words to choose from; default: the shipped vocabulary of buildings.
-            most: number of words to return at most.
-
-        Raises:
-            UserError: the pixel lies outside the view.
+        sky: where the sky or a generic phrase matches best, and no word is clearly better. Raises UserError
+        if the pixel lies outside the view.
         """
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
         camera = self.camera(place, size)
