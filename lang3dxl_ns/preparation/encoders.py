@@ -63,12 +63,10 @@ _VOCABULARIES = (
 
 
 class ImageTextEncoder:
-    """Images and texts in one space (CLIP, SigLIP, TIPSv2 …). Embeddings are projected, float32,
-    unnormalized.
-
-    `dim`: channels; `crop_size`: side in pixels of the pictures that the vision tower was trained on;
-    `patch_size`: side of its patches; `identity`: of the weights; `brightness`: mean value of the photos that
-    it has learned from, if it depends on that, else None."""
+    """Images and texts in one space: CLIP, SigLIP, TIPSv2 … Embeddings are projected, float32 and *not*
+    normalized. `dim`: channels; `crop_size`: side in pixels of the pictures that the vision tower was trained
+    on; `patch_size`: side of its patches; `identity`: of the weights; `brightness`: mean value of the photos
+    that it has learned from, if it depends on that, else None."""
 
     def __init__(
         self,
@@ -97,8 +95,7 @@ class ImageTextEncoder:
         """A photo as its crops should be cut from: in the light that the encoder knows."""
         return photo if self.brightness is None else in_known_light(photo, self.brightness)
 
-    # no_grad, not inference_mode: embeddings may enter autograd later, inference tensors can't
-    @torch.no_grad()
+    @torch.no_grad()  # not inference_mode: embeddings may enter autograd later, inference tensors can't
     def encode_images(self, crops: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n c"]:
         """Embeddings of square crops, RGB in 0…1, on the encoder's device; other sizes are resized first."""
         crops = _resize(crops.to(self._device, torch.float32), self.crop_size, self._resample)
