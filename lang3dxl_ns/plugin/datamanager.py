@@ -160,8 +160,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 f"a split of {self.config.dataparser.data} has no photo: add photos (a tenth is held out)"
             )
         photos, side = outputs.metadata["photos"], self.config.longer_side
-        large = sum(max(photo.width, photo.height) > side for photo in photos)
-        if large:
+        if large := sum(max(photo.width, photo.height) > side for photo in photos):
             _log(
                 f"{large} of {len(photos)} photos are larger than {side:,} pixels and used at that size "
                 "(--pipeline.datamanager.longer-side)"
@@ -373,8 +372,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def evaluated(
         self, dataset: PhotoDataset | None = None, names: Collection[str] | None = None
     ) -> EvalPhotos:
-        """Return photos of a dataset (default: the held-out ones) for evaluation. names: names of the photos;
-        default: all."""
+        """Return the photos of a dataset (default: the held-out ones) with these names (default: all)."""
         dataset = dataset or self.eval_dataset
 
         def ready() -> Callable[[int], tuple[Cameras, Batch]]:
@@ -400,11 +398,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if self.targets is not None and with_targets:
             name = dataset.photos[index].name
             clip = self.targets.clip(name)
-            found = {
-                "clip_target": clip.features,
-                "dense_target": self.targets.dense(name),
-                "regions": self.targets.regions(name),
-            }
+            found = {"clip_target": clip.features, "dense_target": self.targets.dense(name)}
+            found["regions"] = self.targets.regions(name)
             # Clone the values, so that they are read from disk now and not during the step.
             data |= {key: value.clone() for key, value in found.items() if value is not None}
             data["crop_sides"] = clip.crop_fractions
@@ -416,8 +411,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         batch: dict[str, Any] = {"image_idx": index, "name": dataset.photos[index].name}
         for key, value in data.items():
             if isinstance(value, Tensor):
-                value = to_device(value, self.device)
-                value = value.to(_IN_A_STEP.get(key, value.dtype))
+                value = to_device(value, self.device).to(_IN_A_STEP.get(key, value.dtype))
             batch[key] = value
         return dataset.cameras[index : index + 1], cast(Batch, batch)
 

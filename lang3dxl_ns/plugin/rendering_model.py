@@ -56,11 +56,8 @@ class RenderedAnswers:
 
 
 class RenderingModel(SplatfactoModel):
-    """Gaussians with colors, and optionally with semantic values and looks.
-
-    Viewers, `ns-render` and evaluations render through `get_outputs_for_camera`, training through
-    `get_outputs`.
-    """
+    """Gaussians with colors, and optionally with semantic values and looks. Viewers, `ns-render` and
+    evaluations render through `get_outputs_for_camera`, training through `get_outputs`."""
 
     config: ModelSettings
     strategy: Densification

@@ -44,8 +44,7 @@ def rasterize(
     get no gradient, because one would spoil every pixel of its tiles.
 
     Args:
-        gaussians: the Gaussians, world frame.
-        camera: where to render them from.
+        gaussians, camera: in the world frame.
         channels: values to composite over the background, such as activated colors.
         background: one value per channel; black by default.
         features: values composited over black, not divided by alpha.
@@ -129,10 +128,8 @@ def _check_sizes(
     gaussians: Gaussians, channels: Tensor, background: Tensor | None, features: Tensor | None
 ) -> None:
     count = len(gaussians.means)
-    parts = {"channels": channels, **vars(gaussians)}
+    parts = {"channels": channels, "features": features, **vars(gaussians)}
     sizes = {name: len(part) for name, part in parts.items() if isinstance(part, Tensor)}
-    if features is not None:
-        sizes["features"] = len(features)
     wrong = {name: size for name, size in sizes.items() if size != count}
     if wrong:
         raise ValueError(f"there are {count} means, but {wrong}")
