@@ -47,11 +47,6 @@ def nested_grids(height: int, width: int, tokens: int, side: int, sizes: int) ->
     )
 
 
-def mean_of_sizes(features: Float[Tensor, "sizes rows columns c"]) -> Float[Tensor, "rows columns c"]:
-    """Average the maps of all sizes."""
-    return features.mean(0)
-
-
 @torch.no_grad()
 def build_dense_map(
     photo: Float[Tensor, "h w 3"],
@@ -60,7 +55,7 @@ def build_dense_map(
     tokens: int,
     patch_size: int,
     batch_size: int,
-    join: JoinSizes = mean_of_sizes,
+    join: JoinSizes | None = None,
 ) -> Float[Tensor, "rows columns f"]:
     """Build the map: patch features of unit length, blended at each size, joined on the last grid.
 
@@ -69,14 +64,15 @@ def build_dense_map(
         grids: grid of patches of each size, the finest last (`map_grids`, `nested_grids`).
         encode: encodes windows of `tokens` patches per side, each of `patch_size` pixels (`encode_patches`).
         batch_size: windows encoded at once; fewer if memory runs out.
-        join: makes one map of those of all sizes, which are in the order of `grids`.
+        join: makes one map of those of all sizes, which are in the order of `grids`; default: their mean.
     """
     maps = []
     for grid in grids:
         one_size = partial(_one_size, photo, grid, encode, tokens, patch_size)
         features = with_less_memory(one_size, batch_size)
         maps.append(F.interpolate(features[None], grids[-1], mode="bilinear", align_corners=False)[0])
-    return join(torch.stack(maps).permute(0, 2, 3, 1)).contiguous()
+    sizes = torch.stack(maps).permute(0, 2, 3, 1)
+    return (sizes.mean(0) if join is None else join(sizes)).contiguous()
 
 
 def _one_size(

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.dense_map import mean_of_sizes
 from lang3dxl_ns.preparation.families import (
     FAMILIES,
     Family,
@@ -36,7 +35,6 @@ from lang3dxl_ns.preparation.model_files import (
     find_model,
     has_files,
     load_weights,
-    model_type,
     read_config,
     spoken,
     whole,
@@ -119,7 +117,7 @@ class ImageTextEncoder:
     def join_sizes(self, features: Float[Tensor, "sizes rows columns d"]) -> Float[Tensor, "rows columns c"]:
         """Join maps of windows of several sizes, coarse to fine: their mean, or what the head reads."""
         if self._head is None:
-            return mean_of_sizes(features)
+            return features.mean(0)
         # A few rows at a time, because the head's input is several times as wide as its output.
         return torch.cat([self._head(rows) for rows in features.split(_HEAD_ROWS, dim=1)])
 
@@ -180,7 +178,7 @@ def usual_dense(config: PreparationConfig, learned: bool) -> str:
 
 
 def _family(files: ModelFiles) -> Family:
-    kind = model_type(files)
+    kind = read_config(files).model_type
     if kind not in FAMILIES:
         raise UserError(
             f"{files.name} is a {kind} model: {spoken(files.option)} needs an image-text encoder in Hugging "
@@ -259,7 +257,7 @@ def _image_processor(files: ModelFiles) -> Any:
     from transformers import AutoImageProcessor, CLIPImageProcessor
 
     if not any(has_files(files.folder, f"{kind}_config.json") for kind in ("preprocessor", "processor")):
-        if model_type(files) == "clip":
+        if read_config(files).model_type == "clip":
             return CLIPImageProcessor()  # fine-tuned weights are often saved alone; CLIP's own statistics
         raise UserError(
             f"{files.folder} has no preprocessor_config.json: copy it from the model that this one was "
