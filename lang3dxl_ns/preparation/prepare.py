@@ -287,10 +287,8 @@ class _Maker:
         assert clip is not None
         lit, batch, size = clip.in_known_light(image), self._config.crop_batch, clip.crop_size
         if not task.grids:
-            crops = build_clip_target(
-                lit, task.crops.sides, clip.encode_images, size, batch, task.crops.steps
-            )
-            return {"features": crops.features, "valid": crops.valid}
+            crops = task.crops
+            return vars(build_clip_target(lit, crops.sides, clip.encode_images, size, batch, crops.steps))
         tokens, patch = size // clip.patch_size, clip.patch_size
         windows = max(_PATCHES_PER_CROP * batch // tokens**2, 1)
         features = build_dense_map(

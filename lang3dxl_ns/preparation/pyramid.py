@@ -24,7 +24,7 @@ class ClipTarget:
     """
 
     features: Float[Tensor, "hd wd c"]
-    """Mean embedding, float32, as output by the encoder (not normalized)."""
+    """Mean embedding, float32 unless stored, as output by the encoder (not normalized)."""
     valid: Float[Tensor, "hd wd"]
     """Mean share of the crops' area inside the photo, 0..1; the rest of a crop is black."""
 

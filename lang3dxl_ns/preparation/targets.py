@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from lang3dxl_ns.preparation.pyramid import ClipTarget
 from lang3dxl_ns.preparation.store import FeatureStore
 
 CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
@@ -19,13 +20,9 @@ _KEY = "lang3dxl"
 
 
 @dataclass
-class StoredClipTarget:
+class StoredClipTarget(ClipTarget):
     """CLIP target of a photo, memory-mapped (CPU, float16)."""
 
-    features: Float[Tensor, "hd wd c"]
-    """Mean embedding over the scales, not normalized."""
-    valid: Float[Tensor, "hd wd"]
-    """Mean share of the crops' area inside the photo, 0…1."""
     crop_fractions: list[float]
     """Crop sides as fractions of the photo's width, ascending."""
 
