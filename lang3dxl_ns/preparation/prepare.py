@@ -313,11 +313,11 @@ class _Maker:
         # of crops with the first layers' activations, which take a dozen times its size.
         largest = max(task.photo.width * task.photo.height for task in tasks)
         memory = config.workers * 3 * 4 * (3 * largest + 12 * config.crop_batch * crop_size**2)
-        workers = f" in {config.workers} processes" if config.workers > 1 else ""
+        split = f" in {config.workers} processes" if config.workers > 1 else ""
         say(
             f"preparing {len(tasks)} photos ({photos - len(tasks)} of {photos} are ready): "
             f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free",
-            f"memory beside the encoders: about {_gigabytes(memory)}{workers}, however many photos there are",
+            f"memory beside the encoders: about {_gigabytes(memory)}{split}, however many photos there are",
         )
         if clip:
             self._announce_duration(clip, dense, torch.device(device))
