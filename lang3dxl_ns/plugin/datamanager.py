@@ -166,11 +166,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 "(--pipeline.datamanager.longer-side)"
             )
         outputs.metadata["photos"] = [photo.at_most(side) for photo in photos]
-        return PhotoDataset(outputs, self.config.camera_res_scale_factor, self._working)
-
-    @cached_property
-    def _working(self) -> WorkingPhotos:
-        return WorkingPhotos(FeatureStore(self.cache_dir))
+        working = WorkingPhotos(FeatureStore(self.cache_dir))
+        return PhotoDataset(outputs, self.config.camera_res_scale_factor, working)
 
     def setup_train(self) -> None:
         """Prepare missing targets before training; give the model their statistics and the scene's needs."""

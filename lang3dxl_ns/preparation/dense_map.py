@@ -88,8 +88,9 @@ def _one_size(
     planes = photo.permute(2, 0, 1)[None]
     image = F.interpolate(planes, pixels, mode="bicubic", antialias=True).clamp(0, 1)[0]
     places = torch.cartesian_prod(*(window_starts(length, tokens) for length in grid))
-    side, tent = tokens * patch_size, _tent(tokens)
-    total, weight = torch.zeros(()), torch.zeros(grid)
+    side, rising = tokens * patch_size, torch.arange(1.0, tokens + 1)
+    slope = torch.minimum(rising, rising.flip(0))
+    tent, total, weight = torch.outer(slope, slope), torch.zeros(()), torch.zeros(grid)
     for part in places.split(batch_size):
         corners = (part * patch_size).tolist()
         windows = torch.stack([image[:, y : y + side, x : x + side] for y, x in corners])
@@ -108,9 +109,3 @@ def window_starts(length: int, tokens: int) -> Int[Tensor, " n"]:
     shared = round(_OVERLAP * tokens)
     count = max(math.ceil((length - shared) / (tokens - shared)), 1)
     return torch.linspace(0, max(length - tokens, 0), count).round().long()
-
-
-def _tent(tokens: int) -> Float[Tensor, "t t"]:
-    rising = torch.arange(1.0, tokens + 1)
-    side = torch.minimum(rising, rising.flip(0))
-    return torch.outer(side, side)
