@@ -14,7 +14,7 @@ _PUBLIC = {
     "Scene": "query.scene",
     "Match": "query.match",
     "Found": "query.match",
-    "train": "train_scene",
+    "train": "open_scene",
     "reconstruct": "scene.reconstruct:reconstruct_scene",
     "rasterize": "rendering",
     "UserError": "common.errors",

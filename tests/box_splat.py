@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from scenes import CENTER, HALF_SIZES, texture
 
-from lang3dxl_ns.rendering.splats import Splats, harmonics_of
+from lang3dxl_ns.rendering import Splats, harmonics_of
 
 
 def box_splat(spacing: float = 0.05, ground: bool = False) -> Splats:

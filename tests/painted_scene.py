@@ -16,7 +16,7 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.rendering.splats import Splats, harmonics_of
+from lang3dxl_ns.rendering import Splats, harmonics_of
 from lang3dxl_ns.scene.camera import Lens, camera_to_world
 
 WORDS = ("wall", "dome", "window", "object")

@@ -42,7 +42,6 @@ ORDER = (
     {"attachment"},
     {"plugin"},
     {"methods", "open_scene"},
-    {"train_scene"},
     {"commands"},
     {"cli"},
 )

@@ -49,8 +49,8 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import read_scene
+from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Pixels, gather
-from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.scene.camera import resized
 
 TRAINING_SEEDS = range(10_000, 20_000)

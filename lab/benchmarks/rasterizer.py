@@ -42,8 +42,7 @@ from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
-from lang3dxl_ns.rendering import rasterize
-from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering import Backend, rasterize
 from lang3dxl_ns.scene.camera import Camera, at_size
 
 OURS, TORCH, DENSE, GSPLAT = "lang3dxl", "torch kernels", "dense tiles", "gsplat"

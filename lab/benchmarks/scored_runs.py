@@ -231,7 +231,7 @@ def write_output_to(log: Path) -> None:
 
 
 def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
-    from lang3dxl_ns.common import timing
+    from lang3dxl_ns.common.reports import measure
     from lang3dxl_ns.evaluation.aggregate import average
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
@@ -239,7 +239,7 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     torch.manual_seed(run.seed)
     trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
     start, clock = _now(), time.perf_counter()
-    with timing.measure() as parts:
+    with measure() as parts:
         trainer.setup()
     set_up = _now() - start
     learned = set_up * sum(parts.get("learn targets", ())) / (time.perf_counter() - clock)

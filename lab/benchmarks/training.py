@@ -57,7 +57,7 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
 
     import torch
 
-    from lang3dxl_ns.common import timing
+    from lang3dxl_ns.common.reports import measure
     from lang3dxl_ns.methods import run_config
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
@@ -74,7 +74,7 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
     trainer.setup()
     _time_parts(trainer)
     start = time.perf_counter()
-    with timing.measure() as seconds:
+    with measure() as seconds:
         trainer.train()
     total = time.perf_counter() - start
     metrics = trainer.pipeline.get_average_eval_image_metrics()
@@ -97,7 +97,7 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
 
 def _time_parts(trainer: Any) -> None:
     """Wrap the trainer's own methods to time them."""
-    from lang3dxl_ns.common.timing import part
+    from lang3dxl_ns.common.reports import part
 
     def timed(name, function):
         def run(*args, **kwargs):

@@ -12,9 +12,8 @@ from torch import Tensor
 from lab.numerics.measure import Bounds, Case, Maps, Problem
 from lab.numerics.rasterizer_reference import rasterize_reference
 from lang3dxl_ns.common.kernels import numba_works
-from lang3dxl_ns.rendering import Gaussians, rasterize
+from lang3dxl_ns.rendering import Backend, Gaussians, rasterize
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
-from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.scene.camera import Camera
 
 NEAR = 0.01

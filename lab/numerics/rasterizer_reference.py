@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from lang3dxl_ns.rendering.gaussians import Gaussians, Raster
+from lang3dxl_ns.rendering import Gaussians, Raster
 from lang3dxl_ns.scene.camera import Camera
 
 PIXELS_AT_A_TIME = 64

@@ -26,7 +26,7 @@ from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 
 _LIGHT = 0.15
 """Deviation of the photos' brightness (natural logarithm) above which a message reports it."""

@@ -17,9 +17,7 @@ from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, regist
 from lang3dxl_ns.common.console import progress, tracked
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes
-from lang3dxl_ns.rendering.rasterize import rasterize
-from lang3dxl_ns.rendering.render import render
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats, rasterize, render
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 
@@ -79,12 +77,9 @@ def camera_in(similarity: Similarity | Float[Tensor, "4 4"], tracked: TrackedPho
 
 
 def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
-    """Find the frame in which renderings at the photos' cameras look like the photos.
-
-    The frames that programs use are tried first (`known_frames`, by the splat's file), then those from the
-    scene's shape. The best of them are refined by descent on the correlation. The result may be wrong, which
-    `Fit.fits` shows.
-    """
+    """Find the frame in which renderings at the photos' cameras look like the photos: try those that programs
+    use (`known_frames`, by the splat's file), then those from the scene's shape, and refine the best by
+    descent on the correlation. The result may be wrong, which `Fit.fits` shows."""
     small, large = _compared(collection, _FEW, _SMALL), _compared(collection, _MANY, _LARGE)
     best = _best(splats, small, known_frames(collection.reconstruction, splat))
     if best[0].score < FITS:
@@ -145,13 +140,11 @@ def _compared(collection: PhotoCollection, count: int, side: int) -> list[_Compa
     """Read some photos, evenly spread from the first to the last, at a longer side of `side` pixels."""
     found, last = [], len(collection.photos) - 1
     for i in np.linspace(0, last, min(count, last + 1)).round().astype(int):
-        photo = collection.photos[i]
-        scale = min(side / max(photo.width, photo.height), 1.0)
-        gray, mask = photo.read(scale).mean(-1), photo.read_mask(scale)
-        tracked = collection.reconstruction.photos[photo.name].resized(gray.shape[1], gray.shape[0])
-        found.append(
-            _Compared(tracked, gray, torch.ones_like(gray, dtype=torch.bool) if mask is None else mask)
-        )
+        photo = collection.photos[i].at_most(side)
+        gray, mask = photo.read().mean(-1), photo.read_mask()
+        tracked = collection.reconstruction.photos[photo.name].resized(photo.width, photo.height)
+        mask = torch.ones_like(gray, dtype=torch.bool) if mask is None else mask
+        found.append(_Compared(tracked, gray, mask))
     return found
 
 

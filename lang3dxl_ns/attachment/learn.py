@@ -17,7 +17,7 @@ from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.preparation.crop_plan import plan_crops
+from lang3dxl_ns.preparation.crop_sizes import plan_crops
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
@@ -26,8 +26,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
-from lang3dxl_ns.rendering.render import composite
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.scene.camera import Camera, camera_to_world, resized
 from lang3dxl_ns.scene.photo import Photo
 

@@ -14,8 +14,8 @@ from lang3dxl_ns.preparation.segmentation import TextSegmenter
 from lang3dxl_ns.query.learn_word import MARK_SIDE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.teach import Example
+from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
-from lang3dxl_ns.rendering.render import composite
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.photo import Photo
 
@@ -30,12 +30,9 @@ _LEAST, _MOST = 1e-3, 0.9
 def segmented(
     scene: Scene, word: str, segmenter: TextSegmenter, photos: Sequence[Photo], cameras: Mapping[str, Camera]
 ) -> Scene:
-    """Teach a scene a word by a segmenter; if that finds nothing, say so and return the same scene.
-
-    Each photo votes about the Gaussians that it shows, so the others outvote an error in one photo. The word
-    is then learned from the Gaussians with a majority, as from marks by a person. `cameras` holds the photos'
-    cameras, at the files' resolution, in the scene's frame.
-    """
+    """Teach a scene a word by a segmenter; if that finds nothing, say so and return the same scene. Each
+    photo votes about the Gaussians that it shows, and the word is learned from those with a majority, as from
+    marks by a person. `cameras` holds the photos' cameras, at the files' resolution, in the scene's frame."""
     masks: dict[str, Bool[Tensor, "h w"]] = {}
 
     def views() -> Iterator[tuple[Composite, Pixels]]:

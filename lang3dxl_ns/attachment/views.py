@@ -23,10 +23,9 @@ from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.visibility import fingerprint
+from lang3dxl_ns.rendering import Rendering, Splats, composite, render
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.rendering.projection import rotations
-from lang3dxl_ns.rendering.render import Rendering, composite, render
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, Lens, resized
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
@@ -133,11 +132,9 @@ def _axis(name: str) -> Float[Tensor, "3"]:
 
 
 def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCollection:
-    """Render this many pictures of a splat as a photo collection, in the splat's frame.
-
-    They are kept in `folder`, and rendered again only for another splat or other settings. Raises UserError
-    if no view shows the splat well.
-    """
+    """Render this many pictures of a splat as a photo collection, in the splat's frame. They are kept in
+    `folder`, and rendered again only for another splat or other settings. Raises UserError if no view shows
+    the splat well."""
     stamp = fingerprint(vars(splats.gaussians), [_RULE, count, up])
     kept = _kept(folder, stamp)
     cameras = kept or choose_views(splats, Extent.of(splats, up), count)
@@ -183,12 +180,9 @@ def _tracked(name: str, view: Rendering, chosen: np.random.Generator) -> Tracked
 
 
 def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
-    """Choose views that together show the most Gaussians at the size at which they were made.
-
-    Candidates are placed around the scene and in it, at several heights and distances. Those that are too
-    close to matter, show little, or show it blurred are dropped. From the rest, the one that adds most is
-    chosen, again and again. Raises UserError if no candidate is left.
-    """
+    """Choose views that together show the most Gaussians at the size at which they were made: of the
+    candidates that are not too close to matter, and show much of it and sharply, the one that adds most,
+    again and again. Raises UserError if no candidate is left."""
     sample = torch.linspace(0, len(splats) - 1, min(_SAMPLE, len(splats)), dtype=torch.float64).long()
     free = _FreeSpace(solids(splats), extent)
     views = list[tuple[Camera, Float[Tensor, " sample"], float]]()
@@ -226,8 +220,7 @@ def _judged(splats: Splats, camera: Camera, extent: Extent) -> tuple[Float[Tenso
         return None
     if float((view.depth[solid] < _CLOSE * extent.radius).float().mean()) > _MOST_CLOSE:
         return None
-    draw = partial(composite, splats, small)
-    pixels = filled_pixels(draw, torch.ones_like(view.alpha), len(splats))
+    pixels = filled_pixels(partial(composite, splats, small), torch.ones_like(view.alpha), len(splats))
     seen = pixels > 0.1
     if not seen.any():
         return None

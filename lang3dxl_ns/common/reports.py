@@ -1,4 +1,4 @@
-"""Reports: machine description, peak memory, and atomic JSON and markdown."""
+"""Measurements and reports: time by parts, peak memory, machine description, atomic JSON and markdown."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +59,33 @@ def host_peak() -> int:
     import resource  # absent on Windows
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
+
+
+_seconds: dict[str, list[float]] | None = None
+
+
+@contextmanager
+def part(name: str) -> Iterator[None]:
+    """Time the enclosed block as `name`. Does nothing outside `measure()`."""
+    if _seconds is None:
+        yield
+        return
+    synchronize()
+    start = time.perf_counter()
+    yield
+    synchronize()
+    _seconds[name].append(time.perf_counter() - start)
+
+
+@contextmanager
+def measure() -> Iterator[dict[str, list[float]]]:
+    """Collect the seconds of every enclosed `part`. Yields {name: one entry per visit}."""
+    global _seconds
+    _seconds = defaultdict(list)
+    try:
+        yield _seconds
+    finally:
+        _seconds = None
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

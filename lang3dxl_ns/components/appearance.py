@@ -1,8 +1,7 @@
-"""Appearance field: photo-dependent color shifts of the Gaussians, controlled by a vector per photo.
+"""Appearance field: a network that takes a Gaussian's position and base color and a photo's vector, and
+predicts the Gaussian's color shift in that photo (SWAG, Dahmani et al. 2024, as used in Lang3D-XL).
 
-One photo is taken at noon, the next at dusk. A small network takes a Gaussian's position, its base color and
-the photo's vector, and predicts its color shift in that photo (SWAG, Dahmani et al. 2024, as used in
-Lang3D-XL). Only colors, and optionally opacities, depend on the photo; semantics never do.
+Only colors, and optionally opacities, depend on the photo; semantics never do.
 """
 
 from __future__ import annotations
@@ -22,10 +21,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.components.hash_grid import HashGrid
 from lang3dxl_ns.components.linear import linear
-from lang3dxl_ns.rendering.gaussians import Gaussians
-from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import Rendering, render
-from lang3dxl_ns.rendering.splats import Splats, harmonics_of
+from lang3dxl_ns.rendering import Backend, Gaussians, Rendering, Splats, harmonics_of, render
 from lang3dxl_ns.scene.camera import Camera, in_view
 
 HIDDEN = 64
@@ -64,17 +60,12 @@ class AppearanceConfig:
 
 
 class AppearanceField(nn.Module):
-    """Network that computes the colors of Gaussians under one photo's look.
+    """Network that computes the colors of Gaussians under one photo's look; untrained, it changes nothing.
 
-    Before training it changes nothing. Vectors belong to photos by name: a checkpoint's vectors stay with
-    their photos whichever photos the present run has, and new photos get fresh vectors.
-
-    Args:
-        config: the settings.
-        names: names of the training photos.
-        center: center of the scene, world units.
-        radius: distance from the center that contains most of the scene, world units.
-        generator: source of the initial weights and vectors.
+    Vectors belong to the training photos by their `names`: a checkpoint's vectors stay with their photos
+    whichever photos the present run has, and new photos get fresh vectors. `center` and `radius` (the
+    distance from it that contains most of the scene) are in world units; `generator` draws the initial
+    weights and vectors.
     """
 
     def __init__(
@@ -122,16 +113,10 @@ class AppearanceField(nn.Module):
         visible: Int[Tensor, " m"],
         seed: int | None = None,
     ) -> tuple[Float[Tensor, "n 3"], Gaussians]:
-        """Compute colors, and with `opacity_shift` also opacities, under a photo's vector. Positions get no
-        gradient.
-
-        Args:
-            gaussians: Gaussians in the world frame, which are returned unchanged without `opacity_shift`.
-            colors: colors before the shift, at least 0, as after it.
-            vector: the photo's vector.
-            visible: rows of the Gaussians to change; the others stay as they are.
-            seed: seed of the opacity shift's noise in training; None for no noise.
-        """
+        """Compute colors, and with `opacity_shift` also opacities, of the Gaussians (world frame) in the rows
+        `visible` under a photo's vector; the others stay as they are. Colors are at least 0, before and after
+        the shift. Positions get no gradient. `seed` is that of the opacity shift's noise in training; None
+        for no noise."""
         base = colors[visible]
         features = torch.cat((self.grid(self._unit_cube(gaussians.means[visible])), base), 1)
         hidden = F.relu(self.from_gaussian(features) + self.from_photo(vector))

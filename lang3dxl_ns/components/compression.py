@@ -1,10 +1,8 @@
 """Compression of per-Gaussian features to a few numbers each, decoded by a semantic field.
 
-The codes are found by direct regression, without rendering. Each Gaussian is decoded before compositing, so
-codes of neighbors never blend into a third one with another meaning.
-
-The field is trained on a sample of the Gaussians. Then every Gaussian gets the code that decodes nearest to
-its feature, so the work beyond the sample is one search per Gaussian.
+The field and the codes of a sample of the Gaussians are found by direct regression, without rendering. Then
+every Gaussian gets the code that decodes nearest to its feature. Each is decoded before compositing, so codes
+of neighbors never blend into a third one with another meaning.
 """
 
 from __future__ import annotations
@@ -63,9 +61,8 @@ class CompressionConfig:
     """Adam's learning rate for the field."""
 
     def grown(self, count: int) -> CompressionConfig:
-        """Multiply steps and sample for `count` Gaussians by √(count / sample), rounded, in 1…3.
-
-        A field that has seen few of many Gaussians matches those few, and the others less."""
+        """Multiply steps and sample for `count` Gaussians by √(count / sample), rounded, in 1…3. A field that
+        has seen few of many Gaussians matches those few, and the others less."""
         factor = min(max(round(math.sqrt(count / self.sample)), 1), _MOST_GROWTH)
         return replace(self, steps=factor * self.steps, sample=factor * self.sample)
 
@@ -98,18 +95,12 @@ def fit(
     advance: Callable[[], None] = lambda: None,
     blends: float = 0.0,
 ) -> Float[Tensor, "m code"]:
-    """Train the field and the codes of these Gaussians together, and return the codes.
+    """Train the field (in place) and the codes of these Gaussians together, and return the codes.
 
-    The loss is the mean absolute difference over Gaussians drawn with probability ∝ √mass.
-
-    Args:
-        sample: the Gaussians' features.
-        field: the field, which is trained in place.
-        config: steps, batch and rates.
-        generator: source of the draws.
-        advance: called after every step.
-        blends: fraction of the draws that are replaced by blends of two Gaussians, whose codes decode to the
-            same blend of their features. Codes are then not searched anew, which would scatter them.
+    The loss is the mean absolute difference over Gaussians that `generator` draws with probability ∝ √mass.
+    `advance` is called after every step. `blends` is the fraction of the draws that are replaced by blends of
+    two Gaussians, whose codes decode to the same blend of their features. Codes are then not searched anew,
+    which would scatter them.
     """
     place = field.output_mean
     if not len(sample):
@@ -189,9 +180,8 @@ def assign(
 
 @torch.no_grad()
 def centered_cosine(gathered: Gathered, field: SemanticField, codes: Float[Tensor, "n code"]) -> float:
-    """Compute the mean cosine of decoded and given features, both less the mean feature.
-
-    It is 1 if nothing is lost. Without centering, even the mean feature has a cosine above 0.9 with all."""
+    """Compute the mean cosine of decoded and given features, both less the mean feature, 1 if nothing is
+    lost. Without centering, even the mean feature has a cosine above 0.9 with all."""
     features = gathered.features
     if not len(features):
         return 1.0
@@ -261,9 +251,8 @@ class _LearningField(SemanticField):
 
 
 class CompressedField(_LearningField):
-    """Semantic field of a scene whose features are gathered onto its Gaussians after training.
-
-    It decodes each Gaussian's code before compositing. During training there are no codes."""
+    """Semantic field of a scene whose features are gathered onto its Gaussians after training. It decodes
+    each Gaussian's code before compositing. During training there are no codes."""
 
     per_gaussian = True
     needs_lifting = True

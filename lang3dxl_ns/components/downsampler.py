@@ -1,12 +1,9 @@
 """Attenuated downsampler: from a decoded feature map to the grid of the CLIP targets.
 
-A CLIP target is a mean over crops of several sizes, so each cell covers a wide neighborhood. The
-downsampler blurs the decoded map likewise before the two are compared. It multiplies a fixed kernel with the
-footprint of the crops by learned per-pixel weights, which choose the pixels that count inside the window. It
-is used in training only; queries read the decoded map itself.
-
-Every kernel here is a sum of boxes, and therefore separable: sum_j A_j X B_jᵀ, where the small matrices A_j
-and B_j contain window, resize and centering along each axis.
+A CLIP target is a mean over crops of several sizes, so each cell covers a wide neighborhood. In training the
+decoded map is blurred likewise before the two are compared: a fixed kernel with the footprint of the crops is
+multiplied by learned per-pixel weights. Every kernel is a sum of boxes, and therefore separable: sum_j A_j X
+B_jᵀ, where the small matrices A_j and B_j contain window, resize and centering along each axis.
 """
 
 from __future__ import annotations

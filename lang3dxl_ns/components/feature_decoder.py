@@ -38,11 +38,8 @@ class Decoder(nn.Module, ABC):
     """Interface of the semantic field and of other ways to store features on Gaussians.
 
     The model gives every Gaussian `initial_codes`, renders `carried` values, and decodes the rendered map.
-    Outputs are raw (not unit length) CLIP features and, if configured, dense features.
-
-    Args:
-        clip_dim: channels of the CLIP features.
-        dense_dim: channels of the dense features; 0 for none.
+    Outputs are raw (not unit length) CLIP features of `clip_dim` channels and, unless `dense_dim` is 0, dense
+    features of that many.
     """
 
     def __init__(self, clip_dim: int, dense_dim: int) -> None:

@@ -16,7 +16,7 @@ from torch.nn import Parameter
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.rendering.splats import harmonics_of
+from lang3dxl_ns.rendering import harmonics_of
 
 FIRST_OPACITY = 0.1
 FEWEST = 4

@@ -142,13 +142,8 @@ class SemanticField(Decoder):
     """Decoder of rendered codes to raw (not unit length) CLIP features and, if configured, dense features.
 
     Codes may be any number: ±inf decode to finite features, NaN to NaN in their own pixel alone. Everything
-    is per pixel, so large maps can be decoded in chunks.
-
-    Args:
-        config: the settings.
-        clip_dim: channels of the CLIP features.
-        dense_dim: channels of the dense features; 0 omits the dense head.
-        generator: source of the initial weights.
+    is per pixel, so large maps can be decoded in chunks. A `dense_dim` of 0 omits the dense head; `generator`
+    draws the initial weights.
     """
 
     def __init__(

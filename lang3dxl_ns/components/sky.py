@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.rendering.gaussians import Gaussians
-from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
+from lang3dxl_ns.rendering import Gaussians, spherical_harmonics
 
 DEGREE = 2
 """Degree of the spherical harmonics."""

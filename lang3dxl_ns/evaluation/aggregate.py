@@ -51,13 +51,10 @@ Figures = Mapping[str, float]
 
 
 def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str, Any]:
-    """Average every figure over the photos that have it, and add totals.
-
-    `{prefix}map` is the unweighted mean of average precision over the categories. `{prefix}miou`,
-    `{prefix}localization_accuracy` etc. are means over all pairs of a photo and a category.
-    `ap_{category}_photos` is the number of photos with that category. `with_deviation` adds `…_std` for every
-    mean, the sample standard deviation, which is 0 for a single photo.
-    """
+    """Average every figure over the photos that have it, and add totals: `{prefix}map`, the unweighted mean
+    of average precision over the categories; `{prefix}miou` etc. (`TOTALS`), means over all pairs of a photo
+    and a category; and `ap_{category}_photos`, the number of photos with that category. `with_deviation` adds
+    `…_std` for every mean, the sample standard deviation, which is 0 for a single photo."""
     values = _by_name(photos)
     means: dict[str, Any] = {name: float(np.mean(found)) for name, found in values.items()}
     totals = _mean_average_precisions(means)
@@ -87,12 +84,10 @@ def _mean_average_precisions(means: Figures) -> dict[str, float]:
 
 
 def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
-    """Aggregate figures of several scenes in the two ways in which a benchmark's table can be read.
-
-    In `image_pooled`, the `average` over all photos, each photo counts alike, as in the published tables of
+    """Aggregate figures of several scenes in the two ways in which a benchmark's table can be read. In
+    `image_pooled`, the `average` over all photos, each photo counts alike, as in the published tables of
     HolyScenes. In `scene_mean`, the mean of the scenes' means, each scene with a category counts alike; its
-    `map` is the mean of those over categories. `per_scene` has the `average` of each scene.
-    """
+    `map` is the mean of those over categories. `per_scene` has the `average` of each scene."""
     per_scene = {name: average(photos) for name, photos in scenes.items()}
     values = _by_name(per_scene.values())
     means = {name: float(np.mean(v)) for name, v in values.items() if not name.endswith("_photos")}

@@ -1,8 +1,7 @@
 """Half-image protocol: the look of an unseen photo is fitted on its left half, and its right half is scored.
 
-The lighting of an unseen photo is unknown, so comparing the whole photo mostly measures how well its lighting
-was guessed. NeRF in the Wild (Martin-Brualla et al. 2021), WildGaussians and NerfBaselines therefore fit the
-lighting on half of the photo.
+Comparing the whole of an unseen photo mostly measures how well its lighting was guessed. NeRF in the Wild
+(Martin-Brualla et al. 2021), WildGaussians and NerfBaselines therefore fit it on half of the photo.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from torch import Tensor
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.losses import rgb_loss
-from lang3dxl_ns.rendering.rasterize import Backend, rasterize
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Backend, Splats, rasterize
 from lang3dxl_ns.scene.camera import Camera, in_view
 
 STEPS = 64

@@ -12,10 +12,8 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.rendering import Backend, Splats, composite
 from lang3dxl_ns.rendering.gathering import Pixels, gather
-from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import composite
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera
 
 Masks = Mapping[str, Bool[Array, "h w"]]

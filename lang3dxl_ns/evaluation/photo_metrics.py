@@ -97,12 +97,9 @@ def feature_metrics(
     mean: Float[Tensor, " c"],
     weight: Float[Tensor, "h w"] | None = None,
 ) -> dict[str, float]:
-    """Compute L1, PSNR (peak 1) and cosine of `predicted`, and the same for predicting the `mean` everywhere.
-
-    Features are compared on the encoder's own scale, as in Lang3D-XL's encoder ablation. Cells of zero weight
-    (no foreground) are ignored. Keys are `{kind}_l1`, `{kind}_psnr` and `{kind}_cosine`, and the same with
-    `_of_mean` appended.
-    """
+    """Compute L1, PSNR (peak 1) and cosine of `predicted`, `{kind}_l1` etc., and the same for predicting the
+    `mean` everywhere, with `_of_mean` appended. Features are compared on the encoder's own scale, as in
+    Lang3D-XL's encoder ablation. Cells of zero weight (no foreground) are ignored."""
     cells = target.new_ones(target.shape[:2], dtype=torch.bool) if weight is None else weight > 0
     if not cells.any():
         return {}

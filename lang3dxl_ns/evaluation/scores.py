@@ -43,12 +43,9 @@ def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"
 
 
 def score_map(score: Float[Array, "h w"], truth: Truth, smooth: bool = False) -> dict[str, float]:
-    """Compute all measures of a map; empty if the object is not in the photo, where AP is undefined.
-
-    `ap` is the average precision. The measures of `overlap` use the pixels above 0.5. `located` is 1 if the
-    highest pixel lies in a box, or on the mask if there are no boxes, else 0 (LERF's accuracy). `smooth` adds
-    `smooth_located` and the `overlap` of LangSplat's mask, `smooth_iou` etc.
-    """
+    """Compute all measures of a map; empty if the object is not in the photo, where AP is undefined. They are
+    average precision (`ap`), those of `overlap` for the pixels above 0.5, and `located` (LERF's accuracy).
+    `smooth` adds `smooth_located` and the `overlap` of LangSplat's mask, `smooth_iou` etc."""
     precision = average_precision(score, truth.mask)
     if precision is None:
         return {}
@@ -78,7 +75,8 @@ def overlap(found: Bool[Array, "h w"], truth: Bool[Array, "h w"]) -> dict[str, f
 
 
 def located(score: Float[Array, "h w"], truth: Truth) -> float:
-    """Return 1 if any of the highest pixels lies on the object, else 0. A constant map locates nothing."""
+    """Return 1 if one of the highest pixels lies in a box, or on the mask if there are no boxes, else 0. A
+    constant map locates nothing."""
     highest = score == score.max()
     if highest.all():
         return 0.0
@@ -208,19 +206,16 @@ class MapScorer:
         temperature: float = 1.0,
         of_published_prompts: Maps | None = None,
     ) -> dict[str, Maps]:
-        """Return the maps to score, by the prefix of their figures.
-
-        For masks, "" is blurred, "raw_" unprocessed, and "authors_" processed by `as_published`. For
-        LERF-OVS, whose measures include smoothing, there is only "", unprocessed. Maps are set to 0 outside
-        `keep`, before and after the blur. "authors_" is made from `of_published_prompts`, or from `maps` if
-        that is None.
-        """
+        """Return the maps to score, by the prefix of their figures: for masks "" (blurred), "raw_"
+        (unprocessed) and "authors_" (`of_published_prompts`, or else `maps`, processed by `as_published`);
+        for LERF-OVS, whose measures include smoothing, "" alone, unprocessed. Maps are set to 0 outside
+        `keep`, before and after the blur."""
         raw = inside(maps, keep)
         if self.smooths:
             return {"": raw}
-        of_published_prompts = maps if of_published_prompts is None else of_published_prompts
-        published = as_published(inside(softened(of_published_prompts, temperature), keep))
-        return {"": inside(blurred(raw), keep), "raw_": raw, "authors_": published}
+        published = softened(of_published_prompts or maps, temperature)
+        authors = as_published(inside(published, keep))
+        return {"": inside(blurred(raw), keep), "raw_": raw, "authors_": authors}
 
     def scores(
         self, photo: str, variants: Mapping[str, Maps], truths: Mapping[str, Truth] | None = None

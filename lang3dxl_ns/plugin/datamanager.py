@@ -28,13 +28,13 @@ from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.common.settings_help import showing, without
-from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for, recorded_scene
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
-from lang3dxl_ns.preparation.crop_plan import CropPlan, plan_crops
+from lang3dxl_ns.preparation.crop_sizes import CropPlan, plan_crops
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
@@ -160,18 +160,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 f"a split of {self.config.dataparser.data} has no photo: add photos (a tenth is held out)"
             )
         photos, side = outputs.metadata["photos"], self.config.longer_side
-        large = sum(max(photo.width, photo.height) > side for photo in photos)
-        if large:
+        if large := sum(max(photo.width, photo.height) > side for photo in photos):
             _log(
                 f"{large} of {len(photos)} photos are larger than {side:,} pixels and used at that size "
                 "(--pipeline.datamanager.longer-side)"
             )
         outputs.metadata["photos"] = [photo.at_most(side) for photo in photos]
-        return PhotoDataset(outputs, self.config.camera_res_scale_factor, self._working)
-
-    @cached_property
-    def _working(self) -> WorkingPhotos:
-        return WorkingPhotos(FeatureStore(self.cache_dir))
+        working = WorkingPhotos(FeatureStore(self.cache_dir))
+        return PhotoDataset(outputs, self.config.camera_res_scale_factor, working)
 
     def setup_train(self) -> None:
         """Prepare missing targets before training; give the model their statistics and the scene's needs."""
@@ -373,8 +369,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def evaluated(
         self, dataset: PhotoDataset | None = None, names: Collection[str] | None = None
     ) -> EvalPhotos:
-        """Return photos of a dataset (default: the held-out ones) for evaluation. names: names of the photos;
-        default: all."""
+        """Return the photos of a dataset (default: the held-out ones) with these names (default: all)."""
         dataset = dataset or self.eval_dataset
 
         def ready() -> Callable[[int], tuple[Cameras, Batch]]:
@@ -400,11 +395,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if self.targets is not None and with_targets:
             name = dataset.photos[index].name
             clip = self.targets.clip(name)
-            found = {
-                "clip_target": clip.features,
-                "dense_target": self.targets.dense(name),
-                "regions": self.targets.regions(name),
-            }
+            found = {"clip_target": clip.features, "dense_target": self.targets.dense(name)}
+            found["regions"] = self.targets.regions(name)
             # Clone the values, so that they are read from disk now and not during the step.
             data |= {key: value.clone() for key, value in found.items() if value is not None}
             data["crop_sides"] = clip.crop_fractions
@@ -416,8 +408,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         batch: dict[str, Any] = {"image_idx": index, "name": dataset.photos[index].name}
         for key, value in data.items():
             if isinstance(value, Tensor):
-                value = to_device(value, self.device)
-                value = value.to(_IN_A_STEP.get(key, value.dtype))
+                value = to_device(value, self.device).to(_IN_A_STEP.get(key, value.dtype))
             batch[key] = value
         return dataset.cameras[index : index + 1], cast(Batch, batch)
 

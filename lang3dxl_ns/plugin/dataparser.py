@@ -105,14 +105,12 @@ class PhotoCollectionDataParser(ColmapDataParser):
         return outputs
 
     def _get_image_indices(self, image_filenames, split):
-        if self.config.held_out is not None:
-            folder = self._images_folder
-            held_out = self._held_out([Path(p).relative_to(folder).as_posix() for p in image_filenames])
-            everything = np.arange(len(image_filenames))
-            wanted = np.isin(everything, held_out, invert=split == "train")
-            indices = everything[wanted]
-        else:
+        if self.config.held_out is None:
             indices = super()._get_image_indices(image_filenames, split)
+        else:
+            names = [Path(p).relative_to(self._images_folder).as_posix() for p in image_filenames]
+            held_out = np.isin(np.arange(len(names)), self._held_out(names))
+            indices = np.flatnonzero(held_out != (split == "train"))
         if len(indices) == 0:
             raise UserError(
                 f"the {split} split of {self.config.data} has no photo (of {len(image_filenames)} in all): "
@@ -128,10 +126,8 @@ class PhotoCollectionDataParser(ColmapDataParser):
             forms = [(p, str(PurePosixPath(p).with_suffix("")), PurePosixPath(p).stem) for p in photos]
             found = [i for i, known in enumerate(forms) if name in known]
             if len(found) != 1:
-                raise UserError(
-                    f"{self.config.held_out} names {name}, which fits {len(found)} photos of the scene: "
-                    f"correct the list"
-                )
+                fits = f"which fits {len(found)} photos of the scene: correct the list"
+                raise UserError(f"{self.config.held_out} names {name}, {fits}")
             indices += found
         return indices
 
@@ -194,10 +190,8 @@ class PhotoCollectionDataParser(ColmapDataParser):
             model, self._images_folder, self._mask_path, self.config.follow_links
         )
         if len(self.photos) == 1:
-            raise UserError(
-                f"{self.config.data} has one usable photo: a scene needs at least two, one to "
-                f"learn from and one to hold out"
-            )
+            need = "a scene needs at least two, one to learn from and one to hold out"
+            raise UserError(f"{self.config.data} has one usable photo: {need}")
         if not self.photos:
             raise UserError(
                 f"none of the model's {len(self._left_out)} photos can be used; "

@@ -22,7 +22,7 @@ from torch.nn import Parameter
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
-from lang3dxl_ns.common.timing import part
+from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components import losses
 from lang3dxl_ns.components.initialization import (
     EVERY,

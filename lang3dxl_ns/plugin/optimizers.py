@@ -1,8 +1,7 @@
 """Optimizers: Adam with a guard before each step, learning rates and other schedules of runs of any length.
 
 A schedule is a function of x, the run's fraction, and keeps its nearest end value outside [0, 1]. All return
-Python floats, because a NumPy scalar would end up in optimizer state and checkpoints, where a safe loader
-rejects it.
+Python floats, because a safe loader rejects NumPy scalars in checkpoints.
 """
 
 from __future__ import annotations

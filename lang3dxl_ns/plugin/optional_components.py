@@ -1,7 +1,4 @@
-"""Optional components of the model: smooth sky, camera refinement, semantics, and lighting.
-
-A component is an attribute of the model, after which a checkpoint names its tensors.
-"""
+"""Optional components, attributes of the model: smooth sky, camera refinement, semantics, and lighting."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.timing import part
+from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.decoders import make_decoder
@@ -92,8 +89,7 @@ def match_components(model: RenderingModel, state: Mapping[str, Any]) -> None:
 
 def build_sky(model: RenderingModel) -> None:
     """Add the sky's colors as one smooth function, only where photos share one lighting: elsewhere it
-    degrades words (docs/lab/short_and_long_runs.md). Without it the sky's Gaussians are trained like all
-    others."""
+    degrades words (docs/lab/short_and_long_runs.md)."""
     count = model.config.sky_gaussians
     model.sky, model.strategy.still = Sky(model.means.detach()[:count] - model.extent[0]), count
     model.gauss_params["opacities"].data[:count] = torch.logit(torch.tensor(OPACITY))

@@ -38,12 +38,8 @@ _TYPING = 0.5
 
 
 class AskPanel(ViewerControl):
-    """A text box, heat maps over the view, and the views that show a match best.
-
-    nerfstudio's viewer finds the panel as an attribute of the pipeline, and sets it up on start.
-
-    pipeline: the `Lang3DXLPipeline`, whose module imports this one.
-    """
+    """A text box, heat maps over the view, and the views that show a match best. nerfstudio's viewer finds
+    the panel as an attribute of the pipeline (whose module imports this one), and sets it up on start."""
 
     def __init__(self, pipeline: Any) -> None:
         guard_viewers()  # must precede the server that nerfstudio starts

@@ -56,14 +56,9 @@ class PhotoDataset(InputDataset):
 
 
 class EvalPhotos:
-    """Photos as (camera, batch) pairs, one in memory at a time; damaged ones are left out and logged.
-
-    Args:
-        dataset: the photos.
-        ready: called when iteration begins; returns a function that reads a photo's camera and batch by its
-            index, and raises UserError for a photo that can't be used.
-        names: names of the photos to evaluate; default: all.
-    """
+    """Photos of a dataset (default: all; else those with these names) as (camera, batch) pairs, one in memory
+    at a time; damaged ones are left out and logged. `ready` is called when iteration begins, and returns a
+    function that reads a photo by its index, and raises UserError for one that can't be used."""
 
     def __init__(
         self,

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.image import fitted_size
-from lang3dxl_ns.common.timing import part
+from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.feature_decoder import Decoder
@@ -60,11 +60,8 @@ class RenderedAnswers:
 
 
 class RenderingModel(SplatfactoModel):
-    """Gaussians with colors, and optionally with semantic values and looks.
-
-    Viewers, `ns-render` and evaluations render through `get_outputs_for_camera`, training through
-    `get_outputs`.
-    """
+    """Gaussians with colors, and optionally with semantic values and looks. Viewers, `ns-render` and
+    evaluations render through `get_outputs_for_camera`, training through `get_outputs`."""
 
     config: ModelSettings
     strategy: Densification

@@ -126,10 +126,8 @@ class Lang3DXLTrainer(Trainer):
             torch.set_autocast_dtype(config.machine.device_type, torch.bfloat16 if wide else torch.float16)
             self.use_grad_scaler = config.use_grad_scaler or not wide
             self.grad_scaler = GradScaler(enabled=self.use_grad_scaler)
-            if on_cpu:
-                CONSOLE.print(
-                    "It is enabled after all: this CPU multiplies bfloat16."
-                )  # after nerfstudio's line
+            if on_cpu:  # nerfstudio has just said the opposite
+                CONSOLE.print("It is enabled after all: this CPU multiplies bfloat16.")
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up, then seed, so that preparation does not affect the run's randomness. A scene description is
@@ -276,9 +274,9 @@ class Lang3DXLTrainer(Trainer):
             rendering = perf_counter() - start
             model.train()
         count, decoder = self.config.max_num_iterations, model.semantic_field
-        seconds = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings]
-        line, words = f"training: {roughly(seconds)} for {count:,} iterations", 0.0
-        if decoder is not None and self.pipeline.has_words_to_learn:
+        seconds, words = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings], 0.0
+        line = f"training: {roughly(seconds)} for {count:,} iterations"
+        if decoder is not None and decoder.needs_lifting:
             words = rendering * len(cameras) * RENDERINGS_PER_PHOTO
             words += decoder.learning_seconds(model.num_points)
             line += f", then {roughly(words)} to learn words"
@@ -321,22 +319,20 @@ class Lang3DXLTrainer(Trainer):
         if self._last_iteration < self._start_step:
             return "Nothing was learned yet"
         self.save_checkpoint(self._last_iteration)
-        return (
-            f"Stopped after {self._last_iteration + 1} iterations with a checkpoint; to resume: the same "
-            f"command with --load-dir {self.checkpoint_dir}"
-        )
+        return self._how_to_resume(self._last_iteration)
+
+    def _how_to_resume(self, step: int) -> str:
+        folder = self.checkpoint_dir
+        return f"Stopped after {step + 1} iterations. To resume: the same command with --load-dir {folder}"
 
     def _out_of_memory(self) -> str:
         """Describe what happened and what helps. The latest checkpoint is not replaced, since the interrupted
         step may have left incomplete tensors."""
         count = self.pipeline.model.num_points
         when = "while learning words" if self._is_ending else f"at iteration {self.step}"
-        saved = max(self.checkpoint_dir.glob("step-*.ckpt"), default=None)
-        kept = (
-            f"{saved} is kept: --load-dir {self.checkpoint_dir} resumes there"
-            if saved
-            else "none is saved yet"
-        )
+        saved, kept = max(self.checkpoint_dir.glob("step-*.ckpt"), default=None), "none is saved yet"
+        if saved is not None:
+            kept = f"{saved} is kept: --load-dir {self.checkpoint_dir} resumes there"
         return (
             f"out of memory {when} with {count:,} Gaussians. Three settings help: "
             f"--pipeline.model.max-gaussians {count // 2}, --pipeline.datamanager.camera-res-scale-factor "
@@ -354,11 +350,7 @@ class Lang3DXLTrainer(Trainer):
             self._learn_words()
         if self.interrupted:
             self.config.viewer.quit_on_train_completion = True
-            CONSOLE.print(
-                f"Stopped after {self.step + 1} iterations. To resume: the same command with "
-                f"--load-dir {self.checkpoint_dir}",
-                soft_wrap=True,
-            )
+            CONSOLE.print(self._how_to_resume(self.step), soft_wrap=True)
         super()._after_train()  # saves first
 
     def write_scene(self) -> None:

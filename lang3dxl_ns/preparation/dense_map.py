@@ -47,11 +47,6 @@ def nested_grids(height: int, width: int, tokens: int, side: int, sizes: int) ->
     )
 
 
-def mean_of_sizes(features: Float[Tensor, "sizes rows columns c"]) -> Float[Tensor, "rows columns c"]:
-    """Average the maps of all sizes."""
-    return features.mean(0)
-
-
 @torch.no_grad()
 def build_dense_map(
     photo: Float[Tensor, "h w 3"],
@@ -60,7 +55,7 @@ def build_dense_map(
     tokens: int,
     patch_size: int,
     batch_size: int,
-    join: JoinSizes = mean_of_sizes,
+    join: JoinSizes | None = None,
 ) -> Float[Tensor, "rows columns f"]:
     """Build the map: patch features of unit length, blended at each size, joined on the last grid.
 
@@ -69,14 +64,15 @@ def build_dense_map(
         grids: grid of patches of each size, the finest last (`map_grids`, `nested_grids`).
         encode: encodes windows of `tokens` patches per side, each of `patch_size` pixels (`encode_patches`).
         batch_size: windows encoded at once; fewer if memory runs out.
-        join: makes one map of those of all sizes, which are in the order of `grids`.
+        join: makes one map of those of all sizes, which are in the order of `grids`; default: their mean.
     """
     maps = []
     for grid in grids:
         one_size = partial(_one_size, photo, grid, encode, tokens, patch_size)
         features = with_less_memory(one_size, batch_size)
         maps.append(F.interpolate(features[None], grids[-1], mode="bilinear", align_corners=False)[0])
-    return join(torch.stack(maps).permute(0, 2, 3, 1)).contiguous()
+    sizes = torch.stack(maps).permute(0, 2, 3, 1)
+    return (sizes.mean(0) if join is None else join(sizes)).contiguous()
 
 
 def _one_size(
@@ -92,8 +88,9 @@ def _one_size(
     planes = photo.permute(2, 0, 1)[None]
     image = F.interpolate(planes, pixels, mode="bicubic", antialias=True).clamp(0, 1)[0]
     places = torch.cartesian_prod(*(window_starts(length, tokens) for length in grid))
-    side, tent = tokens * patch_size, _tent(tokens)
-    total, weight = torch.zeros(()), torch.zeros(grid)
+    side, rising = tokens * patch_size, torch.arange(1.0, tokens + 1)
+    slope = torch.minimum(rising, rising.flip(0))
+    tent, total, weight = torch.outer(slope, slope), torch.zeros(()), torch.zeros(grid)
     for part in places.split(batch_size):
         corners = (part * patch_size).tolist()
         windows = torch.stack([image[:, y : y + side, x : x + side] for y, x in corners])
@@ -112,9 +109,3 @@ def window_starts(length: int, tokens: int) -> Int[Tensor, " n"]:
     shared = round(_OVERLAP * tokens)
     count = max(math.ceil((length - shared) / (tokens - shared)), 1)
     return torch.linspace(0, max(length - tokens, 0), count).round().long()
-
-
-def _tent(tokens: int) -> Float[Tensor, "t t"]:
-    rising = torch.arange(1.0, tokens + 1)
-    side = torch.minimum(rising, rising.flip(0))
-    return torch.outer(side, side)

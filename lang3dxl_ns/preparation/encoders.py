@@ -17,7 +17,6 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.dense_map import mean_of_sizes
 from lang3dxl_ns.preparation.families import (
     FAMILIES,
     Family,
@@ -36,7 +35,6 @@ from lang3dxl_ns.preparation.model_files import (
     find_model,
     has_files,
     load_weights,
-    model_type,
     read_config,
     spoken,
     whole,
@@ -64,11 +62,9 @@ _VOCABULARIES = (
 
 class ImageTextEncoder:
     """Images and texts in one space: CLIP, SigLIP, TIPSv2 … Embeddings are projected, float32 and *not*
-    normalized.
-
-    `dim`: channels; `crop_size`: side in pixels of the pictures that the vision tower was trained on;
-    `patch_size`: side of its patches; `identity`: of the weights; `brightness`: mean value of the photos that
-    it has learned from, if it depends on that, else None."""
+    normalized. `dim`: channels; `crop_size`: side in pixels of the pictures that the vision tower was trained
+    on; `patch_size`: side of its patches; `identity`: of the weights; `brightness`: mean value of the photos
+    that it has learned from, if it depends on that, else None."""
 
     def __init__(
         self,
@@ -97,8 +93,7 @@ class ImageTextEncoder:
         """A photo as its crops should be cut from: in the light that the encoder knows."""
         return photo if self.brightness is None else in_known_light(photo, self.brightness)
 
-    # no_grad, not inference_mode: embeddings may enter autograd later, inference tensors can't
-    @torch.no_grad()
+    @torch.no_grad()  # not inference_mode: embeddings may enter autograd later, inference tensors can't
     def encode_images(self, crops: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n c"]:
         """Embeddings of square crops, RGB in 0…1, on the encoder's device; other sizes are resized first."""
         crops = _resize(crops.to(self._device, torch.float32), self.crop_size, self._resample)
@@ -122,7 +117,7 @@ class ImageTextEncoder:
     def join_sizes(self, features: Float[Tensor, "sizes rows columns d"]) -> Float[Tensor, "rows columns c"]:
         """Join maps of windows of several sizes, coarse to fine: their mean, or what the head reads."""
         if self._head is None:
-            return mean_of_sizes(features)
+            return features.mean(0)
         # A few rows at a time, because the head's input is several times as wide as its output.
         return torch.cat([self._head(rows) for rows in features.split(_HEAD_ROWS, dim=1)])
 
@@ -183,7 +178,7 @@ def usual_dense(config: PreparationConfig, learned: bool) -> str:
 
 
 def _family(files: ModelFiles) -> Family:
-    kind = model_type(files)
+    kind = read_config(files).model_type
     if kind not in FAMILIES:
         raise UserError(
             f"{files.name} is a {kind} model: {spoken(files.option)} needs an image-text encoder in Hugging "
@@ -197,9 +192,7 @@ class DenseEncoder:
 
     def __init__(self, model: Any, tokens: int, identity: str) -> None:
         self.dim: int = model.config.hidden_size
-        self.tokens = tokens
-        self.identity = identity
-        self._model = model
+        self.tokens, self.identity, self._model = tokens, identity, model
         self._side = tokens * model.config.patch_size
         self._device = next(model.parameters()).device
         own = model.config.model_type in _NORMALIZE_THEMSELVES
@@ -264,14 +257,13 @@ def _image_processor(files: ModelFiles) -> Any:
     from transformers import AutoImageProcessor, CLIPImageProcessor
 
     if not any(has_files(files.folder, f"{kind}_config.json") for kind in ("preprocessor", "processor")):
-        if model_type(files) == "clip":
+        if read_config(files).model_type == "clip":
             return CLIPImageProcessor()  # fine-tuned weights are often saved alone; CLIP's own statistics
         raise UserError(
             f"{files.folder} has no preprocessor_config.json: copy it from the model that this one was "
             "fine-tuned from"
         )
-    path = files.folder / "preprocessor_config.json"
-    with whole(f"{path} can't be read", "download the model again"):
+    with whole(f"{files.folder / 'preprocessor_config.json'} can't be read", "download the model again"):
         return AutoImageProcessor.from_pretrained(
             files.folder, local_files_only=True, trust_remote_code=False
         )

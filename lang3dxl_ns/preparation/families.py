@@ -2,8 +2,7 @@
 
 A contrastive encoder is trained to compare one vector per picture with one per text. To compare its patches
 with texts as well, the last step that mixes them is replaced, by a published recipe for each family. Or a
-head reads them, in small windows, which show what a patch is made of, together with the same place in larger
-windows, which show what it is a part of: a wall, or a tower's wall."""
+head reads them in small windows, together with the same place in larger ones: a wall, or a tower's wall."""
 
 from __future__ import annotations
 

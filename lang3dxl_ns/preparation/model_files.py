@@ -132,11 +132,6 @@ def load_processor(processor_class: Any, files: ModelFiles) -> Any:
         return processor_class.from_pretrained(files.folder, local_files_only=True)
 
 
-def model_type(files: ModelFiles) -> str:
-    """Read a model's type, such as "clip", from its configuration. Raises UserError for a damaged one."""
-    return read_config(files).model_type
-
-
 def read_config(files: ModelFiles) -> Any:
     """Read a model's configuration. Raises UserError for a file that isn't one."""
     from transformers import AutoConfig

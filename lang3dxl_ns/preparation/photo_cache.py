@@ -17,20 +17,15 @@ PATIENCE_S = (1.0, 5.0, 15.0)
 
 
 class PhotoCache:
-    """Cache that keeps the first decoded photos that fit, and reads the others ahead in the order of use.
+    """Cache that keeps the first decoded photos that fit into `max_bytes`, and reads the others ahead, in a
+    number of threads (`readers`), in the order of use. `read` reads a photo's data by its index.
 
     Photos come in shuffled rounds, and each round uses every photo once. So a cache of the latest ones would
     hardly ever hit, while photos that are kept for good hit in proportion to their number.
-
-    Args:
-        read: function that reads a photo's data by its index; it is called in several threads.
-        max_bytes: memory for the photos that are kept.
-        readers: number of threads.
     """
 
     def __init__(self, read: Callable[[int], dict[str, Any]], max_bytes: float, readers: int = 4):
-        self._read = read
-        self._free = max_bytes
+        self._read, self._free = read, max_bytes
         self._kept: dict[int, dict[str, Any]] = {}
         self._ahead: dict[int, Future[dict[str, Any]]] = {}
         self._pool = ThreadPoolExecutor(readers, thread_name_prefix="photo-reader")

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json
@@ -144,7 +142,9 @@ def _transforms_photo(folder: Path, name: str, frame: Mapping[str, Any]) -> tupl
     path = inside(folder, name, follow_links=True)
     if not path.is_file():
         raise UserError(f"there is no {path}")
-    mask, pose = frame.get("mask_path"), _camera_from_world(frame["transform_matrix"])
+    mask, matrix = frame.get("mask_path"), frame["transform_matrix"]
+    check_pose(matrix)
+    pose = view_matrix(torch.tensor(matrix[:3], dtype=torch.float64))[:3].numpy()
     nothing = np.zeros((0, 3)), np.zeros((0, 2))
     # Programs that write this file read the pixels as stored, whatever their EXIF orientation.
     tracked = upright_in_model(TrackedPhoto(name, _transforms_lens(frame, path, name), pose, *nothing), path)
@@ -171,8 +171,3 @@ def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
     lens = Lens(width, height, fx, fy, cx, cy, distortion if fisheye or any(distortion) else (), fisheye)
     lens.check()
     return lens
-
-
-def _camera_from_world(matrix: Any) -> Float[Array, "3 4"]:
-    check_pose(matrix)
-    return view_matrix(torch.tensor(matrix[:3], dtype=torch.float64))[:3].numpy()

@@ -119,16 +119,13 @@ def prepare(
     fine: Collection[str] = (),
 ) -> TargetReader:
     """Make the missing targets of all photos, and return the reader of those that are complete, in the order
-    given. The work ahead and the disk it needs are logged first.
+    given. The work ahead and the disk it needs are logged first. Photos that cannot be read are left out with
+    a warning. Raises UserError if none can be read, a model cannot be loaded, or the disk is too small.
 
     pixel_sizes: world units per pixel *of the photo as it is read* (its `width`), by photo name; None for
-    relative scales. scales: crop sides in world units, or in photo widths without pixel sizes.
-    regions: source of label maps, or None. fine: names of photos that get small crops alone (`fine_crops`),
-    the smallest a third of their side apart, or half if there would be too many; or, if the encoder has a
-    head for patches, the map that it reads. If any photo is fine, only fine ones get dense features.
-
-    Photos that cannot be read are left out with a warning. Raises UserError if none can be read, a model
-    cannot be loaded, or the disk is too small.
+    relative scales. scales: crop sides in world units, or in photo widths without pixel sizes. fine: names of
+    photos that get small crops alone (`choose_crops`) or, if the encoder has a head for patches, the map that
+    it reads. If any photo is fine, only fine ones get dense features.
     """
     tasks, left_out = _plan(photos, pixel_sizes, config, scales, store, regions, frozenset(fine))
     missing = [task for task in tasks if task.missing]
@@ -290,10 +287,8 @@ class _Maker:
         assert clip is not None
         lit, batch, size = clip.in_known_light(image), self._config.crop_batch, clip.crop_size
         if not task.grids:
-            crops = build_clip_target(
-                lit, task.crops.sides, clip.encode_images, size, batch, task.crops.steps
-            )
-            return {"features": crops.features, "valid": crops.valid}
+            crops = task.crops
+            return vars(build_clip_target(lit, crops.sides, clip.encode_images, size, batch, crops.steps))
         tokens, patch = size // clip.patch_size, clip.patch_size
         windows = max(_PATCHES_PER_CROP * batch // tokens**2, 1)
         features = build_dense_map(
@@ -318,12 +313,11 @@ class _Maker:
         # of crops with the first layers' activations, which take a dozen times its size.
         largest = max(task.photo.width * task.photo.height for task in tasks)
         memory = config.workers * 3 * 4 * (3 * largest + 12 * config.crop_batch * crop_size**2)
+        split = f" in {config.workers} processes" if config.workers > 1 else ""
         say(
             f"preparing {len(tasks)} photos ({photos - len(tasks)} of {photos} are ready): "
             f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free",
-            f"memory beside the encoders: about {_gigabytes(memory)}"
-            + (f" in {config.workers} processes" if config.workers > 1 else "")
-            + ", whatever the number of photos",
+            f"memory beside the encoders: about {_gigabytes(memory)}{split}, however many photos there are",
         )
         if clip:
             self._announce_duration(clip, dense, torch.device(device))
@@ -337,12 +331,10 @@ class _Maker:
         encoded = [task.encoded(clip.crop_size // clip.patch_size) for task in tasks]
         if sum(encoded) < _ANNOUNCED_CROPS:
             return
-        noise, rest = torch.rand(3, clip.crop_size, clip.crop_size, device=device), 0.0
-        of_crop = _seconds_each(
-            lambda batch: clip.encode_images(noise.expand(batch, -1, -1, -1)), config.crop_batch
-        )
+        noise, rest = torch.rand(1, 3, clip.crop_size, clip.crop_size, device=device), 0.0
+        of_crop = _seconds_each(lambda n: clip.encode_images(noise.expand(n, -1, -1, -1)), config.crop_batch)
         if dense is not None:
-            of_photo = _seconds_each(lambda _: dense.encode(noise.permute(1, 2, 0)), 1)
+            of_photo = _seconds_each(lambda _: dense.encode(noise[0].permute(1, 2, 0)), 1)
             rest = of_photo * sum(DENSE in task.missing for task in tasks)
         least = (number if task.grids else task.fast for task, number in zip(tasks, encoded, strict=True))
         takes, faster = ((n * of_crop + rest) / config.workers for n in (sum(encoded), sum(least)))

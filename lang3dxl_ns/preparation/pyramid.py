@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.memory import with_less_memory
-from lang3dxl_ns.preparation.physical_scale import SMALLEST_CROP, crop_sides, fine_crops
+from lang3dxl_ns.preparation.crop_sizes import SMALLEST_CROP, crop_sides, fine_crops
 from lang3dxl_ns.preparation.settings import Quality
 
 
@@ -24,7 +24,7 @@ class ClipTarget:
     """
 
     features: Float[Tensor, "hd wd c"]
-    """Mean embedding, float32, as output by the encoder (not normalized)."""
+    """Mean embedding, float32 unless stored, as output by the encoder (not normalized)."""
     valid: Float[Tensor, "hd wd"]
     """Mean share of the crops' area inside the photo, 0..1; the rest of a crop is black."""
 
@@ -136,9 +136,7 @@ def _windows(
 ) -> tuple[Float[Tensor, "3 H W t t"], Int[Tensor, " ny"], Int[Tensor, " nx"]]:
     """Return a crop at every pixel (views of the photo padded with black, which take no memory each), and the
     rows and columns at which the required crops begin."""
-    half = _half(side)
-    padding: list[int] = []
-    starts = []
+    half, padding, starts = _half(side), list[int](), []
     for length in (photo.shape[1], photo.shape[0]):  # F.pad counts from the last axis, the width
         centers = crop_centers(length, side, steps).to(photo.device)
         before = max(0, half - int(centers[0]))
@@ -177,10 +175,8 @@ def choose_crops(
     input_side: int,
     quality: Quality,
 ) -> Crops:
-    """Choose a photo's crops: those of the scales, without crops too small for the encoder.
-
-    If there are more than the quality allows, fine crops first move apart, from a third to half of their
-    side; then the crops grow.
+    """Choose a photo's crops: those of the scales, without crops too small for the encoder. If there are more
+    than the quality allows, fine crops first move apart, from a third to half of their side; then all grow.
 
     Args:
         scales: sides in world units, or in photo widths.

@@ -97,13 +97,9 @@ class FelzenszwalbRegions:
 
 
 class MaskRegions:
-    """Regions from a network's masks, which may overlap.
-
-    Args:
-        load: function that loads the network, when the first photo needs it, and returns its masks' function.
-        level: which mask a pixel of several gets.
-        made_with: settings of the masks, the network's identity among them.
-    """
+    """Regions from a network's masks, which may overlap: a pixel of several gets the mask of `level`. `load`
+    loads the network, when the first photo needs it, and returns its masks' function; `made_with` are the
+    settings of the masks, the network's identity among them."""
 
     def __init__(self, load: Callable[[], FindMasks], level: RegionLevel, **made_with: Any) -> None:
         self._load, self._level = load, level

@@ -21,7 +21,7 @@ from lang3dxl_ns.preparation.model_files import (
     find_model,
     load_processor,
     load_weights,
-    model_type,
+    read_config,
 )
 
 TEXT_OPTION = "--pipeline.datamanager.foreground-model"
@@ -68,7 +68,7 @@ def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
     """Find a text segmenter's files: a CLIPSeg or SAM 3 alone, or a GroundingDINO with a SAM. Raises
     UserError if one can't be found or downloaded, or is another kind of model."""
     words = find_model(name_or_dir, TEXT_OPTION)
-    kind = model_type(words)
+    kind = read_config(words).model_type
     if kind not in ("clipseg", "grounding-dino", *SAM3_TYPES):
         raise UserError(
             f"{words.name} is a {kind} model: {TEXT_OPTION} takes a GroundingDINO "
@@ -80,7 +80,7 @@ def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
 def find_sam(name_or_dir: str) -> ModelFiles:
     """Find SAM's files. Raises UserError if they are unavailable, or of another kind of model."""
     files = find_model(name_or_dir, SAM_OPTION)
-    kind = model_type(files)
+    kind = read_config(files).model_type
     if kind != "sam":
         raise UserError(f"{files.name} is a {kind} model: {SAM_OPTION} takes a SAM: facebook/sam-vit-base")
     return files
@@ -95,7 +95,7 @@ def load_text_segmenter(files: SegmenterFiles, device: torch.device | str) -> Te
 
 def is_sam3(files: SegmenterFiles) -> bool:
     """Return whether a text segmenter is a SAM 3, which distinguishes instances."""
-    return model_type(files.words) in SAM3_TYPES
+    return read_config(files.words).model_type in SAM3_TYPES
 
 
 class ClipSeg:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from lang3dxl_ns.preparation.pyramid import ClipTarget
 from lang3dxl_ns.preparation.store import FeatureStore
 
 CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
@@ -19,13 +20,9 @@ _KEY = "lang3dxl"
 
 
 @dataclass
-class StoredClipTarget:
+class StoredClipTarget(ClipTarget):
     """CLIP target of a photo, memory-mapped (CPU, float16)."""
 
-    features: Float[Tensor, "hd wd c"]
-    """Mean embedding over the scales, not normalized."""
-    valid: Float[Tensor, "hd wd"]
-    """Mean share of the crops' area inside the photo, 0…1."""
     crop_fractions: list[float]
     """Crop sides as fractions of the photo's width, ascending."""
 
@@ -104,17 +101,14 @@ class TargetReader:
 
 
 def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:
-    """Compute statistics over all maps' pixels, merged map by map in float64 (Chan, Golub & LeVeque 1983)."""
-    count, mean, squares = 0, torch.zeros(()), torch.zeros(())
+    """Compute statistics over all maps' pixels. Sums in float64 are exact enough for values of 16 bits."""
+    count, total, squares = 0, torch.zeros(()), torch.zeros(())
     for values in maps:
         pixels = values.flatten(0, 1).double()
-        variance, own_mean = torch.var_mean(pixels, dim=0, correction=0)
-        both = count + len(pixels)
-        step = own_mean - mean
-        mean = mean + step * len(pixels) / both
-        squares = squares + variance * len(pixels) + step**2 * count * len(pixels) / both
-        count = both
-    std = (squares / count).sqrt()
+        count, total = count + len(pixels), total + pixels.sum(0)
+        squares = squares + pixels.square().sum(0)
+    mean = total / count
+    std = (squares / count - mean.square()).clamp_min(0).sqrt()
     floor = max(_STD_FLOOR * float(std.mean()), torch.finfo(torch.float32).eps)
     return ChannelStatistics(mean.float(), std.clamp_min(floor).float())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -69,10 +70,8 @@ class WorkingPhotos:
 
     def _keep(self, path: Path, content: bytes) -> None:
         """Write a copy. Without space or permission it is not written, and the photo is decoded each time."""
-        try:
+        with suppress(UserError):
             self._store.write_bytes(path, content, path.name)
-        except UserError:
-            return
 
 
 def mask_png(mask: Bool[Tensor, "h w"], made_with: str) -> bytes:

@@ -28,12 +28,9 @@ _LONGEST = 40
 
 @dataclass(eq=False, repr=False)
 class Conversation:
-    """Questions to a model that may be in training in another thread.
-
-    Each question is put to a snapshot of the model, a separate scene, so that only taking the snapshot waits
-    for training. If the model is in training and its decoder learns from lifted features, taking the snapshot
-    learns words from the photos first.
-    """
+    """Questions to a model that may be in training in another thread. Each is put to a snapshot of the model,
+    a separate scene, so that only taking the snapshot waits for training; then words are first learned from
+    the photos, if the decoder learns from lifted features."""
 
     model: Any
     """A `Lang3DXLModel`, trained or in training."""
@@ -99,15 +96,12 @@ class Conversation:
         a snapshot is reused for at most a tenth of the run."""
         with self._making:
             learning, step = self.learning(), self.model.step
-            behind = self.model.config.total_steps / 10
-            kept = self._scene is not None and (
-                self._scene_step is None or (learning and step - self._scene_step <= behind)
-            )
-            if not kept:
+            behind, taken = self.model.config.total_steps / 10, self._scene_step
+            recent = taken is None or (learning and step - taken <= behind)
+            if self._scene is None or not recent:
                 self._encode_texts = self._encode_texts or text_encoder(self.file, self.model.device)
                 self._scene = self._snapshot(learning)
                 self._scene_step = step if learning else None
-            assert self._scene is not None
             return self._scene
 
     def _snapshot(self, learning: bool) -> Scene:

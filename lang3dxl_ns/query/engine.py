@@ -97,10 +97,8 @@ class PerGaussian:
         return in_chunks(lambda part: part.float() @ vectors, self.rows, self.rows.shape[1], _CHUNK_MB)
 
     def calibrated(self, words: Queries) -> PerGaussian:
-        """Return this engine with a temperature that suits the encoder (`relevancy.calibrated`).
-
-        words: a fixed set for all scenes and encoders, `TextEncoder.yardstick`.
-        """
+        """Return this engine with a temperature that suits the encoder (`relevancy.calibrated`), by words
+        that are the same for all scenes and encoders (`TextEncoder.yardstick`)."""
         known = self.rows[self.known]
         cosines = replace(self, rows=known[:: max(len(known) // _SAMPLE, 1)]).cosines(words)
         return replace(self, temperature=calibrated(self.temperature, cosines))

@@ -37,11 +37,9 @@ def overlay(
     opacity: float = _OPACITY,
     color_map: str = "turbo",
 ) -> Float[Tensor, "h w 3"]:
-    """Draw the heat map over the pixels that match, and keep the image (colors 0…1) elsewhere.
-
-    The threshold gets the first color of the matplotlib color map, and the highest relevancy its last. Raises
-    UserError if there is no such color map.
-    """
+    """Draw the heat map over the pixels that match, and keep the image (colors 0…1) elsewhere. The threshold
+    gets the first color of the matplotlib color map, and the highest relevancy its last. Raises UserError if
+    there is no such color map."""
     hot = color(heat(relevancy * mask, threshold), color_map)
     return torch.lerp(image, hot, opacity * mask.to(image)[..., None])
 
@@ -95,9 +93,7 @@ def with_legend(picture: UInt8[Array, "h w 3"], labels: Sequence[str]) -> UInt8[
     canvas.paste(Image.fromarray(picture))
     pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(size)
     for i, label in enumerate(labels):
-        top = height + i * line + (line - size) // 2
-        pen.rectangle(
-            (size // 2, top, size // 2 + size, top + size), fill=PROMPT_COLORS[i % len(PROMPT_COLORS)]
-        )
+        left, top = size // 2, height + i * line + (line - size) // 2
+        pen.rectangle((left, top, left + size, top + size), fill=PROMPT_COLORS[i % len(PROMPT_COLORS)])
         pen.text((2 * size, top + size / 2), " ".join(label.split()), "black", font, anchor="lm")
     return np.asarray(canvas)

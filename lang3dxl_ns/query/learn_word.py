@@ -25,10 +25,8 @@ from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.teach import MASK_SIDE, Example, TaughtWord
+from lang3dxl_ns.rendering import Backend, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_parts
-from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import composite
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import resized
 
 MARK_SIDE = 320
@@ -84,11 +82,9 @@ class Weights:
 def learn(
     name: str, examples: Sequence[Example], weights: Sequence[Weights], engine: QueryEngine, queries: Queries
 ) -> TaughtWord:
-    """Learn a word from examples, whose order doesn't matter, and from what the marks of each show.
-
-    queries: the query of the word's text, without synonyms. Raises UserError if there is no example, or the
-    marks show nothing, or everything.
-    """
+    """Learn a word from examples, whose order doesn't matter, from what the marks of each show, and from the
+    query of the word's text, without synonyms. Raises UserError if there is no example, or the marks show
+    nothing, or everything."""
     if not examples:
         raise UserError(f"there is no example of {name!r}: mark it in a photo")
     for example, one in zip(examples, weights, strict=True):

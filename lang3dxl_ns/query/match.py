@@ -20,7 +20,7 @@ from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.query.heat_maps import overlay, tinted, with_legend
 from lang3dxl_ns.query.places import Box, Viewpoint
 from lang3dxl_ns.query.text import Prompt
-from lang3dxl_ns.rendering.render import Rendering
+from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera
 
 

@@ -84,9 +84,8 @@ def strongest_match(
 
     The core is the heaviest group of Gaussians that match nearly as well as the best. The box holds the group
     of good matches around it, or the core alone if the group joins it with other things. DBSCAN separates
-    groups that are more than `gap` world units apart.
-
-    scores: relevancy of each Gaussian, 0…1. mass: pixels that each Gaussian fills, over all views.
+    groups that are more than `gap` world units apart. `scores` is the relevancy of each Gaussian, 0…1; `mass`
+    the pixels that it fills, over all views.
     """
     weights = (scores - threshold).clamp_min(0) * mass
     rows = (weights > 0).nonzero().squeeze(1)

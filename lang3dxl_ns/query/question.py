@@ -23,7 +23,7 @@ from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.text import Prompt, TextConfig
-from lang3dxl_ns.rendering.render import Rendering
+from lang3dxl_ns.rendering import Rendering
 
 EVEN = 0.5
 """Relevancy where prompt and negatives match equally well."""
@@ -136,14 +136,9 @@ class Question:
         self, rendering: Rendering, foreground: Bool[Tensor, "h w"] | None = None
     ) -> tuple[Float[Tensor, "q h w"], Bool[Tensor, "q h w"]]:
         """Compute the relevancy of every pixel to every prompt, 0…1, and the pixels that match: those covered
-        by matching Gaussians, so that a view shows the scene's selection.
-
-        Pixels outside the foreground, and those that the scene hardly covers, are 0 and match nothing.
-
-        Args:
-            rendering: a view with `channels`, composited at its size or at another.
-            foreground: pixels that may match, at any size; None for all.
-        """
+        by matching Gaussians, so that a view shows the scene's selection. Pixels outside the foreground (at
+        any size; None: all are inside), and those that the scene hardly covers, are 0 and match nothing. The
+        rendering has `channels`, composited at its size or at another."""
         assert rendering.channels is not None
         keep, size = rendering.alpha >= self.min_alpha, (rendering.camera.height, rendering.camera.width)
         if foreground is not None:

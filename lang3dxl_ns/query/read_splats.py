@@ -27,7 +27,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
-from lang3dxl_ns.rendering.splats import Splats, harmonics_of
+from lang3dxl_ns.rendering import Splats, harmonics_of
 
 KINDS = ".ply, .spz, .splat, a checkpoint of gsplat (.pt) or nerfstudio (.ckpt), or a run's folder"
 _IN_FOLDERS = ("*.ckpt", "nerfstudio_models/*.ckpt", "ckpts/*.pt", "point_cloud/iteration_*/point_cloud.ply")

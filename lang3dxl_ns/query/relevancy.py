@@ -51,11 +51,9 @@ class Queries:
         negatives: Sequence[Float[Tensor, "m c"]] | None = None,
         against: Sequence[Sequence[int]] | None = None,
     ) -> Queries:
-        """Build queries from prompts (a row per synonym), shared phrases, and each prompt's `negatives`.
-
-        against: for every prompt, the indices of the shared phrases that it competes with; default: all.
-        Vectors need not have unit length. Raises ValueError if a prompt has no vector or no competitor.
-        """
+        """Build queries from prompts (a row per synonym), shared phrases, and each prompt's `negatives`, all
+        of any length. against: for every prompt, the indices of the shared phrases that it competes with;
+        default: all. Raises ValueError if a prompt has no vector or no competitor."""
         own = [canonical[:0]] * len(prompts) if negatives is None else negatives
         chosen = [range(len(canonical))] * len(prompts) if against is None else against
         if any(len(p) == 0 or len(c) + len(n) == 0 for p, n, c in zip(prompts, own, chosen, strict=True)):
@@ -109,12 +107,9 @@ def spread(cosines: Float[Tensor, "n w"]) -> float:
 
 
 def calibrated(temperature: float, cosines: Float[Tensor, "n w"]) -> float:
-    """Compute the temperature at which an encoder's margins mean what the built-in CLIP's mean.
-
-    Encoders differ in how widely their cosines vary: by ±.5 or by ±.05. A relevancy at the calibrated
-    temperature does not change if all cosines (with `TextEncoder.yardstick`) are scaled or shifted. If their
-    spread is 0, the temperature for the built-in CLIP is returned unchanged.
-    """
+    """Compute the temperature at which an encoder's margins mean what the built-in CLIP's mean. A relevancy
+    at this temperature does not change if all cosines (with `TextEncoder.yardstick`) are scaled or shifted:
+    encoders' vary by ±.5 or by ±.05. If their spread is 0, the temperature is returned unchanged."""
     own = spread(cosines)
     return temperature * SPREAD / max(own, _LEAST_SPREAD) if own else temperature
 

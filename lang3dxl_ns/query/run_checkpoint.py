@@ -20,9 +20,7 @@ NOT_A_CHECKPOINT = (*DAMAGE, pickle.UnpicklingError)
 
 def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
     """Load the latest checkpoint in a folder on the CPU, without executing code; return its path and content.
-
-    Raises UserError if there is none, or it is damaged, or not a run's checkpoint.
-    """
+    Raises UserError if there is none, or it is damaged, or not a run's checkpoint."""
     checkpoints = sorted(folder.glob("step-*.ckpt"))
     if not checkpoints:
         raise UserError(f"{folder} holds no checkpoint: train for longer, or copy it")
@@ -60,10 +58,8 @@ def _no_checkpoint(path: Path, why: object) -> UserError:
 
 
 def check_checkpoint(place: Path) -> None:
-    """Verify the checksums of the checkpoint at a path, or of the latest one in a folder.
-
-    Raises UserError if it is damaged. A folder without checkpoints is accepted, since runs start with one.
-    """
+    """Verify the checksums of the checkpoint at a path, or of the latest one in a folder. Raises UserError if
+    it is damaged. A folder without checkpoints is accepted, since runs start with one."""
     checkpoints = sorted(place.glob("step-*.ckpt")) if place.is_dir() else [place]
     if not checkpoints or not checkpoints[-1].exists():
         return

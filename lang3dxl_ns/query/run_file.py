@@ -98,10 +98,8 @@ class ScenePhoto:
         return Photo(self.name, folder / self.name, mask, self.lens, self.quarter_turns)
 
     def foreground(self, size: tuple[int, int] | None = None) -> Bool[Tensor, "h w"] | None:
-        """Read the photo's undistorted foreground; None if it has no mask, or the mask is gone.
-
-        size: height and width in pixels; default: the size of the stored mask.
-        """
+        """Read the photo's undistorted foreground at a size (height and width in pixels; default: the stored
+        mask's); None if it has no mask, or the mask is gone."""
         mask = None if isinstance(self.mask, bytes) else self.photo().read_mask()
         if isinstance(self.mask, bytes):
             mask = torch.from_numpy(np.array(Image.open(io.BytesIO(self.mask)).convert("1")))
@@ -140,10 +138,8 @@ class SceneFile:
             return scene_from_json(content)
 
     def photo(self, name: str) -> ScenePhoto:
-        """Find the photo with this name, or with this file name or stem if only one photo has it.
-
-        Raises UserError, which names similar photos, if there is none.
-        """
+        """Find the photo with this name, or with this file name or stem if only one photo has it. Raises
+        UserError, which names similar photos, if there is none."""
         for form in (str, lambda n: PurePosixPath(n).name, lambda n: PurePosixPath(n).stem):
             found = [photo for photo in self.photos if form(photo.name) == name]
             if len(found) == 1:
@@ -216,12 +212,9 @@ def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
 
 
 def find_config(run: str | Path | None = None) -> Path:
-    """Find the config.yml of a run.
-
-    run: the file, the run's folder, or a folder above it, whose newest run is taken; None: the newest run
-    under outputs/. Runs of other methods, which lack a scene description, are skipped. Raises UserError if
-    there is no run.
-    """
+    """Find the config.yml of a run: the file itself, or that in the run's folder, or in a folder above it,
+    whose newest run is taken; None: the newest run under outputs/. Runs of other methods, which lack a scene
+    description, are skipped. Raises UserError if there is no run."""
     place = OUTPUTS if run is None else expanded(run)
     if place.is_dir():
         if place.joinpath("config.yml").is_file():

@@ -138,9 +138,8 @@ def check_command_line(arguments: Sequence[str]) -> None:
     """Exit from an `ns-…` command whose `--load-config` file is a run of this method and holds more than
     settings, or cannot be checked before nerfstudio reads it (a pipe, or a device).
 
-    nerfstudio calls whatever such a file names. It imports the methods first, including this one, and that is
-    the earliest moment at which a plugin can check. Files that do not name this package are left to
-    nerfstudio.
+    nerfstudio calls whatever such a file names. It imports the methods first, the earliest moment at which a
+    plugin can check. Files that do not name this package are left to nerfstudio.
     """
     for path in load_configs(arguments):
         if os.environ.get(TRUST_VARIABLE) != "1" and (why := _trouble(path)):

@@ -35,10 +35,8 @@ from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, texts_of
 from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
 from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, searched, shipped_vocabulary
+from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
-from lang3dxl_ns.rendering.rasterize import Backend
-from lang3dxl_ns.rendering.render import Rendering, composite
-from lang3dxl_ns.rendering.splats import Splats
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 
 _ROWS = 65_536
@@ -140,15 +138,9 @@ class Scene:
     def render(
         self, place: Place, size: int | None = None, fov: float | None = None, look: str | None = None
     ) -> View:
-        """Render the scene from a photo's viewpoint, a camera or a pose.
-
-        Args:
-            place, size, fov: see `camera`.
-            look: training photo whose lighting is used; by default the scene's rule chooses for this view.
-
-        Raises:
-            UserError: see `camera`; or there is no look of this photo.
-        """
+        """Render the scene from a photo's viewpoint, a camera or a pose; see `camera`. look: training photo
+        whose lighting is used; by default the scene's rule chooses for this view. Raises UserError as
+        `camera` does, and if there is no look of this photo."""
         return self._view(self.camera(place, size, fov), self._name(place), look)
 
     def draw(
@@ -184,10 +176,8 @@ class Scene:
         return self.file.photo(place).name if isinstance(place, str) else None
 
     def baked(self, look: str | None = None) -> Splats:
-        """Return the Gaussians with a training photo's look in their colors, for viewers that know no looks.
-
-        look: the photo; by default the overview photo. Raises UserError if there is no look of this photo.
-        """
+        """Return the Gaussians with the look of a training photo (default: the overview photo) in their
+        colors, for viewers that know no looks. Raises UserError if there is no look of this photo."""
         chosen = self._look(look)
         if self.looks is None:
             return self.splats
@@ -278,9 +268,9 @@ class Scene:
     def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
         """Find matches of a question's prompts in one view; see `query`.
 
-        Relevancies are composited with at most as many pixels as the training photos have. If the view has
-        more, they are rendered in a separate pass and enlarged: nothing was learned between these pixels, and
-        Gaussians too thin for them would stand out as lines.
+        Relevancies are composited with at most as many pixels as the training photos have, and enlarged for a
+        larger view: nothing was learned between these pixels, and Gaussians too thin for them would stand out
+        as lines.
         """
         start = time.perf_counter()
         channels = question.channels
@@ -289,8 +279,7 @@ class Scene:
         small = resized(camera, self.trained_side)
         enlarged = small.width < camera.width
         view = self._view(camera, name, channels=None if enlarged else channels)
-        rendered = time.perf_counter()
-        rendering = view.rendering
+        rendered, rendering = time.perf_counter(), view.rendering
         if enlarged:
             rendering = replace(rendering, channels=composite(self.splats, small, channels, self.backend))
         foreground = None if name is None else self.file.photo(name).foreground()
@@ -305,7 +294,7 @@ class Scene:
 
     @torch.no_grad()
     def relevancy_maps(self, camera: Camera, queries: Queries) -> Float[Tensor, "q h w"]:
-        """Compute the relevancy of every pixel to every query, 0…1, as it is scored, without a foreground."""
+        """Compute every pixel's relevancy to every query, 0…1, as it is scored, without a foreground."""
         rendering = self.draw(camera, self.engine.channels(queries))
         assert rendering.channels is not None
         return self.engine.maps(rendering.channels, queries)
@@ -318,15 +307,9 @@ class Scene:
         threshold: float | None = None,
         most: int = 10,
     ) -> Any:
-        """Find matches in the scene: return a `Found` for one prompt, a list of them for several.
-
-        Args:
-            texts, negatives, threshold: see `ask`.
-            most: number of views to return at most, at least 1.
-
-        Raises:
-            UserError: see `ask`; or `most` is below 1.
-        """
+        """Find matches in the scene: return a `Found` with at most `most` views for one prompt, a list of
+        them for several. For the other arguments see `ask`. Raises UserError as `ask` does, and if `most` is
+        below 1."""
         if most < 1:
             raise UserError(f"{most} views are requested: give 1 or more")
         found = self.places(self.ask(texts, negatives=negatives, threshold=threshold), most)
@@ -370,7 +353,6 @@ class Scene:
         many were written.
 
         Args:
-            path: the file.
             text: prompt; only the Gaussians that match it are written. None: all Gaussians are written.
             threshold: see `ask`.
             everything: with a text, write all Gaussians; a PLY has their relevancy as a property.
@@ -386,14 +368,13 @@ class Scene:
             return write_splats(Path(path), splats)
         question = self._one(text, threshold)
         relevancy, keep = question.relevancy[0], question.gaussians[0]
+        if not everything and not keep.any():
+            best, level = float(relevancy.max()), question.thresholds[0]
+            raise UserError(
+                f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
+                f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
+            )
         if not everything:
-            if not keep.any():
-                level = question.thresholds[0]
-                raise UserError(
-                    f"no Gaussian matches {question.prompts[0].text!r}: the best reaches "
-                    f"{float(relevancy.max()):.2f}; lower --threshold, now {level:.2f}, or write all with "
-                    "their relevancy (--all)"
-                )
             splats, relevancy = splats.select(keep), relevancy[keep]
         if index is not None:
             write_index(Path(index), keep)
@@ -416,15 +397,13 @@ class Scene:
         for name, camera in tracked(cameras.items(), what):
             if self.watch is not None:
                 self.watch(f"{what}: view {len(views) + 1} of {len(cameras)}")
-            views[name] = self._visible(name, camera)
+            size = camera.height, camera.width
+            mask = self.file.photo(name).foreground(size)
+            weight = torch.ones(size) if mask is None else mask.float()
+            views[name] = VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
         if self.cache is not None:
             save_visible(self.cache, views, key)
         return views
-
-    def _visible(self, name: str, camera: Camera) -> VisibleGaussians:
-        mask = self.file.photo(name).foreground((camera.height, camera.width))
-        weight = torch.ones(camera.height, camera.width) if mask is None else mask.float()
-        return VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
 
     def _fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
         drawn = partial(composite, self.splats, camera, backend=self.backend)
@@ -480,19 +459,12 @@ class Scene:
         most: int = 5,
         size: int | None = None,
     ) -> list[tuple[str, float]]:
-        """Find the words that match a pixel best; return them with their relevancy, best first.
+        """Find at most `most` of the `words` (default: the shipped vocabulary of buildings) that match a
+        pixel best, with their relevancy, best first. x, y: its column and row in the view; see `camera`.
 
         The result is empty where the scene's Gaussians hardly cover the pixel or have no meaning, and at the
-        sky: where the sky or a generic phrase matches best, and no word is clearly better.
-
-        Args:
-            place, size: the view, see `camera`.
-            x, y: column and row in pixels of that view.
-            words: the words to choose from; default: the shipped vocabulary of buildings.
-            most: number of words to return at most.
-
-        Raises:
-            UserError: the pixel lies outside the view.
+        sky: where the sky or a generic phrase matches best, and no word is clearly better. Raises UserError
+        if the pixel lies outside the view.
         """
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
         camera = self.camera(place, size)
@@ -519,10 +491,8 @@ class Scene:
     def teach(
         self, word: str, examples: Example | Sequence[Example], selection: Bool[Tensor, " n"] | None = None
     ) -> Scene:
-        """Return a scene that also knows a word from examples, as `scene.words[word]`; this one is unchanged.
-
-        `query`, `find`, `relevancy` and `export` of the new scene use what it learned wherever the word is a
-        prompt. Examples that the word had before are replaced.
+        """Return a scene that also knows a word, as `scene.words[word]`, and uses what it learned wherever
+        the word is a prompt; this scene is unchanged. Examples that the word had before are replaced.
 
         Args:
             word: the word, in any case.

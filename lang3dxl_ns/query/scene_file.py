@@ -40,7 +40,7 @@ from lang3dxl_ns.query.splat_file import log_scales, logits
 from lang3dxl_ns.query.teach import TaughtWord, known_word
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
 
 Module = TypeVar("Module", bound=torch.nn.Module)
@@ -190,12 +190,9 @@ def read_scene(
     config: QueryConfig | None = None,
     encode_texts: EncodeTexts | None = None,
 ) -> Scene:
-    """Read a scene file. Nothing in it is executed, and no memory is allocated beyond what it holds.
-
-    device: by default a GPU if there is one. encode_texts: the scene's CLIP, if it is already loaded, or is
-    not where the scene file says. Raises UserError if the file is missing, damaged, cut short, or of a newer
-    version.
-    """
+    """Read a scene file. Nothing in it is executed, and no memory is allocated beyond what it holds. device:
+    by default a GPU if there is one. encode_texts: the scene's CLIP, if it is already loaded, or is not where
+    the file says. Raises UserError if the file is missing, damaged, cut short, or of a newer version."""
     path, device = expanded(path), torch.device(device or best_device())
     with _opened(path) as file:
         splats, decoder, codes, looks, vectors = _splats(file), None, None, None, None

@@ -17,19 +17,16 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 
 LEAST_OPACITY = 1e-6
 """Smallest distance of stored opacities from 0 and 1, where logits are infinite."""
 
 
 def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | None = None) -> int:
-    """Write a .ply or .spz file, without Gaussians that have a NaN or infinite value. Return the number of
-    Gaussians written.
-
-    relevancy: relevancy of each Gaussian to a prompt, 0…1, written to a PLY as the property `relevancy`.
-    Raises UserError if the ending names another kind of file, or gsply is missing for .spz.
-    """
+    """Write a .ply or .spz file, without Gaussians that have a NaN or infinite value, and return the number
+    of those written. relevancy: each Gaussian's to a prompt, 0…1, written to a PLY as the property
+    `relevancy`. Raises UserError if the ending names another kind of file, or gsply is missing for .spz."""
     check_splat_name(path)
     sound = splats.sound()
     splats, relevancy = splats.select(sound), None if relevancy is None else relevancy[sound]

@@ -33,9 +33,7 @@ _VERSION = 1
 @dataclass(frozen=True, eq=False)
 class Example:
     """Marks in one photo: an outline or a box around everything that is the word, or clicks on some of it.
-
-    Coordinates are pixels of the photo's file, with the origin at its top-left corner.
-    """
+    Coordinates are pixels of the photo's file, with the origin at its top-left corner."""
 
     photo: str
     """Name of the marked photo."""
@@ -135,11 +133,9 @@ def _kept(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
 
 @dataclass(frozen=True, eq=False)
 class TaughtWord:
-    """A word learned from examples, in the space of a CLIP.
-
-    A unit feature f has the margin `vector` · f + `bias` + `text` · (margin of the word's text). The
-    relevancy is sigmoid(temperature · margin), which is above 0.5 where the word is.
-    """
+    """A word learned from examples, in the space of a CLIP. A unit feature f has the margin `vector` · f +
+    `bias` + `text` · (margin of the word's text). The relevancy is sigmoid(temperature · margin), which is
+    above 0.5 where the word is."""
 
     name: str
     vector: Float[Tensor, " c"]

@@ -60,10 +60,8 @@ def texts_of(texts: Any, what: str) -> list[str]:
 
 def parse_prompts(typed: str) -> list[Prompt]:
     """Parse prompts separated by `;`, with optional negatives: `"windows" not "decorative opening"; dome`.
-
     `not` is special only before a quoted phrase (several: `not "a", "b"`), so that phrases may contain the
-    word. A `;` in quotes doesn't separate. Raises UserError if there is no prompt.
-    """
+    word. A `;` in quotes doesn't separate. Raises UserError if there is no prompt."""
     (clean,) = texts_of([typed], "a prompt")
     clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES))
     parts = re.findall(rf"(?:{_QUOTED}|[^;])+", clean)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.doubt import UNRELATED
@@ -58,11 +58,9 @@ CLEAR = 0.6
 
 
 def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:
-    """Return the indices of the phrases that a prompt competes with: those that it does not name.
-
-    words: the prompt and its synonyms. A phrase is named by any of its words or their synonyms, singular or
-    plural. If all phrases are named, all compete.
-    """
+    """Return the indices of the phrases that a prompt competes with: those that neither it nor its synonyms
+    (`words`) name, by any of their words or the synonyms of these, singular or plural. If all phrases are
+    named, all compete."""
     named = {form for text in words for word in text.lower().split() for form in singulars(word)}
     chosen = [i for i, phrase in enumerate(phrases) if not named & _meanings(phrase)]
     return chosen or list(range(len(phrases)))
@@ -143,9 +141,9 @@ def whole_words(clip: str | Path) -> tuple[str, ...]:
     UserError if there is no CLIP of this name or folder on this machine."""
     folder, tokens = find_model(clip, CLIP_OPTION).folder, list[Any]()
     if (folder / "tokenizer.json").is_file():
-        tokens = json.loads((folder / "tokenizer.json").read_text(encoding="utf-8"))["model"]["vocab"]
+        tokens = read_json(folder / "tokenizer.json")["model"]["vocab"]
     elif (folder / "vocab.json").is_file():
-        tokens = json.loads((folder / "vocab.json").read_text(encoding="utf-8"))
+        tokens = read_json(folder / "vocab.json")
     # Unigram models list pairs of token and score; byte-pair ones map tokens to numbers.
     names = [token if isinstance(token, str) else token[0] for token in tokens]
     words = (_WHOLE.fullmatch(name) for name in names)

@@ -18,7 +18,6 @@ import subprocess
 import sys
 import sysconfig
 import time
-from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
@@ -132,16 +131,16 @@ def build_folder(arch: str) -> Path:
     return cache / "gsplat-{}-py{}{}-sm-{}".format(versions, *sys.version_info[:2], sm)
 
 
-def built(folder: Path, name: str = NAME) -> Path | None:
+def built(folder: Path) -> Path | None:
     """Return the library if it was built completely."""
-    library = folder / f"{name}.so"
+    library = folder / f"{NAME}.so"
     return library if (folder / "done").is_file() and library.is_file() else None
 
 
-def build(folder: Path, arch: str, sources: Sequence[Path] = (), name: str = NAME) -> Path:
-    """Compile gsplat's kernels (or other sources) into a folder, with the output in build.log, and return the
-    library. An interrupted build is continued, and another process that builds there is waited for. Raises
-    UserError if something is missing, or the compiler failed."""
+def build(folder: Path, arch: str) -> Path:
+    """Compile gsplat's kernels into a folder, with the output in build.log, and return the library. An
+    interrupted build is continued, and another process that builds there is waited for. Raises UserError if
+    something is missing, or the compiler failed."""
     missing = [f"{need.what} is missing: {need.remedy}" for need in needs(folder) if need.found is None]
     if missing:
         raise UserError("gsplat's CUDA kernels can't be built here. " + ". ".join(missing))
@@ -153,36 +152,36 @@ def build(folder: Path, arch: str, sources: Sequence[Path] = (), name: str = NAM
         except Timeout:
             say(f"Another process builds gsplat's CUDA kernels in {folder}: waiting for it")
             lock.acquire()
-        return built(folder, name) or _compile(folder, arch, sources, name)
+        return built(folder) or _compile(folder, arch)
     except OSError as error:
         raise UserError(f"gsplat's CUDA kernels can't be built in {folder} ({error})") from error
     finally:
         lock.release()
 
 
-def _compile(folder: Path, arch: str, sources: Sequence[Path], name: str) -> Path:
-    toolkit, own = find_toolkit(torch.version.cuda or ""), _package("gsplat")[0] / "cuda" / "csrc"
+def _compile(folder: Path, arch: str) -> Path:
+    toolkit, sources = find_toolkit(torch.version.cuda or ""), _sources()
     assert toolkit is not None
-    sources = sources or sorted([*own.glob("*.cu"), *own.glob("*.cpp")])
     jobs = str(max(1, min(os.cpu_count() or 1, int(machine_memory() / JOB_BYTES))))
     jobs = os.environ.get("MAX_JOBS", jobs)
     libraries = str(_linkable(toolkit, folder / "lib")), os.environ.get("LIBRARY_PATH")
     environment = {**os.environ, "MAX_JOBS": jobs, "TORCH_CUDA_ARCH_LIST": arch, "CUDA_HOME": str(toolkit)}
     environment["PATH"] = _path(toolkit / "bin")
     environment["LIBRARY_PATH"] = os.pathsep.join(filter(None, libraries))
+    included = sources, sources / "third_party" / "glm", *_headers(toolkit)
     arguments = {
-        "name": name,
+        "name": NAME,
         "sources": [str(path) for path in _united(sources, folder)],
         "extra_cflags": ["-O3"],
         "extra_cuda_cflags": ["-O3", "--use_fast_math"],
-        "extra_include_paths": [str(p) for p in (own, own / "third_party" / "glm", *_headers(toolkit))],
+        "extra_include_paths": list(map(str, included)),
         "build_directory": str(folder),
         "verbose": True,
     }
     (folder / "lock").unlink(missing_ok=True)  # older versions of torch would wait forever for its holder
-    log, start, library = folder / "build.log", time.monotonic(), folder / f"{name}.so"
+    log, start, library = folder / "build.log", time.monotonic(), folder / f"{NAME}.so"
     say(
-        f"Building {name} for compute capability {arch} with {jobs} jobs: once, for some minutes. "
+        f"Building {NAME} for compute capability {arch} with {jobs} jobs: once, for some minutes. "
         f"Interrupted, it goes on next time. Log: {log}"
     )
     command = [sys.executable, "-c", _COMPILE, json.dumps(arguments)]
@@ -194,7 +193,7 @@ def _compile(folder: Path, arch: str, sources: Sequence[Path], name: str) -> Pat
         reason = next(named, lines[-1])[:300]
         if status < 0:
             reason = f"signal {-status} stopped it, perhaps for lack of memory (MAX_JOBS=1 takes less)"
-        raise UserError(f"building {name} failed: {reason} (the whole output: {log})")
+        raise UserError(f"building {NAME} failed: {reason} (the whole output: {log})")
     # This file also marks a complete build.
     (folder / "done").write_text(f"{time.monotonic() - start:.0f} s with {jobs} job(s)\n")
     return library
@@ -209,16 +208,20 @@ def _linkable(toolkit: Path, folder: Path) -> Path:
     return folder
 
 
-def _united(sources: Sequence[Path], folder: Path) -> list[Path]:
+def _sources() -> Path:
+    return _package("gsplat")[0] / "cuda" / "csrc"
+
+
+def _united(sources: Path, folder: Path) -> list[Path]:
     """Return the sources, with the CUDA ones merged into a few files that include them. A file is written
     only if it changes, so that compiled objects stay valid."""
-    cuda = sorted((path for path in sources if path.suffix == ".cu"), key=lambda p: p.stat().st_size)
+    cuda = sorted(sources.glob("*.cu"), key=lambda path: path.stat().st_size)
     units = [folder / f"unit_{number}.cu" for number in range(min(UNITS, len(cuda)))]
     for number, unit in enumerate(units):
         text = "".join(f'#include "{path}"\n' for path in cuda[number::UNITS])
         if not unit.is_file() or unit.read_text() != text:
             unit.write_text(text)
-    return [*units, *(path for path in sources if path.suffix != ".cu")]
+    return [*units, *sorted(sources.glob("*.cpp"))]
 
 
 def load(library: Path) -> ModuleType:
@@ -243,13 +246,7 @@ def make_ready() -> None:
         raise UserError("gsplat's kernels run on NVIDIA's GPUs, and this one is AMD's")
     arch = device_arch()
     folder = build_folder(arch)
-    library = built(folder) or build(folder, arch)
-    try:
-        kernels = load(library)
-    except ImportError:  # the library is damaged
-        library.unlink()
-        kernels = load(build(folder, arch))
-    gsplat.csrc = sys.modules["gsplat.csrc"] = kernels
+    gsplat.csrc = sys.modules["gsplat.csrc"] = load(built(folder) or build(folder, arch))
 
 
 @functools.cache

@@ -42,8 +42,7 @@ def rasterize(
     because one would spoil every pixel of its tiles.
 
     Args:
-        gaussians: the Gaussians, world frame.
-        camera: where to render them from.
+        gaussians, camera: in the world frame.
         channels: values to composite over the background, such as activated colors.
         background: one value per channel; black by default.
         render_depth: also render the expected depth, world units.
@@ -109,7 +108,7 @@ def _without_broken(
 
 def _check_sizes(gaussians: Gaussians, channels: Tensor, background: Tensor | None) -> None:
     count = len(gaussians.means)
-    parts = {"channels": channels, **vars(gaussians)}
+    parts = {"channels": channels, "features": features, **vars(gaussians)}
     sizes = {name: len(part) for name, part in parts.items() if isinstance(part, Tensor)}
     wrong = {name: size for name, size in sizes.items() if size != count}
     if wrong:

@@ -32,11 +32,9 @@ MOST_TILES = 4096
 
 
 class Compositing(torch.autograd.Function):
-    """Compositing of screen ellipses front to back over black, to image and alpha, [h, w, …] each.
-
-    The rules are gsplat's: alpha is at most 0.999 and skipped below 1/255, and a pixel stops before its
-    transmittance reaches 1e-4.
-    """
+    """Compositing of screen ellipses front to back over black, to image and alpha, [h, w, …] each. The rules
+    are gsplat's: alpha is at most 0.999 and skipped below 1/255, and a pixel stops before its transmittance
+    reaches 1e-4."""
 
     @staticmethod
     def forward(  # type: ignore[override]

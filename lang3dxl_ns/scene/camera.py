@@ -145,12 +145,12 @@ class Camera:
         return replace(self, view_matrix=view, intrinsics=intrinsics)
 
     def at_origin(self, like: Tensor) -> tuple[Camera, Float[Tensor, "3"]]:
-        """Return the camera in a world whose origin is its own (rounded) position, and that position.
+        """Return the camera in a world whose origin is its own (rounded) position, and that position, in the
+        type and on the device of `like`.
 
         Far from the origin (map coordinates are in the millions) R·x + t is a small difference of large
-        numbers. R·(x − position) + (R·position + t) is not, if the last bracket is computed in float64. That
-        happens on the camera's device, or on the CPU for Apple's GPUs, which lack float64. The result has the
-        type and device of `like`.
+        numbers. R·(x − position) + (R·position + t) is not, if the last bracket is computed in float64: on
+        the camera's device, or on the CPU for Apple's GPUs, which lack float64.
         """
         view = self.view_matrix.cpu() if self.view_matrix.device.type == "mps" else self.view_matrix
         view = view.to(torch.float64)

@@ -1,8 +1,7 @@
 """Structure from motion: from a folder of photos to cameras, poses and points, with COLMAP's library.
 
-The steps are SIFT features, matching, and COLMAP's incremental or global mapper. Features and matches are
-stored in a database as they are made, so that an interrupted reconstruction can be resumed; the model is
-written only when it is complete.
+Features and matches are stored in a database as they are made, so that an interrupted reconstruction can be
+resumed; the model is written only when it is complete.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
-from lang3dxl_ns.common.timing import measure, part
+from lang3dxl_ns.common.reports import measure, part
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import (
@@ -75,14 +74,13 @@ def reconstruct(
     features, partners = _features_and_partners(database)
     if not models:
         raise UserError(_why_no_model(features, partners))
-    names = dict(zip(copies.names, good.names, strict=True))
+    best, names = models[0], dict(zip(copies.names, good.names, strict=True))
     reasons = _reasons(copies.names, models, features, partners)
     with load_pycolmap().Database.open(database) as db:
-        doubts = doubtful_placements(rotations_of(models[0]), matched_pairs(db, models[0]))
-    doubtful = {names[models[0].images[i].name]: why for i, why in sorted(doubts.items())}
+        doubts = doubtful_placements(rotations_of(best), matched_pairs(db, best))
+    doubtful = {names[best.images[i].name]: why for i, why in sorted(doubts.items())}
     for image in (image for model in models for image in model.images.values()):
         image.name = names[image.name]
-    best = models[0]
     report = ReconstructionReport(
         photos=len(photos.names), registered=best.num_reg_images(), points=best.num_points3D(),
         error=float(best.compute_mean_reprojection_error()),
@@ -275,9 +273,8 @@ def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:
                 found.write_binary(complete / str(index))
             complete.rename(model)
     except OSError as error:
-        raise UserError(
-            f"the model can't be written to {model} ({error}): make room, or choose --cache-dir"
-        ) from error
+        trouble = f"the model can't be written to {model} ({error})"
+        raise UserError(f"{trouble}: make room, or choose --cache-dir") from error
 
 
 def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:

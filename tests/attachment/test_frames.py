@@ -14,7 +14,7 @@ from lang3dxl_ns.attachment import frames
 from lang3dxl_ns.attachment.frames import camera_in, find_frame
 from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames
 from lang3dxl_ns.preparation.photo_collection import read_collection
-from lang3dxl_ns.rendering.render import render
+from lang3dxl_ns.rendering import render
 
 
 @pytest.fixture(scope="module")

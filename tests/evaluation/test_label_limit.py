@@ -7,7 +7,7 @@ import torch
 from lang3dxl_ns.evaluation.label_limit import label_limit
 from lang3dxl_ns.evaluation.layouts import Truth
 from lang3dxl_ns.evaluation.scores import average_precision, bounds
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.camera import Camera
 
 SIZE = 24

@@ -8,8 +8,7 @@ from conftest import make_trainer
 from lang3dxl_ns.components.initialization import FREE, LONGEST, NEEDLE, keep_in_bounds
 from lang3dxl_ns.query.read_splats import read_splats
 from lang3dxl_ns.query.splat_file import write_splats
-from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
+from lang3dxl_ns.rendering import Gaussians, rasterize, spherical_harmonics
 from lang3dxl_ns.scene.camera import Lens
 
 SKY = 40

@@ -21,8 +21,7 @@ from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words, read_scene
 from lang3dxl_ns.query.teach import Example
-from lang3dxl_ns.rendering import Gaussians, rasterize
-from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
+from lang3dxl_ns.rendering import Gaussians, rasterize, spherical_harmonics
 
 WHOLE_SKY = {"pipeline__model__sky_gaussians": 2_000}
 """Through gaps in a smaller one faint Gaussians show, which rounding draws or leaves out."""

@@ -14,7 +14,7 @@ from numpy.lib import recfunctions
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.splat_file import log_scales, logits, write_splats
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 
 
 def some_splats(count: int = 300, bands: int = 4) -> Splats:

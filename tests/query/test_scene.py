@@ -25,8 +25,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.rendering.rasterize import rasterize
-from lang3dxl_ns.rendering.render import composite
+from lang3dxl_ns.rendering import composite, rasterize
 from lang3dxl_ns.scene.camera import camera_to_world
 
 
@@ -118,7 +117,7 @@ def test_a_view_of_at_most_the_training_size_takes_one_pass(scene, monkeypatch, 
         return rasterize(gaussians, camera, *args, **settings)
 
     question = scene.ask("dome; window")
-    monkeypatch.setattr(sys.modules["lang3dxl_ns.rendering.render"], "rasterize", counted)
+    monkeypatch.setattr(sys.modules["lang3dxl_ns.rendering.splats"], "rasterize", counted)
     match, _ = scene.matches(question, "all/0003.jpg", size)
     assert drawn == [size, 96][:passes]
     if passes == 1:
@@ -282,7 +281,7 @@ def test_the_cache_is_read_back_and_forgotten_with_the_geometry(tmp_path, monkey
     expected = painted_scene(cache).find("dome")
     stamp = cache.stat().st_mtime_ns
     with monkeypatch.context() as patched:
-        patched.setattr(Scene, "_visible", lambda *_: pytest.fail("measured again, though it is kept"))
+        patched.setattr(Scene, "_fill", lambda *_: pytest.fail("measured again, though it is kept"))
         assert painted_scene(cache).find("dome").box == expected.box
     splats = painted_splats()
     painted_scene(cache, splats=replace(splats, means=splats.means + 0.01)).find("dome")

@@ -36,11 +36,14 @@ TOOLKIT = find_toolkit(torch.version.cuda or "0")
 
 
 @pytest.fixture
-def build(tmp_path):
+def build(tmp_path, monkeypatch):
     """Builds a small source into a folder."""
-    source = tmp_path / "tiny.cu"
-    source.write_text(SOURCE)
-    return lambda folder: gsplat_build.build(folder, "8.6", [source], "tiny")
+    sources = tmp_path / "sources"
+    sources.mkdir()
+    (sources / "tiny.cu").write_text(SOURCE)
+    monkeypatch.setattr(gsplat_build, "_sources", lambda: sources)
+    monkeypatch.setattr(gsplat_build, "NAME", "tiny")
+    return lambda folder: gsplat_build.build(folder, "8.6")
 
 
 @pytest.fixture
@@ -129,13 +132,13 @@ def test_a_half_built_folder_is_completed(build, tmp_path, fake_compiler):
     fake_compiler("(f / 'one.o').touch(); (f / 'tiny.so').write_text('half'); sys.exit(1)")
     with pytest.raises(UserError, match="failed"):
         build(folder)
-    assert gsplat_build.built(folder, "tiny") is None
+    assert gsplat_build.built(folder) is None
     (folder / "lock").touch()  # of an older torch, which would wait for its holder
     fake_compiler(
         "assert (f / 'one.o').exists() and not (f / 'lock').exists(); (f / 'tiny.so').write_text('whole')"
     )
     assert build(folder).read_text() == "whole"
-    assert gsplat_build.built(folder, "tiny") is not None
+    assert gsplat_build.built(folder) is not None
 
 
 def test_two_builds_at_once_share_one(build, tmp_path, fake_compiler):

@@ -27,12 +27,9 @@ def is_local(host: str) -> bool:
 
 @dataclass
 class Access:
-    """Access rules of one server.
-
-    A server that only this machine can reach answers requests for the machine's own names (against DNS
-    rebinding) from its own pages. A server that others can reach answers clients that opened the address with
-    the token, which becomes a cookie.
-    """
+    """Access rules of one server. One that only this machine can reach answers requests for the machine's own
+    names (against DNS rebinding) from its own pages. One that others can reach answers clients that opened
+    the address with the token, which becomes a cookie."""
 
     host: str
     port: int

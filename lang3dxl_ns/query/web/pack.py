@@ -22,7 +22,7 @@ from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.splat_file import array_of
 from lang3dxl_ns.query.visibility import VisibleGaussians
-from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.camera import Camera
 
 _LOG_SCALES = (-12.0, 9.0)
@@ -40,13 +40,11 @@ LEAST_PIXELS, PIXEL_STEPS = 0.05, 12
 def pack_splats(
     splats: Splats, center: Float[Tensor, "3"], toward: Float[Tensor, "3"]
 ) -> UInt8[Array, "n 16"]:
-    """Pack splats into 16 bytes per Gaussian, in Spark's format.
-
-    The bytes are: red, green, blue, opacity; half-precision means; two octahedral coordinates of the
-    rotation's axis; three logarithmic scales; the rotation's angle. Gaussians with a NaN or infinite value
-    become invisible, so that row numbers stay those of the scene. Half precision is finest close to `center`,
-    the origin of the packed means. Colors are those seen from `toward` (both in world units).
-    """
+    """Pack splats into 16 bytes per Gaussian, in Spark's format: red, green, blue, opacity; half-precision
+    means; two octahedral coordinates of the rotation's axis; three logarithmic scales; the rotation's angle.
+    Gaussians with a NaN or infinite value become invisible, so that row numbers stay those of the scene. Half
+    precision is finest close to `center`, the origin of the packed means. Colors are those seen from `toward`
+    (both in world units)."""
     sound = splats.sound()[:, None]
     means = torch.where(sound, splats.means - center, 0.0).cpu().numpy().astype("<f2")
     axes, angle = _octahedral(torch.where(sound, splats.quats, 0.0).cpu().double())
