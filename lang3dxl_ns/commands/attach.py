@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -11,10 +13,14 @@ from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
 
+if TYPE_CHECKING:
+    from lang3dxl_ns.query.scene import Scene
+    from lang3dxl_ns.query.text import Prompt
+
 
 @showing(
-    *("splat", "data", "out", "clip", "quality", "views", "up", "foreground", "segment", "workers"),
-    "cache_dir",
+    *("splat", "data", "out", "text", "clip", "quality", "views", "up", "foreground", "segment"),
+    *("workers", "cache_dir"),
 )
 @dataclass(kw_only=True)
 class Attach(AttachConfig):
@@ -31,10 +37,29 @@ class Attach(AttachConfig):
     """Photos of the splat, with a COLMAP model, with a transforms.json, or alone, or a video."""
     out: Path
     """Scene file to write, NAME.scene."""
+    text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """Texts to search for at the end ("windows; towers"), with a picture of the best view of each."""
 
     def main(self) -> None:
         from lang3dxl_ns.attachment.attach import attach
+        from lang3dxl_ns.query.text import parse_prompts
 
         self.check()
-        attach(self.splat, self.data, self.out, self)
+        prompts = [prompt for text in self.text for prompt in parse_prompts(text)]  # fail before the work
+        scene = attach(self.splat, self.data, self.out, self)
+        if prompts:
+            _show(scene, prompts, self.out)
         say(f'Ask it: lang3dxl query {self.out} --text "windows" --out found')
+
+
+def _show(scene: Scene, texts: Sequence[str | Prompt], out: Path) -> None:
+    """Write a picture of the view that shows each text best, named after the text."""
+    from lang3dxl_ns.common.files import slugs
+    from lang3dxl_ns.query.doubt import doubtful
+
+    matches = scene.query(texts)
+    for match, slug in zip(matches, slugs([match.prompt.text for match in matches]), strict=True):
+        picture = match.save(out.with_name(f"{out.stem}.{slug}.png"))
+        say(f"{match.prompt.text}, in the view of {match.view.name}: {picture}")
+        if advice := doubtful(match.prompt.text, match.doubt, match.prompt.taught is not None):
+            say(f"  {advice}")

@@ -12,6 +12,7 @@ from scenes import write_scene
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.known_frames import known_frames
+from lang3dxl_ns.commands.attach import Attach, _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.preparation.photo_collection import read_collection
@@ -89,6 +90,12 @@ def test_written_over_a_scene_it_keeps_the_words_that_were_taught(place):
 
 
 @pytest.mark.slow
+def test_pictures_are_named_after_the_texts_that_they_show(place, tmp_path):
+    _show(read_scene(place / "box.scene"), ["windows", "towers"], tmp_path / "box.scene")
+    assert {path.name for path in tmp_path.iterdir()} == {"box.windows.png", "box.towers.png"}
+
+
+@pytest.mark.slow
 def test_without_photos_the_splat_is_its_own(place):
     scene = attach(place / "box.ply", None, place / "alone.scene", SETTINGS)
     assert len(scene.photos) == 6
@@ -140,10 +147,12 @@ def test_photos_of_something_else_are_refused_with_a_picture(place):
     assert not (place / "other.scene").exists()
 
 
-def test_mistakes_are_told_before_a_model_is_downloaded(tmp_path):
+def test_mistakes_are_told_before_a_model_is_downloaded_and_an_empty_text_before_the_work(tmp_path):
     config = replace(SETTINGS, clip="somebody/nothing")
     with pytest.raises(UserError, match=r"nothing\.ply does not exist"):
         attach(tmp_path / "nothing.ply", None, tmp_path / "a.scene", config)
+    with pytest.raises(UserError, match="prompt is empty"):
+        Attach(splat=tmp_path / "nothing.ply", out=tmp_path / "a.scene", text=["dome", " "]).main()
 
 
 @pytest.mark.parametrize(
