@@ -246,7 +246,13 @@ def make_ready() -> None:
         raise UserError("gsplat's kernels run on NVIDIA's GPUs, and this one is AMD's")
     arch = device_arch()
     folder = build_folder(arch)
-    gsplat.csrc = sys.modules["gsplat.csrc"] = load(built(folder) or build(folder, arch))
+    library = built(folder) or build(folder, arch)
+    try:
+        kernels = load(library)
+    except ImportError:  # the library is damaged
+        library.unlink()
+        kernels = load(build(folder, arch))
+    gsplat.csrc = sys.modules["gsplat.csrc"] = kernels
 
 
 @functools.cache

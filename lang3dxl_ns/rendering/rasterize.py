@@ -108,7 +108,7 @@ def _without_broken(
 
 def _check_sizes(gaussians: Gaussians, channels: Tensor, background: Tensor | None) -> None:
     count = len(gaussians.means)
-    parts = {"channels": channels, "features": features, **vars(gaussians)}
+    parts = {"channels": channels, **vars(gaussians)}
     sizes = {name: len(part) for name, part in parts.items() if isinstance(part, Tensor)}
     wrong = {name: size for name, size in sizes.items() if size != count}
     if wrong:

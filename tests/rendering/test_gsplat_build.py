@@ -205,6 +205,24 @@ print(_C is kernels)
     assert done.stdout.strip().endswith("True")
 
 
+def test_a_damaged_library_is_built_again(monkeypatch, tmp_path):
+    import gsplat
+
+    damaged, rebuilt = tmp_path / f"{gsplat_build.NAME}.so", tmp_path / "rebuilt.py"
+    damaged.write_bytes(b"no library")
+    rebuilt.write_text("complete = True")
+    (tmp_path / "done").touch()
+    monkeypatch.setattr(gsplat_build, "device_arch", lambda: "8.6")
+    monkeypatch.setattr(gsplat_build, "build_folder", lambda _: tmp_path)
+    monkeypatch.setattr(gsplat_build, "build", lambda *_: rebuilt)
+    try:
+        gsplat_build.make_ready()
+        assert gsplat.csrc.complete and not damaged.exists()
+    finally:
+        sys.modules.pop("gsplat.csrc", None)
+        vars(gsplat).pop("csrc", None)
+
+
 def test_a_toolkit_with_the_whole_chain_of_links_is_linked(tmp_path):
     """conda and systems have libcudart.so.13 and libcudart.so.13.2.51; pip has one of them."""
     (tmp_path / "lib").mkdir()
