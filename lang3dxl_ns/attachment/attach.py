@@ -27,6 +27,7 @@ from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
 from lang3dxl_ns.rendering.splats import Splats
+from lang3dxl_ns.scene.photo_folder import check_data
 
 _LIGHT = 0.15
 """Deviation of the photos' brightness (natural logarithm) above which a message reports it."""
@@ -61,7 +62,8 @@ def attach(
         raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
     if data is None and place is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
-    path = find_splats(splat)  # before any model is downloaded
+    path = find_splats(splat)  # before any model is downloaded, as the next line
+    check_data(None if data is None else Path(data))
     option_prefix.set("--")
     preparation = settled(config)
     check_encoders(preparation.clip, preparation.dense)

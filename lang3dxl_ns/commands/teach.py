@@ -11,6 +11,7 @@ import tyro
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import locked
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene
@@ -41,13 +42,16 @@ class Teach:
     """Point on something else: X,Y. Repeat the flag for more."""
 
     def main(self) -> None:
-        from lang3dxl_ns.query.scene_file import keep_words
+        from lang3dxl_ns.open_scene import existing_scene_file
+        from lang3dxl_ns.query.scene_file import keep_words, read_scene
         from lang3dxl_ns.query.teach import known_word
 
-        (scene, file), name = opened(self.scene), known_word(self.word)
-        before = scene.words[name].examples if name in scene.words else ()
-        taught = scene.teach(self.word, [*before, self._example()])
-        keep_words(file, {name: taught.words[name]})
+        file, name = existing_scene_file(self.scene).resolve(), known_word(self.word)
+        with locked(file.parent):  # another example that is taught at this moment comes first, or waits
+            scene = read_scene(file)
+            before = scene.words[name].examples if name in scene.words else ()
+            taught = scene.teach(self.word, [*before, self._example()])
+            keep_words(file, {name: taught.words[name]})
         say(*described(taught.words[name]))
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
 
@@ -79,8 +83,8 @@ class Words:
     """File of words to add. Words learned in one scene often fail in another, so check them."""
 
     def main(self) -> None:
-        from lang3dxl_ns.query.scene_file import keep_words
-        from lang3dxl_ns.query.teach import load_words, save_words
+        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words
+        from lang3dxl_ns.query.teach import known_word, load_words, save_words
 
         if self.save is not None and self.save.suffix != ".json":
             raise UserError(f"--save writes words as JSON: {self.save} is not the name of a .json file")
@@ -94,7 +98,13 @@ class Words:
         words = list(scene.words.values())
         if self.forget or self.load is not None:
             changed = {name: scene.words.get(name) for name in {**before, **scene.words}}
-            keep_words(file, {name: word for name, word in changed.items() if word is not before.get(name)})
+            changed = {name: word for name, word in changed.items() if word is not before.get(name)}
+            with locked(file.resolve().parent):
+                for word in describe_scene_file(file)["taught"]:
+                    name = known_word(word.name)
+                    if name in changed and (name not in before or word.to_json() != before[name].to_json()):
+                        raise UserError(f"{word.name!r} was taught at this moment: repeat this command")
+                keep_words(file, changed)
         if self.save is not None:
             if not words:
                 raise UserError("there is no word to save: teach one with lang3dxl teach")

@@ -11,11 +11,13 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.timing import part
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
@@ -76,6 +78,9 @@ class RenderingModel(SplatfactoModel):
     answers: RenderedAnswers | Conversation | None = None
     codes_have_begun = False
     """Whether training has reached the codes; part of a checkpoint's run state."""
+    refuses_lenses = False
+    """Whether a camera that is not perspective is an error, as for `ns-render`; viewers are told of it."""
+    _told_of_lens = False
 
     @property
     def facts(self) -> SceneFacts:
@@ -145,6 +150,7 @@ class RenderingModel(SplatfactoModel):
         self, camera: Cameras, obb_box: OrientedBox | None = None
     ) -> dict[str, Tensor]:
         """Return the camera's outputs in the order of viewers' lists, with the outputs of `answers` first."""
+        self._check_lens(CameraType(int(camera.camera_type[0])))
         self.set_crop(obb_box)
         start, answers = time.perf_counter(), self.answers
         if answers is None:
@@ -153,6 +159,16 @@ class RenderingModel(SplatfactoModel):
         rendering, outputs = self._shown(camera, answers.channels(), colors)
         found = answers.outputs(rendering, time.perf_counter() - start)
         return {"rgb": outputs["rgb"], **found, **outputs}
+
+    def _check_lens(self, kind: CameraType) -> None:
+        if kind is CameraType.PERSPECTIVE or self._told_of_lens:
+            return
+        lens = kind.name.lower().replace("_", " ")
+        why = f"Gaussians are rendered in perspective only, not as {lens}: choose the camera type perspective"
+        if self.refuses_lenses:
+            raise UserError(why)
+        self._told_of_lens = True
+        say(why)
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
         """Render a camera: `rgb`, `accumulation`, `background`; in training also `codes` [H, W, d] if the

@@ -151,6 +151,9 @@ def test_mistakes_are_told_before_a_model_is_downloaded_and_an_empty_text_before
     config = replace(SETTINGS, clip="somebody/nothing")
     with pytest.raises(UserError, match=r"nothing\.ply does not exist"):
         attach(tmp_path / "nothing.ply", None, tmp_path / "a.scene", config)
+    (tmp_path / "some.ply").touch()
+    with pytest.raises(UserError, match=r"typo is not a folder"):
+        attach(tmp_path / "some.ply", tmp_path / "typo", tmp_path / "a.scene", config)
     with pytest.raises(UserError, match="prompt is empty"):
         Attach(splat=tmp_path / "nothing.ply", out=tmp_path / "a.scene", text=["dome", " "]).main()
 
