@@ -47,10 +47,11 @@ class Teach:
         from lang3dxl_ns.query.teach import known_word
 
         file, name = existing_scene_file(self.scene).resolve(), known_word(self.word)
+        example = self._example()
         with locked(file.parent):  # another example that is taught at this moment comes first, or waits
             scene = read_scene(file)
             before = scene.words[name].examples if name in scene.words else ()
-            taught = scene.teach(self.word, [*before, self._example()])
+            taught = scene.teach(self.word, [*before, example])
             keep_words(file, {name: taught.words[name]})
         say(*described(taught.words[name]))
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
@@ -146,7 +147,7 @@ def described(word: TaughtWord) -> list[str]:
         return [f"{word.name}: carried over from {word.scene}, which often fails: check it in a few photos"]
     count = f"{len(word.examples)} example{'s' if len(word.examples) > 1 else ''}"
     lines = [f"{word.name}: taught by {count}, doubt {word.doubt:.2f}"]
-    learned = ", learned from the others" if len(word.precision) > 1 else ""
+    learned = ", learned from the others" if len({e.photo for e in word.examples}) > 1 else ""
     for number, example in enumerate(word.examples, start=1):
         precision = word.precision.get(example.photo)
         score = "" if precision is None else f": average precision {precision:.2f}{learned}"

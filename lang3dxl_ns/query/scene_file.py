@@ -270,8 +270,12 @@ class _File:
         if name not in self.shapes:
             return None
         content = self.tensor(name, *self.shapes[name]).numpy().astype(np.uint8).tobytes()
-        with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
-            expect(image.width * image.height <= MOST_PIXELS, "a mask is too large")
+        try:
+            with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+                expect(image.width * image.height <= MOST_PIXELS, "a mask is too large")
+                image.verify()
+        except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+            raise ValueError(f"the mask of photo {photo} is damaged, or too large") from error
         return content
 
     def loaded(self, name: str, module: Module, state: Mapping[str, Any] | None = None) -> Module:
