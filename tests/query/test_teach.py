@@ -87,7 +87,7 @@ def test_a_photo_is_not_judged_by_its_own_marks_under_whatever_name(scene):
     assert [example.photo for example in taught.examples] == [ALL, ALL] and list(taught.precision) == [ALL]
     other = "left/0001.jpg"
     examples = [Example(ALL, edge), Example(ALL, first), Example(other, outline(scene, other, FIRST_WINDOW))]
-    # By the mark of the dome itself it has 0.99.
+    # By the other mark in it it has 0.88.
     assert scene.teach("gizmo", examples).words["gizmo"].precision[ALL] < 0.8
 
 
