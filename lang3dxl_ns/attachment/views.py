@@ -138,8 +138,7 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCol
     They are kept in `folder`, and rendered again only for another splat or other settings. Raises UserError
     if no view shows the splat well.
     """
-    shown = {**vars(splats.gaussians), "harmonics": splats.harmonics}
-    stamp = fingerprint(shown, [_RULE, count, up, splats.antialiased])
+    stamp = fingerprint(vars(splats.gaussians) | {"harmonics": splats.harmonics}, [_RULE, count, up])
     kept = _kept(folder, stamp)
     cameras = kept or choose_views(splats, Extent.of(splats, up), count)
     background = splats.means.new_tensor(BACKGROUND)

@@ -84,12 +84,13 @@ class Words:
     """File of words to add. Words learned in one scene often fail in another, so check them."""
 
     def main(self) -> None:
-        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words
+        from lang3dxl_ns.open_scene import existing_scene_file
+        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words, read_scene
         from lang3dxl_ns.query.teach import known_word, load_words, save_words
 
         if self.save is not None and self.save.suffix != ".json":
             raise UserError(f"--save writes words as JSON: {self.save} is not the name of a .json file")
-        scene, file = opened(self.scene)
+        scene = read_scene(file := existing_scene_file(self.scene))
         before = scene.words
         for name in self.forget:
             scene = forgotten(scene, name)
@@ -114,15 +115,6 @@ class Words:
             say("This scene was taught no word: lang3dxl teach --word doors --photo NAME --at X,Y")
         for word in words:
             say(*described(word))
-
-
-def opened(path: Path | None) -> tuple[Scene, Path]:
-    """Open a scene, and find the file that keeps its words. Raises UserError if there is none."""
-    from lang3dxl_ns.open_scene import existing_scene_file
-    from lang3dxl_ns.query.scene_file import read_scene
-
-    file = existing_scene_file(path)
-    return read_scene(file), file
 
 
 def forgotten(scene: Scene, which: str) -> Scene:

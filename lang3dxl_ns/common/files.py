@@ -11,7 +11,6 @@ import re
 import secrets
 import stat
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -98,7 +97,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         raise
 
 
-@contextmanager
+@contextlib.contextmanager
 def locked(folder: Path, busy: str | None = None) -> Iterator[None]:
     """Hold a folder's lock, which a killed process gives up too. If another process holds it, wait, or raise
     UserError with the message `busy`. Where the system has no such locks, nothing is held."""

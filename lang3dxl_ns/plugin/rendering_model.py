@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 from lang3dxl_ns.rendering.splats import harmonics_of
 from lang3dxl_ns.scene.camera import in_view
+
+_say_once = cache(say)
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,6 @@ class RenderingModel(SplatfactoModel):
     """Whether training has reached the codes; part of a checkpoint's run state."""
     refuses_lenses = False
     """Whether a camera that is not perspective is an error, as for `ns-render`; viewers are told of it."""
-    _told_of_lens = False
 
     @property
     def facts(self) -> SceneFacts:
@@ -150,7 +152,11 @@ class RenderingModel(SplatfactoModel):
         self, camera: Cameras, obb_box: OrientedBox | None = None
     ) -> dict[str, Tensor]:
         """Return the camera's outputs in the order of viewers' lists, with the outputs of `answers` first."""
-        self._check_lens(CameraType(int(camera.camera_type[0])))
+        if (kind := CameraType(int(camera.camera_type[0])).name.lower()) != "perspective":
+            why = f"Gaussians are rendered in perspective, not as {kind}: choose the camera type perspective"
+            if self.refuses_lenses:
+                raise UserError(why)
+            _say_once(why)
         self.set_crop(obb_box)
         start, answers = time.perf_counter(), self.answers
         if answers is None:
@@ -159,16 +165,6 @@ class RenderingModel(SplatfactoModel):
         rendering, outputs = self._shown(camera, answers.channels(), colors)
         found = answers.outputs(rendering, time.perf_counter() - start)
         return {"rgb": outputs["rgb"], **found, **outputs}
-
-    def _check_lens(self, kind: CameraType) -> None:
-        if kind is CameraType.PERSPECTIVE or self._told_of_lens:
-            return
-        lens = kind.name.lower().replace("_", " ")
-        why = f"Gaussians are rendered in perspective only, not as {lens}: choose the camera type perspective"
-        if self.refuses_lenses:
-            raise UserError(why)
-        self._told_of_lens = True
-        say(why)
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor]:  # type: ignore[override]
         """Render a camera: `rgb`, `accumulation`, `background`; in training also `codes` [H, W, d] if the
