@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from lang3dxl_ns.attachment.views import rendered_views
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.files import expanded, make_folder
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
@@ -27,6 +28,7 @@ from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
 from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.scene.photo_folder import check_data
 
 _LIGHT = 0.15
 """Deviation of the photos' brightness (natural logarithm) above which a message reports it."""
@@ -61,7 +63,12 @@ def attach(
         raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
     if data is None and place is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
-    path = find_splats(splat)  # before any model is downloaded
+    path = find_splats(splat)  # before any model is downloaded, as the next line
+    check_data(None if data is None else Path(data))
+    if place is not None:
+        make_folder(place.parent)
+        if not os.access(place.parent, os.W_OK):
+            raise UserError(f"{place.parent} is read-only: choose another place, or change its permissions")
     option_prefix.set("--")
     preparation = settled(config)
     check_encoders(preparation.clip, preparation.dense)

@@ -135,12 +135,14 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCol
     """Render this many pictures of a splat as a photo collection, in the splat's frame. They are kept in
     `folder`, and rendered again only for another splat or other settings. Raises UserError if no view shows
     the splat well."""
-    stamp = fingerprint(vars(splats.gaussians), [_RULE, count, up])
+    stamp = fingerprint(vars(splats.gaussians) | {"harmonics": splats.harmonics}, [_RULE, count, up])
     kept = _kept(folder, stamp)
     cameras = kept or choose_views(splats, Extent.of(splats, up), count)
     background = splats.means.new_tensor(BACKGROUND)
     names = [f"{i:04d}.png" for i in range(len(cameras))]
     make_folder(folder)
+    if kept is None:  # pictures of another splat, or, if this is interrupted, of two
+        (folder / "views.json").unlink(missing_ok=True)
     seen, chosen = {}, np.random.default_rng(0)
     for name, camera in tracked(zip(names, cameras, strict=True), "rendering views", len(cameras)):
         view = render(splats, camera, background=background)

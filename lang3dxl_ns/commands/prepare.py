@@ -33,9 +33,9 @@ class Prepare(PreparationConfig):
     or dense features with --dense none), and make none."""
 
     def main(self) -> None:
-        from lang3dxl_ns.plugin.dataparser import check_data
         from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
         from lang3dxl_ns.preparation.store import FeatureStore
+        from lang3dxl_ns.scene.photo_folder import check_data
 
         option_prefix.set("--")
         check_data(self.data)

@@ -11,6 +11,7 @@ import tyro
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import locked
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene
@@ -41,13 +42,17 @@ class Teach:
     """Point on something else: X,Y. Repeat the flag for more."""
 
     def main(self) -> None:
-        from lang3dxl_ns.query.scene_file import keep_words
+        from lang3dxl_ns.open_scene import existing_scene_file
+        from lang3dxl_ns.query.scene_file import keep_words, read_scene
         from lang3dxl_ns.query.teach import known_word
 
-        (scene, file), name = opened(self.scene), known_word(self.word)
-        before = scene.words[name].examples if name in scene.words else ()
-        taught = scene.teach(self.word, [*before, self._example()])
-        keep_words(file, {name: taught.words[name]})
+        file, name = existing_scene_file(self.scene).resolve(), known_word(self.word)
+        example = self._example()
+        with locked(file.parent):  # another example that is taught at this moment comes first, or waits
+            scene = read_scene(file)
+            before = scene.words[name].examples if name in scene.words else ()
+            taught = scene.teach(self.word, [*before, example])
+            keep_words(file, {name: taught.words[name]})
         say(*described(taught.words[name]))
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
 
@@ -79,12 +84,13 @@ class Words:
     """File of words to add. Words learned in one scene often fail in another, so check them."""
 
     def main(self) -> None:
-        from lang3dxl_ns.query.scene_file import keep_words
-        from lang3dxl_ns.query.teach import load_words, save_words
+        from lang3dxl_ns.open_scene import existing_scene_file
+        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words, read_scene
+        from lang3dxl_ns.query.teach import known_word, load_words, save_words
 
         if self.save is not None and self.save.suffix != ".json":
             raise UserError(f"--save writes words as JSON: {self.save} is not the name of a .json file")
-        scene, file = opened(self.scene)
+        scene = read_scene(file := existing_scene_file(self.scene))
         before = scene.words
         for name in self.forget:
             scene = forgotten(scene, name)
@@ -94,7 +100,13 @@ class Words:
         words = list(scene.words.values())
         if self.forget or self.load is not None:
             changed = {name: scene.words.get(name) for name in {**before, **scene.words}}
-            keep_words(file, {name: word for name, word in changed.items() if word is not before.get(name)})
+            changed = {name: word for name, word in changed.items() if word is not before.get(name)}
+            with locked(file.resolve().parent):
+                for word in describe_scene_file(file)["taught"]:
+                    name = known_word(word.name)
+                    if name in changed and (name not in before or word.to_json() != before[name].to_json()):
+                        raise UserError(f"{word.name!r} was taught at this moment: repeat this command")
+                keep_words(file, changed)
         if self.save is not None:
             if not words:
                 raise UserError("there is no word to save: teach one with lang3dxl teach")
@@ -103,15 +115,6 @@ class Words:
             say("This scene was taught no word: lang3dxl teach --word doors --photo NAME --at X,Y")
         for word in words:
             say(*described(word))
-
-
-def opened(path: Path | None) -> tuple[Scene, Path]:
-    """Open a scene, and find the file that keeps its words. Raises UserError if there is none."""
-    from lang3dxl_ns.open_scene import existing_scene_file
-    from lang3dxl_ns.query.scene_file import read_scene
-
-    file = existing_scene_file(path)
-    return read_scene(file), file
 
 
 def forgotten(scene: Scene, which: str) -> Scene:
@@ -136,7 +139,7 @@ def described(word: TaughtWord) -> list[str]:
         return [f"{word.name}: carried over from {word.scene}, which often fails: check it in a few photos"]
     count = f"{len(word.examples)} example{'s' if len(word.examples) > 1 else ''}"
     lines = [f"{word.name}: taught by {count}, doubt {word.doubt:.2f}"]
-    learned = ", learned from the others" if len(word.precision) > 1 else ""
+    learned = ", learned from the others" if len({e.photo for e in word.examples}) > 1 else ""
     for number, example in enumerate(word.examples, start=1):
         precision = word.precision.get(example.photo)
         score = "" if precision is None else f": average precision {precision:.2f}{learned}"

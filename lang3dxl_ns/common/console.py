@@ -85,4 +85,4 @@ _KNOWN_WARNINGS = (
 
 def some(names: Sequence[str], shown: int = 10) -> str:
     """Join the first few names for a message."""
-    return printable(", ".join(names[:shown])) + (", …" if len(names) > shown else "")
+    return printable(", ".join(names[:shown])).replace("\n", "\\n") + (", …" if len(names) > shown else "")

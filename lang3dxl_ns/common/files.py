@@ -10,7 +10,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -95,6 +95,24 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         if isinstance(error, OSError):
             error.filename = str(path)  # otherwise it would be None or the temporary name
         raise
+
+
+@contextlib.contextmanager
+def locked(folder: Path, busy: str | None = None) -> Iterator[None]:
+    """Hold a folder's lock, which a killed process gives up too. If another process holds it, wait, or raise
+    UserError with the message `busy`. Where the system has no such locks, nothing is held."""
+    make_folder(folder)
+    with contextlib.ExitStack() as held:
+        try:
+            import fcntl  # absent on Windows
+
+            held.callback(os.close, descriptor := os.open(folder, os.O_RDONLY))
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (fcntl.LOCK_NB if busy else 0))
+        except BlockingIOError as error:
+            raise UserError(busy) from error
+        except (ImportError, OSError):  # network disks
+            pass
+        yield
 
 
 def replace_durably(partial: Path, path: Path) -> None:

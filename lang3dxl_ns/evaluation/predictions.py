@@ -49,7 +49,7 @@ def score_predictions(
     if not maps.is_dir():
         raise UserError(f"{maps} is not a folder: pass the one that holds <prompt>/<photo>.npy")
     scorer, folders = MapScorer(truth), dict(zip(truth.categories, slugs(truth.categories), strict=True))
-    keys = truth.labeled if photos is None else [_key(truth, photo) for photo in photos]
+    keys = truth.labeled if photos is None else list(dict.fromkeys(_key(truth, photo) for photo in photos))
     keeps = {key: None if masks is None else _read_mask(masks, key) for key in keys}
     figures: dict[str, dict[str, float]] = {}
     for key in tracked(keys, "scoring"):

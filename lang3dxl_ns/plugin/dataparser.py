@@ -281,14 +281,6 @@ def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
 # ── the choice for --data ─────────────────────────────────────────────────────────────────────────────────
 
 
-def check_data(data: Path | None) -> None:
-    """Raise UserError for a place without photos, before encoders are looked for. None is accepted."""
-    place = Path() if data is None else expanded(data)
-    known = is_video(place) or (place.is_file() and place.suffix == ".json")
-    if not (known or place.is_dir() or frames_folder(place).is_dir()):
-        raise UserError(f"{data} is not a folder: pass the one that holds your photos as --data, or a video")
-
-
 def parser_for(
     parser: PhotoCollectionDataParserConfig, cache_dir: Path | None, may_reconstruct: bool
 ) -> DataParserConfig:

@@ -15,7 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from lang3dxl_ns.common.console import tracked
+from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import host_peak, synchronize
 from lang3dxl_ns.evaluation.aggregate import average
@@ -55,6 +55,13 @@ class EvaluationSettings:
     evaluated_photos: Split = "held-out"
     """Photos that `ns-eval` evaluates. `held-out`: photos held out of training. `seen`: training photos with
     ground truth, as in HolyScenes' main tables."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore settings from config.yml. An earlier version had another choice of photos."""
+        if state.get("evaluated_photos") == "test":
+            say("The run's setting evaluated_photos: test no longer exists: held-out photos are evaluated")
+            state = state | {"evaluated_photos": "held-out"}
+        self.__dict__.update(state)
 
 
 class Evaluation:

@@ -97,6 +97,7 @@ class Lang3DXLPipeline(VanillaPipeline):
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint; for rendering, also prepare to answer the configured prompts."""
         super().load_pipeline(loaded_state, step)
+        self.model.refuses_lenses = self.test_mode == "inference"
         if self.test_mode != "val" and self.query:
             run = self.datamanager.config.run
             cache = None if run is None else run / "lang3dxl_visible.safetensors"

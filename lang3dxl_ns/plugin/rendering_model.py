@@ -6,16 +6,19 @@ import time
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size
 from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
@@ -41,6 +44,8 @@ from lang3dxl_ns.scene.camera import at_size, in_view
 
 DECODE_SIZES = 5
 """Number of sizes at which what Gaussians carry is drawn and decoded in training."""
+
+_say_once = cache(say)
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,8 @@ class RenderingModel(SplatfactoModel):
     answers: RenderedAnswers | Conversation | None = None
     codes_have_begun = False
     """Whether training has reached the codes; part of a checkpoint's run state."""
+    refuses_lenses = False
+    """Whether a camera that is not perspective is an error, as for `ns-render`; viewers are told of it."""
 
     @property
     def facts(self) -> SceneFacts:
@@ -146,6 +153,11 @@ class RenderingModel(SplatfactoModel):
         self, camera: Cameras, obb_box: OrientedBox | None = None
     ) -> dict[str, Tensor]:
         """Return the camera's outputs in the order of viewers' lists, with the outputs of `answers` first."""
+        if (kind := CameraType(int(camera.camera_type[0])).name.lower()) != "perspective":
+            why = f"Gaussians are rendered in perspective, not as {kind}: choose the camera type perspective"
+            if self.refuses_lenses:
+                raise UserError(why)
+            _say_once(why)
         self.set_crop(obb_box)
         start, answers = time.perf_counter(), self.answers
         if answers is None:

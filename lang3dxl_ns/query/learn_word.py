@@ -102,10 +102,11 @@ def learn(
     fit = partial(_fitted, name, sample, text, axes, engine.temperature)
     word = fit(photos)
     # Each photo is judged by a word that the others teach.
-    judges = [fit(photos[:i] + photos[i + 1 :]) for i in range(len(photos))] if len(photos) > 1 else [word]
-    judged = zip(photos, judges, strict=True)
+    complete = {photo.name: photo for photo in photos if photo.complete}
+    others = {name: [photo for photo in photos if photo.name != name] for name in complete}
+    judges = {name: fit(some) if some else word for name, some in others.items()}
     precision = {  # where a click is all that is known, the rest of the thing would count as an error
-        photo.name: photo.precision(judge.margins(sample, text)) for photo, judge in judged if photo.complete
+        name: photo.precision(judges[name].margins(sample, text)) for name, photo in complete.items()
     }
     doubt = fmean(1 - photo.separation(word.margins(sample, text)) for photo in photos)
     return replace(word, doubt=doubt, precision=precision, examples=tuple(examples))

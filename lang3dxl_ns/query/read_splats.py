@@ -160,11 +160,14 @@ def _ply(path: Path) -> Splats:
         if missing := [name for name in _NEEDED if name not in columns]:
             raise UserError(f"not a splat but a point cloud: its points have no {', '.join(missing[:3])}")
         expect(next(iter(tables)) == "vertex", "its points don't come first")
+        expect(all(row[name].itemsize for name in columns), "its points hold lists")
         _check_memory(count, 1 + sum(name.startswith("f_rest_") for name in columns) // 3)
         if form != "ascii":
             return _of_table(np.fromfile(file, row, count))
         numbers = np.fromstring(file.read().decode("latin-1"), sep=" ", dtype=np.float32)
-        rows = numbers[: count * len(columns)].reshape(count, len(columns))
+        expected = count * len(columns)
+        expect(len(numbers) == expected or len(tables) > 1, f"it has {len(numbers)} numbers, not {expected}")
+        rows = numbers[:expected].reshape(count, len(columns))
         return _of_table({name: rows[:, i] for i, name in enumerate(columns)})
 
 
@@ -206,7 +209,7 @@ def _of_table(table: Any) -> Splats:
     else:
         first = harmonics_of(columns("red", "green", "blue") / 255)
     # Coefficients are stored channel by channel.
-    others = columns(*rest).reshape(len(first), 3, -1).mT if rest else first[:, :0]
+    others = columns(*rest).reshape(len(first), 3, len(rest) // 3).mT if rest else first[:, :0]
     scales = columns("scale_0", "scale_1")
     # A flat Gaussian (2D Gaussian splatting) has only two scales.
     third = columns("scale_2") if "scale_2" in known else scales.amin(1, keepdim=True) - 5

@@ -269,6 +269,7 @@ class _File:
         content = self.tensor(name, *self.shapes[name]).numpy().astype(np.uint8).tobytes()
         with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
             expect(image.width * image.height <= MOST_PIXELS, "a mask is too large")
+            image.verify()
         return content
 
     def loaded(self, name: str, module: Module, state: Mapping[str, Any] | None = None) -> Module:
@@ -299,7 +300,7 @@ def _opened(path: Path) -> Iterator[_File]:
             yield _File(opened)
     except _NewerError as error:
         raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
-    except (UserError, SafetensorError, *DAMAGE) as error:
+    except (UserError, SafetensorError, SyntaxError, Image.DecompressionBombError, *DAMAGE) as error:
         remedy = "copy it again" if path.suffix == SUFFIX else "a splat becomes one with lang3dxl attach"
         raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): {remedy}") from error
 

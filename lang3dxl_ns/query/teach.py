@@ -59,7 +59,7 @@ class Example:
         if self.mask is not None and self.box is not None:
             raise UserError(f"{self.photo} has a mask and a box: give one of them")
         if self.mask is not None:
-            if np.ndim(self.mask) != 2 or not np.any(self.mask):
+            if np.ndim(self.mask) != 2 or not np.asarray(self.mask).any():
                 raise UserError(f"the mask of {self.photo} is empty or not [h, w]: mark the word in white")
             object.__setattr__(self, "mask", _kept(np.asarray(self.mask, bool)))
 

@@ -26,8 +26,8 @@ def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
     target = Path(os.path.realpath(path))  # unlike resolve(), accepts links in a circle
     if not follow_links and not target.is_relative_to(os.path.realpath(folder)):
         raise UserError(
-            f"{path} is a link that leads out of {folder}, to {target}: copy the file there, or, "
-            "if you trust the links, pass `lang3dxl-colmap --follow-links True` after all other options"
+            f"{path} is a link that leads out of {folder}, to {target}: copy the file there; "
+            "ns-train follows links with `lang3dxl-colmap --follow-links True` after all other options"
         )
     return path
 

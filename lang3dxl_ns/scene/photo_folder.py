@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif")
@@ -132,6 +133,14 @@ def is_video(path: Path) -> bool:
 def frames_folder(video: Path) -> Path:
     """Return the folder of a video's frames, which is beside the video and named after it."""
     return video.with_name(f"{video.stem}_photos")
+
+
+def check_data(data: Path | None) -> None:
+    """Raise UserError for a place without photos, before encoders are looked for. None is accepted."""
+    place = Path() if data is None else expanded(data)
+    known = is_video(place) or (place.is_file() and place.suffix == ".json")
+    if not (known or place.is_dir() or frames_folder(place).is_dir()):
+        raise UserError(f"{data} is not a folder: pass the one that holds your photos as --data, or a video")
 
 
 def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOST_FRAMES) -> Path:

@@ -23,7 +23,7 @@ import numpy as np
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError, is_plain
-from lang3dxl_ns.common.files import expanded, write_atomically
+from lang3dxl_ns.common.files import expanded, locked, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.common.reports import measure, part
@@ -110,7 +110,8 @@ def reconstruct_scene(
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
         model = work / "sparse"
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
-    report = reconstruct(photos, work, model, settings)
+    with locked(work, busy=f"another command reconstructs in {work}: wait for it, or end it"):
+        report = reconstruct(photos, work, model, settings)
     say(*report.lines())
     return data, model / "0"
 

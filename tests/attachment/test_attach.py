@@ -1,5 +1,6 @@
 """Words for a finished splat, with its photos and without; and back."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -147,10 +148,20 @@ def test_photos_of_something_else_are_refused_with_a_picture(place):
     assert not (place / "other.scene").exists()
 
 
-def test_mistakes_are_told_before_a_model_is_downloaded_and_an_empty_text_before_the_work(tmp_path):
+def test_mistakes_are_told_before_a_model_is_downloaded_and_an_empty_text_before_the_work(
+    tmp_path, monkeypatch
+):
     config = replace(SETTINGS, clip="somebody/nothing")
     with pytest.raises(UserError, match=r"nothing\.ply does not exist"):
         attach(tmp_path / "nothing.ply", None, tmp_path / "a.scene", config)
+    (tmp_path / "some.ply").touch()
+    with pytest.raises(UserError, match=r"typo is not a folder"):
+        attach(tmp_path / "some.ply", tmp_path / "typo", tmp_path / "a.scene", config)
+    with pytest.raises(OSError, match="exists"):
+        attach(tmp_path / "some.ply", tmp_path, tmp_path / "some.ply" / "a.scene", config)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(UserError, match="is read-only: choose another place"):
+        attach(tmp_path / "some.ply", tmp_path, tmp_path / "a.scene", config)
     with pytest.raises(UserError, match="prompt is empty"):
         Attach(splat=tmp_path / "nothing.ply", out=tmp_path / "a.scene", text=["dome", " "]).main()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from box_splat import box_splat
-from moved_splats import transformed
+from moved_splats import transformed, with_colors
 from scenes import CENTER, HALF_SIZES
 from scipy.spatial.transform import Rotation
 
@@ -118,6 +118,26 @@ def test_another_splat_gets_other_views(tmp_path, monkeypatch):
     rendered_views(SPLATS, 2, "z", tmp_path / "views")
     rendered_views(SPLATS.select(torch.arange(len(SPLATS)) % 2 == 0), 2, "z", tmp_path / "views")
     assert len(chosen) == 2
+
+
+def test_pictures_of_other_colors_or_of_an_interrupted_call_are_not_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(views, "choose_views", lambda *args: choose_first(args[1]))
+    bright = with_colors(SPLATS, torch.ones(len(SPLATS), 3))
+    place = tmp_path / "views/images/0000.png"
+    rendered_views(SPLATS, 2, "z", tmp_path / "views")
+    before = place.read_bytes()
+    monkeypatch.setattr(views, "_tracked", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        rendered_views(bright, 2, "z", tmp_path / "views")
+    assert place.read_bytes() != before
+    monkeypatch.undo()
+    monkeypatch.setattr(views, "choose_views", lambda *args: choose_first(args[1]))
+    rendered_views(SPLATS, 2, "z", tmp_path / "views")
+    assert place.read_bytes() == before
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
 
 
 def choose_first(extent):

@@ -305,6 +305,17 @@ def test_values_of_another_kind_are_named(tmp_path, setting, other):
         read_config(tmp_path / "config.yml")
 
 
+def test_a_choice_of_photos_that_no_longer_exists_is_told_and_replaced(copy, capsys):
+    text = (copy / "config.yml").read_text()
+    assert "evaluated_photos: held-out" in text
+    (copy / "config.yml").write_text(text.replace("evaluated_photos: held-out", "evaluated_photos: test"))
+    assert read_config(copy / "config.yml").pipeline.evaluated_photos == "held-out"
+    assert "evaluated_photos: test no longer exists" in capsys.readouterr().out
+    (copy / "config.yml").write_text(text.replace("evaluated_photos: held-out", "evaluated_photos: [1]"))
+    with pytest.raises(UserError, match="evaluated_photos"):
+        read_config(copy / "config.yml")
+
+
 def test_a_run_made_on_windows_opens(tmp_path):
     text = yaml.dump(lang3dxl.config)
     (tmp_path / "config.yml").write_text(text.replace("pathlib.PosixPath", "pathlib.WindowsPath"))

@@ -1,6 +1,8 @@
 """`lang3dxl teach`, `lang3dxl words` and `lang3dxl query --coco`, on a scene file."""
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -82,6 +84,29 @@ def test_a_word_that_is_taught_while_another_is_forgotten_stays(place, monkeypat
     monkeypatch.setattr("lang3dxl_ns.commands.teach.forgotten", meanwhile)
     main(["words", str(place), "--forget", "gizmo"])
     assert list(words(place)) == ["widget"]
+
+
+def test_a_word_that_is_taught_twice_at_once_has_both_examples(place, monkeypatch):
+    monkeypatch.setattr(
+        "lang3dxl_ns.query.scene_file.keep_words", lambda *given: time.sleep(0.5) or keep_words(*given)
+    )
+    two = [Teach(scene=place, word="gizmo", photo="0003.jpg", at=[at]) for at in ("69,69", "70,70")]
+    with ThreadPoolExecutor() as both:
+        list(both.map(Teach.main, two))
+    assert len(words(place)["gizmo"].examples) == 2
+
+
+def test_an_example_that_is_taught_while_its_word_is_forgotten_stays(place, monkeypatch):
+    teach(place, "--box", DOME)
+
+    def meanwhile(scene, name):
+        teach(place, "--at", "69,69")
+        return forgotten(scene, name)
+
+    monkeypatch.setattr("lang3dxl_ns.commands.teach.forgotten", meanwhile)
+    with pytest.raises(SystemExit, match="'gizmo' was taught at this moment: repeat"):
+        main(["words", str(place), "--forget", "gizmo/1"])
+    assert len(words(place)["gizmo"].examples) == 2
 
 
 def test_evaluate_takes_a_scene_or_the_folder_that_holds_it(place):

@@ -8,7 +8,7 @@ import rich.progress
 import torch
 
 from lang3dxl_ns.common import console
-from lang3dxl_ns.common.console import progress, silence_libraries, tracked
+from lang3dxl_ns.common.console import progress, silence_libraries, some, tracked
 from lang3dxl_ns.evaluation.photo_metrics import Lpips
 
 
@@ -63,3 +63,7 @@ def test_the_time_left_is_that_of_equal_lots(monkeypatch):
             if done > 1:
                 left = bars[0].tasks[0].time_remaining
                 assert left == pytest.approx((lots - done) * seconds, rel=0.1, abs=1)
+
+
+def test_a_name_with_a_line_break_stays_in_its_line():
+    assert some(["new\nline.jpg", "b.jpg"]) == "new\\nline.jpg, b.jpg"

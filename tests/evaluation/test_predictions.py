@@ -56,6 +56,12 @@ def test_every_photo_has_its_figures_and_the_protocol_says_what_was_done(scene, 
     assert protocol["layout"] == "plain" and "none" in protocol["foreground"]
 
 
+def test_a_photo_that_is_named_twice_counts_once(scene):
+    truth, maps = scene
+    figures, protocol = score_predictions(GroundTruth(truth), maps, ["0001", "0001.jpg"])
+    assert list(figures) == ["0001"] and protocol["evaluated_photos"] == 1
+
+
 def test_pictures_score_as_floats_do(scene, tmp_path):
     truth, maps = scene
     expected = score_predictions(GroundTruth(truth), maps)[0]["0001"]

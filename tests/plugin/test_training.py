@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import make_trainer
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
@@ -148,6 +149,20 @@ def test_config_is_complete_and_readable_from_any_folder(finished, tmp_path, mon
     assert step == 5
     assert config.pipeline.model.semantic_field.preset == "short"
     assert pipeline.model.num_points > 0
+
+
+def test_a_panorama_is_refused_in_files_and_told_of_once_in_a_viewer(finished, capsys):
+    for mode in ("inference", "test"):
+        _, pipeline, _, _ = eval_setup(finished.base_dir / "config.yml", test_mode=mode)
+        camera = pipeline.datamanager.train_dataset.cameras[:1]
+        camera.camera_type[:] = CameraType.EQUIRECTANGULAR.value
+        capsys.readouterr()
+        if mode == "inference":  # ns-render
+            with pytest.raises(UserError, match="not as equirectangular: choose"):
+                pipeline.model.get_outputs_for_camera(camera)
+        else:
+            assert [pipeline.model.get_outputs_for_camera(camera)["rgb"].ndim for _ in "ab"] == [3, 3]
+            assert capsys.readouterr().out.count("not as equirectangular") == 1
 
 
 def first_batch(trainer):

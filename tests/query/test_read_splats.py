@@ -278,6 +278,37 @@ def test_a_ply_cut_anywhere_is_refused(tmp_path):
             read_splats(tmp_path / "b.ply")
 
 
+@pytest.mark.parametrize(
+    ("form", "old", "new", "said"),
+    [
+        (
+            "ascii",
+            b" 0.0 ",
+            b" 0.0 0.5 ",
+            r"it has \d+ numbers, not \d+",
+        ),  # each row after it would be shifted
+        ("ascii", b" 0.0 ", b" 0,5 ", r"it has \d+ numbers, not \d+"),
+        ("ascii", b"vertex 5", b"vertex 4", r"it has \d+ numbers, not \d+"),
+        (
+            "binary_little_endian",
+            b"end_header",
+            b"property list uchar int id\nend_header",
+            "points hold lists",
+        ),
+        ("binary_little_endian", b"vertex 5", b"vertex 0", "holds no Gaussian: export it again"),
+    ],
+)
+def test_rows_that_are_not_as_announced_are_refused_rather_than_read_shifted(form, old, new, said, tmp_path):
+    write_splats(tmp_path / "a.ply", some_splats(5))
+    _, rows = table(tmp_path / "a.ply")
+    write_table(tmp_path / "b.ply", rows, form, "<f4", "float")
+    content = (tmp_path / "b.ply").read_bytes()
+    assert len(read_splats(tmp_path / "b.ply")) == 5 and old in content
+    (tmp_path / "b.ply").write_bytes(content.replace(old, new, 1))
+    with pytest.raises(UserError, match=said):
+        read_splats(tmp_path / "b.ply")
+
+
 def test_a_missing_file_and_a_folder_without_a_splat_are_named(tmp_path):
     for place in (tmp_path / "nothing.ply", tmp_path):
         with pytest.raises(UserError, match=place.name):

@@ -1,5 +1,6 @@
 """Scene files: what is written is read, and nothing else is."""
 
+import io
 import json
 import struct
 from contextlib import suppress
@@ -250,6 +251,21 @@ def test_a_scene_without_numbers_is_refused_rather_than_answered_with_0(written,
     tensors[name][rows] = np.nan
     path.write_bytes(save(tensors, metadata))
     with pytest.raises(UserError, match=rf"wall\.scene is not a readable scene \({said}\)"):
+        read_scene(path, "cpu")
+
+
+@pytest.mark.parametrize("size", [30_000, 24])
+def test_a_mask_that_is_damaged_or_would_fill_the_memory_is_refused(written, size):
+    _, path = written
+    with safe_open(path, "np") as file:
+        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    picture = io.BytesIO()
+    Image.new("1", (size, size)).save(picture, "PNG")
+    tensors["mask.0"] = np.frombuffer(picture.getvalue(), np.uint8).copy()
+    if size < 100:
+        tensors["mask.0"][-20] ^= 1
+    path.write_bytes(save(tensors, metadata))
+    with pytest.raises(UserError, match=r"wall\.scene is not a readable scene \((Image size|broken PNG)"):
         read_scene(path, "cpu")
 
 

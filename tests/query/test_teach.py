@@ -80,6 +80,17 @@ def test_a_word_is_found_from_behind(scene):
     assert np.allclose(behind.relevancy("gizmo"), taught.relevancy("gizmo"), atol=1e-5)
 
 
+def test_a_photo_is_not_judged_by_its_own_marks_under_whatever_name(scene):
+    first, edge = outline(scene, ALL, DOME_BOX), outline(scene, ALL, (1.0, 2.0, 1.0, 1.5))
+    twice = scene.teach("gizmo", [Example("0003", torch.from_numpy(first)), Example(ALL, edge)])
+    taught = twice.words["gizmo"]
+    assert [example.photo for example in taught.examples] == [ALL, ALL] and list(taught.precision) == [ALL]
+    other = "left/0001.jpg"
+    examples = [Example(ALL, edge), Example(ALL, first), Example(other, outline(scene, other, FIRST_WINDOW))]
+    # By the other mark in it it has 0.88.
+    assert scene.teach("gizmo", examples).words["gizmo"].precision[ALL] < 0.8
+
+
 def test_the_order_of_examples_does_not_matter(scene):
     examples = [
         Example(ALL, outline(scene, ALL, DOME_BOX)),

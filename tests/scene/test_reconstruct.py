@@ -11,6 +11,7 @@ from PIL import Image
 from scenes import speckled, write_scene
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.scene import reconstruct as module
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.photo_folder import find_photos
@@ -87,6 +88,13 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
 def test_all_photos_share_the_camera(reconstructed):
     _, model, _ = reconstructed
     assert pycolmap.Reconstruction(model).num_cameras() == 1
+
+
+def test_a_second_reconstruction_in_one_folder_ends_at_once(photos):
+    work = photos / "lang3dxl_cache" / "reconstruction"
+    with locked(work), pytest.raises(UserError, match=r"another command reconstructs in .*reconstruction"):
+        reconstruct_scene(photos)
+    assert not list(work.iterdir())
 
 
 def test_names_with_spaces_formats_of_the_web_and_odd_bytes(photos):
