@@ -77,9 +77,12 @@ def camera_in(similarity: Similarity | Float[Tensor, "4 4"], tracked: TrackedPho
 
 
 def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
-    """Find the frame in which renderings at the photos' cameras look like the photos: try those that programs
-    use (`known_frames`, by the splat's file), then those from the scene's shape, and refine the best by
-    descent on the correlation. The result may be wrong, which `Fit.fits` shows."""
+    """Find the frame in which renderings at the photos' cameras look like the photos.
+
+    The frames that programs use are tried first (`known_frames`, by the splat's file), then those from the
+    scene's shape. The best of them are refined by descent on the correlation. The result may be wrong, which
+    `Fit.fits` shows.
+    """
     small, large = _compared(collection, _FEW, _SMALL), _compared(collection, _MANY, _LARGE)
     best = _best(splats, small, known_frames(collection.reconstruction, splat))
     if best[0].score < FITS:

@@ -182,9 +182,12 @@ def _tracked(name: str, view: Rendering, chosen: np.random.Generator) -> Tracked
 
 
 def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
-    """Choose views that together show the most Gaussians at the size at which they were made: of the
-    candidates that are not too close to matter, and show much of it and sharply, the one that adds most,
-    again and again. Raises UserError if no candidate is left."""
+    """Choose views that together show the most Gaussians at the size at which they were made.
+
+    Candidates are placed around the scene and in it, at several heights and distances. Those that are too
+    close to matter, show little, or show it blurred are dropped. From the rest, the one that adds most is
+    chosen, again and again. Raises UserError if no candidate is left.
+    """
     sample = torch.linspace(0, len(splats) - 1, min(_SAMPLE, len(splats)), dtype=torch.float64).long()
     free = _FreeSpace(solids(splats), extent)
     views = list[tuple[Camera, Float[Tensor, " sample"], float]]()

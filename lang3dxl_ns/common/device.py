@@ -67,7 +67,7 @@ def _reason() -> str:
 
 @functools.cache
 def multiplies_bfloat16() -> bool:
-    """Whether this machine's CPU does. Elsewhere bfloat16 is slower than float32."""
+    """Return whether this machine's CPU multiplies bfloat16. Elsewhere it is slower than float32."""
     try:
         from llvmlite.binding import get_host_cpu_features
     except ImportError:

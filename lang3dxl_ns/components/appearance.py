@@ -113,10 +113,16 @@ class AppearanceField(nn.Module):
         visible: Int[Tensor, " m"],
         seed: int | None = None,
     ) -> tuple[Float[Tensor, "n 3"], Gaussians]:
-        """Compute colors, and with `opacity_shift` also opacities, of the Gaussians (world frame) in the rows
-        `visible` under a photo's vector; the others stay as they are. Colors are at least 0, before and after
-        the shift. Positions get no gradient. `seed` is that of the opacity shift's noise in training; None
-        for no noise."""
+        """Compute colors, and with `opacity_shift` also opacities, under a photo's vector. Positions get no
+        gradient.
+
+        Args:
+            gaussians: Gaussians in the world frame, which are returned unchanged without `opacity_shift`.
+            colors: colors before the shift, at least 0, as after it.
+            vector: the photo's vector.
+            visible: rows of the Gaussians to change; the others stay as they are.
+            seed: seed of the opacity shift's noise in training; None for no noise.
+        """
         base = colors[visible]
         features = torch.cat((self.grid(self._unit_cube(gaussians.means[visible])), base), 1)
         hidden = F.relu(self.from_gaussian(features) + self.from_photo(vector))

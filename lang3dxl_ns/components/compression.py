@@ -180,8 +180,9 @@ def assign(
 
 @torch.no_grad()
 def centered_cosine(gathered: Gathered, field: SemanticField, codes: Float[Tensor, "n code"]) -> float:
-    """Compute the mean cosine of decoded and given features, both less the mean feature, 1 if nothing is
-    lost. Without centering, even the mean feature has a cosine above 0.9 with all."""
+    """Compute the mean cosine of decoded and given features, both less the mean feature.
+
+    It is 1 if nothing is lost. Without centering, even the mean feature has a cosine above 0.9 with all."""
     features = gathered.features
     if not len(features):
         return 1.0

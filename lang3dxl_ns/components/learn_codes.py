@@ -57,11 +57,15 @@ def learn_codes(
     clip_targets: ClipMaps,
     dense_targets: DenseMaps | None = None,
 ) -> Float[Tensor, "n code"]:
-    """Average the targets of `count` photos over the Gaussians that they show, and let a decoder with
-    `learn_gaussians`, which is trained in place, learn codes; NaN for Gaussians that no photo shows.
+    """Average the photos' targets over the Gaussians that they show, and let the decoder learn codes, with
+    progress bars and a line about what it learned.
+
+    Codes of Gaussians that no photo shows are NaN.
 
     Args:
+        decoder: a decoder with `learn_gaussians`, which is trained in place.
         views: the photos, each once.
+        count: number of the photos.
         means: centers of the Gaussians, which determine number, type and device of the codes.
         clip_targets: the CLIP targets of the views, from which a basis is computed.
         dense_targets: the dense features of the views; None if features are not to be sharpened.

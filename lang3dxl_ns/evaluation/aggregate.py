@@ -51,10 +51,13 @@ Figures = Mapping[str, float]
 
 
 def average(photos: Sequence[Figures], with_deviation: bool = False) -> dict[str, Any]:
-    """Average every figure over the photos that have it, and add totals: `{prefix}map`, the unweighted mean
-    of average precision over the categories; `{prefix}miou` etc. (`TOTALS`), means over all pairs of a photo
-    and a category; and `ap_{category}_photos`, the number of photos with that category. `with_deviation` adds
-    `…_std` for every mean, the sample standard deviation, which is 0 for a single photo."""
+    """Average every figure over the photos that have it, and add totals.
+
+    `{prefix}map` is the unweighted mean of average precision over the categories. `{prefix}miou`,
+    `{prefix}localization_accuracy` etc. are means over all pairs of a photo and a category.
+    `ap_{category}_photos` is the number of photos with that category. `with_deviation` adds `…_std` for every
+    mean, the sample standard deviation, which is 0 for a single photo.
+    """
     values = _by_name(photos)
     means: dict[str, Any] = {name: float(np.mean(found)) for name, found in values.items()}
     totals = _mean_average_precisions(means)

@@ -33,9 +33,14 @@ _READERS: dict[str, Callable[[Path], Mapping[str, Mapping[str, MaskFile | Outlin
 
 
 class GroundTruth:
-    """Labels of a scene's photos, by category, in the folder of one scene. The layout is "holyscenes"
-    (<category>/NNNN-gt.jpg), "lerf_ovs" (<photo>.json, also PT-OVS) or "plain" (<prompt>/<photo>.png); "auto"
-    detects it. Raises UserError for a folder that is missing or holds something else."""
+    """Labels of a scene's photos, by category. Raises UserError for a folder that is missing or holds
+    something else.
+
+    Args:
+        folder: folder of one scene.
+        layout: "holyscenes" (<category>/NNNN-gt.jpg), "lerf_ovs" (<photo>.json, also PT-OVS), or "plain"
+            (<prompt>/<photo>.png); "auto" detects it.
+    """
 
     def __init__(self, folder: Path, layout: Layout | Literal["auto"] = "auto") -> None:
         self.folder = expanded(folder)

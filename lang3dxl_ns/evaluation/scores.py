@@ -206,10 +206,13 @@ class MapScorer:
         temperature: float = 1.0,
         of_published_prompts: Maps | None = None,
     ) -> dict[str, Maps]:
-        """Return the maps to score, by the prefix of their figures: for masks "" (blurred), "raw_"
-        (unprocessed) and "authors_" (`of_published_prompts`, or else `maps`, processed by `as_published`);
-        for LERF-OVS, whose measures include smoothing, "" alone, unprocessed. Maps are set to 0 outside
-        `keep`, before and after the blur."""
+        """Return the maps to score, by the prefix of their figures.
+
+        For masks, "" is blurred, "raw_" unprocessed, and "authors_" processed by `as_published`. For
+        LERF-OVS, whose measures include smoothing, there is only "", unprocessed. Maps are set to 0 outside
+        `keep`, before and after the blur. "authors_" is made from `of_published_prompts`, or from `maps` if
+        that is None.
+        """
         raw = inside(maps, keep)
         if self.smooths:
             return {"": raw}

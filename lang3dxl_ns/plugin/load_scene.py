@@ -29,10 +29,19 @@ def load_run(
     config: QueryConfig | None = None,
     clip: str | None = None,
 ) -> Scene:
-    """Load the scene of a run (as for `find_config`) from its latest checkpoint, on a device (default: a GPU
-    if there is one), with defaults of queries, and the name or folder of its CLIP, if that is not where the
-    run says. No code is executed, while nerfstudio's own commands trust config.yml. Raises UserError if the
-    folder has no checkpoint, or the run is damaged or of another method."""
+    """Load the scene of a run from its latest checkpoint.
+
+    Args:
+        run: the run's folder, a folder above it (the newest run there is taken), or its config.yml; None: the
+            newest run under outputs/. The file is loaded without executing code (nerfstudio's own commands,
+            such as ns-eval, do trust it).
+        device: default: a GPU if there is one.
+        config: defaults of queries.
+        clip: name or folder of the run's CLIP, if it is not where the run says.
+
+    Raises:
+        UserError: the folder has no checkpoint, or the run is damaged or of another method.
+    """
     place, worker = find_config(run), torch.device(device or best_device())
     settings, checkpoints = read_model_config(place)
     folder, file = place.parent, SceneFile.read(place.parent / SCENE_FILE)
