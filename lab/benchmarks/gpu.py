@@ -31,7 +31,8 @@ from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldCo
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, gather
-from lang3dxl_ns.scene.camera import Camera, at_size
+from lang3dxl_ns.rendering.rasterize import at_fewer_pixels
+from lang3dxl_ns.scene.camera import Camera
 
 CLIP = 512
 """Channels of the features whose cost is measured."""
@@ -169,9 +170,8 @@ def step(count: int, size: tuple[int, int], paper: bool = False, looks: bool = F
             colors, gaussians = look(gaussians, colors, look.vector("photo"), everything, 0)
         state["photo"] = rasterize(gaussians, camera, colors).image
         if paper:
-            at_fewer = at_size(camera, *small)
-            blur = 0.3 * small[0] * small[1] / (size[0] * size[1])
-            state["codes"] = rasterize(gaussians, at_fewer, parameters["codes"], eps2d=blur).image
+            view, eps2d = at_fewer_pixels(camera, *small)
+            state["codes"] = rasterize(gaussians, view, parameters["codes"], eps2d=eps2d).image
 
     def loss() -> None:
         state["loss"] = rgb_loss(state["photo"], target)

@@ -43,7 +43,8 @@ from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.rendering import Backend, rasterize
-from lang3dxl_ns.scene.camera import Camera, at_size
+from lang3dxl_ns.rendering.rasterize import EPS2D, at_fewer_pixels
+from lang3dxl_ns.scene.camera import Camera
 
 OURS, TORCH, DENSE, GSPLAT = "lang3dxl", "torch kernels", "dense tiles", "gsplat"
 """Methods that can be compared."""
@@ -108,8 +109,7 @@ def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
     )
     color_gradient, feature_gradient = problem.image_gradient.split([COLORS, CHANNELS - COLORS], dim=2)
     leaves = (*problem.leaves[:-1], colors, features)
-    small = at_size(camera, -(-camera.height // 5), -(-camera.width // 5))
-    blur = 0.3 * small.width * small.height / (camera.width * camera.height)
+    small, eps2d = at_fewer_pixels(camera, -(-camera.height // 5), -(-camera.width // 5))
 
     def one_pass() -> object:
         black = torch.zeros(CHANNELS - COLORS).to(background)
@@ -118,7 +118,7 @@ def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
         upstream = problem.image_gradient, problem.alpha_gradient
         return torch.autograd.grad((result.image, result.alpha), leaves, upstream)
 
-    def passes(second: Camera | None, eps2d: float = 0.3) -> object:
+    def passes(second: Camera | None, eps2d: float = EPS2D) -> object:
         first = rasterize(gaussians, camera, colors, background)
         outputs, upstream = [first.image, first.alpha], [color_gradient, problem.alpha_gradient]
         if second is not None:
@@ -130,7 +130,7 @@ def pass_costs(problem: Problem) -> dict[str, Callable[[], object]]:
         "colors alone": lambda: passes(None),
         "features in one pass": one_pass,
         "features in a second pass": lambda: passes(camera),
-        "features in a small second pass": lambda: passes(small, blur),
+        "features in a small second pass": lambda: passes(small, eps2d),
     }
 
 

@@ -99,8 +99,9 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, busy: str | None = None) -> Iterator[None]:
-    """Hold a folder's lock, which a killed process gives up too. If another process holds it, wait, or raise
-    UserError with the message `busy`. Where the system has no such locks, nothing is held."""
+    """Hold the lock of a folder itself: unlike a lock file, it leaves nothing beside a user's files, and a
+    killed process gives it up too. If another process holds it, wait, or raise UserError with the message
+    `busy`. Where the system has no such locks, nothing is held."""
     make_folder(folder)
     with contextlib.ExitStack() as held:
         try:

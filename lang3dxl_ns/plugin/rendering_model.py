@@ -37,10 +37,10 @@ from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.rendering import Gaussians, Raster, Rendering, Splats, composite, rasterize
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
-from lang3dxl_ns.rendering.rasterize import Backend
+from lang3dxl_ns.rendering.rasterize import Backend, at_fewer_pixels
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 from lang3dxl_ns.rendering.splats import harmonics_of
-from lang3dxl_ns.scene.camera import at_size, in_view
+from lang3dxl_ns.scene.camera import in_view
 
 DECODE_SIZES = 5
 """Number of sizes at which what Gaussians carry is drawn and decoded in training."""
@@ -290,9 +290,8 @@ class RenderingModel(SplatfactoModel):
         else:
             gaussians, view = gaussians.detach(), view.detach()
         # A photo has many times the pixels that are decoded. The same ellipses are drawn at these alone.
-        small = at_size(view, *fitted_size((view.height, view.width), self.decoded_side))
-        blur = 0.3 * small.width * small.height / (view.width * view.height)
-        codes = rasterize(gaussians.seen_from(view), small, carried, eps2d=blur, **settings).image
+        small, eps2d = at_fewer_pixels(view, *fitted_size((view.height, view.width), self.decoded_side))
+        codes = rasterize(gaussians.seen_from(view), small, carried, eps2d=eps2d, **settings).image
         return photo, background, codes
 
     @property

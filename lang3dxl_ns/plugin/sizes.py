@@ -16,7 +16,7 @@ PER_LOOK = 3_000.0
 PER_PIXEL = 480.0
 """Bytes of a step per pixel of the photo."""
 PER_CODE = 12.0
-"""Bytes of a step per number of a rendered code, for every Gaussian and every pixel."""
+"""Bytes of a step per Gaussian and number of its code. Codes are drawn at few pixels."""
 WORDS = 1.5e9
 """Most bytes, in addition to the model, that learning words takes after the last step."""
 CONTEXT = 0.8e9

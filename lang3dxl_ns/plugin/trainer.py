@@ -44,9 +44,9 @@ from lang3dxl_ns.query.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint,
 from lang3dxl_ns.query.run_file import SCENE_FILE
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
 
-RENDERINGS_PER_STEP = {False: 3.0, True: 6.0}
-"""Duration of an iteration in renderings of its photo, by whether semantics are trained with the scene: 2.1
-to 2.7 on a landmark and `castle`, and 3.5 to 8.4 for `feature3dgs` and `paper`, measured on a busy CPU."""
+RENDERINGS_PER_STEP = {False: 3.0, True: 4.0}
+"""Duration of an iteration in renderings of its photo, by whether semantics are trained with the scene: 1.5
+to 2.7 on landmarks and `castle`, and 3.0 for `paper` on a landmark, measured on a busy CPU."""
 RENDERINGS_PER_PHOTO = 30.0
 """Duration of reading a photo's features onto the Gaussians, in renderings of it: measured 30 on one core for
 160 channels, 18,000 Gaussians, 240×180 pixels."""

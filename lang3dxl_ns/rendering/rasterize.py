@@ -16,9 +16,11 @@ from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Ellipses, Gaussians, Raster
 from lang3dxl_ns.rendering.projection import project
 from lang3dxl_ns.rendering.torch_rasterizer import Compositing
-from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.scene.camera import Camera, at_size
 
 Backend = Literal["auto", "torch", "numba", "gsplat"]
+EPS2D = 0.3
+"""Variance that blurs Gaussians on screen, pixels² (gsplat's default)."""
 _STRATEGY_KEYS = ("width", "height", "n_cameras", "radii", "gaussian_ids", "means2d")
 
 
@@ -32,7 +34,7 @@ def rasterize(
     render_depth: bool = False,
     antialiased: bool = False,
     near: float = 0.01,
-    eps2d: float = 0.3,
+    eps2d: float = EPS2D,
     backend: Backend = "auto",
 ) -> Raster:
     """Render Gaussians by alpha compositing (3D Gaussian Splatting, Kerbl et al. 2023; gsplat's rules).
@@ -80,6 +82,11 @@ def rasterize(
     depth = maps[..., -1:] / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None
     image = maps[..., : channels.shape[1]] + (1 - alpha) * background
     return Raster(image, alpha, depth, info)
+
+
+def at_fewer_pixels(camera: Camera, height: int, width: int) -> tuple[Camera, float]:
+    """Return the view at a smaller size, and the `eps2d` with which the same ellipses are drawn there."""
+    return at_size(camera, height, width), EPS2D * height * width / (camera.height * camera.width)
 
 
 def _best_backend(means: Tensor) -> Backend:

@@ -78,7 +78,7 @@ class _Sum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, basis: Tensor, coefficients: Tensor) -> Float[Tensor, "n 3"]:  # type: ignore[override]
-        ctx.save_for_backward(basis, coefficients)
+        ctx.save_for_backward(basis, coefficients if ctx.needs_input_grad[0] else None)
         return torch.einsum("nk,nkc->nc", basis, coefficients)
 
     @staticmethod

@@ -10,7 +10,7 @@ from splat_clouds import Cloud, gradients, make_cloud, maps, relative_error
 
 from lab.numerics.rasterizer_reference import rasterize_reference
 from lang3dxl_ns.rendering import rasterize
-from lang3dxl_ns.scene.camera import at_size
+from lang3dxl_ns.rendering.rasterize import at_fewer_pixels
 
 pytestmark = pytest.mark.usefixtures("backend")
 MODES = [
@@ -123,9 +123,9 @@ def test_at_fewer_pixels_the_same_ellipses_are_drawn():
     cloud = make_cloud(300, 45, 35)
     leaves = cloud.leaves()
     large = cloud.render(rasterize, leaves, antialiased=True)
-    small = replace(cloud, width=9, height=7)
-    small.intrinsics = at_size(cloud.camera(leaves), 7, 9).intrinsics
-    found = small.render(rasterize, leaves, eps2d=0.3 / 25, antialiased=True)
+    view, eps2d = at_fewer_pixels(cloud.camera(leaves), 7, 9)
+    small = replace(cloud, width=9, height=7, intrinsics=view.intrinsics)
+    found = small.render(rasterize, leaves, eps2d=eps2d, antialiased=True)
     for name, value in maps(found).items():
         torch.testing.assert_close(value, getattr(large, name)[2::5, 2::5], atol=1e-10, rtol=0)
 
