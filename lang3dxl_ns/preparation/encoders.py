@@ -192,7 +192,9 @@ class DenseEncoder:
 
     def __init__(self, model: Any, tokens: int, identity: str) -> None:
         self.dim: int = model.config.hidden_size
-        self.tokens, self.identity, self._model = tokens, identity, model
+        self.tokens = tokens
+        self.identity = identity
+        self._model = model
         self._side = tokens * model.config.patch_size
         self._device = next(model.parameters()).device
         own = model.config.model_type in _NORMALIZE_THEMSELVES

@@ -25,7 +25,8 @@ class PhotoCache:
     """
 
     def __init__(self, read: Callable[[int], dict[str, Any]], max_bytes: float, readers: int = 4):
-        self._read, self._free = read, max_bytes
+        self._read = read
+        self._free = max_bytes
         self._kept: dict[int, dict[str, Any]] = {}
         self._ahead: dict[int, Future[dict[str, Any]]] = {}
         self._pool = ThreadPoolExecutor(readers, thread_name_prefix="photo-reader")

@@ -136,7 +136,9 @@ def _windows(
 ) -> tuple[Float[Tensor, "3 H W t t"], Int[Tensor, " ny"], Int[Tensor, " nx"]]:
     """Return a crop at every pixel (views of the photo padded with black, which take no memory each), and the
     rows and columns at which the required crops begin."""
-    half, padding, starts = _half(side), list[int](), []
+    half = _half(side)
+    padding: list[int] = []
+    starts = []
     for length in (photo.shape[1], photo.shape[0]):  # F.pad counts from the last axis, the width
         centers = crop_centers(length, side, steps).to(photo.device)
         before = max(0, half - int(centers[0]))
