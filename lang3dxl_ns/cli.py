@@ -40,7 +40,7 @@ BENCHMARKS = {
 }
 COMMANDS = {
     "demo": ("lab.landmark.demo:Demo", "The full workflow in minutes, on a generated landmark."),
-    "reconstruct": ("commands.reconstruct:Reconstruct", "COLMAP model from photos, or a video."),
+    "reconstruct": ("commands.prepare:Reconstruct", "COLMAP model from photos, or a video."),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
     "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),

@@ -26,7 +26,7 @@ from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
+from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.photo_folder import check_data
 
@@ -34,6 +34,8 @@ _LIGHT = 0.15
 """Deviation of the photos' brightness (natural logarithm) above which a message reports it."""
 _SMALLEST = 1e-3
 """Size of a splat in its units, below which it lies before the near plane of every camera that shows it."""
+_NEAREST = 1.2e-4
+"""Size of a splat, relative to its distance from the origin, that 32-bit numbers divide into 1,000 steps."""
 _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
 
 
@@ -63,27 +65,29 @@ def attach(
         raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
     if data is None and place is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
-    path = find_splats(splat)  # before any model is downloaded, as the next line
+    path = find_splats(splat)
     check_data(None if data is None else Path(data))
     if place is not None:
         make_folder(place.parent)
         if not os.access(place.parent, os.W_OK):
             raise UserError(f"{place.parent} is read-only: choose another place, or change its permissions")
+    stages = Stages(_SHARES | {"segment": 0.3} if config.segment else _SHARES)
+    worker = torch.device(device or best_device())
+    with stages.stage("splat"):  # a damaged one is refused before any model is downloaded
+        splats = read_splats(path).to(worker)
+        middle = splats.means.median(0).values
+        spread, far = float((splats.means - middle).norm(dim=1).median()), float(middle.norm())
+        if spread < max(_SMALLEST, _NEAREST * far):
+            raise UserError(
+                f"half of the Gaussians of {path} lie within {spread:.2g} units of one place, {far:,.0f} "
+                "units from the origin, too close to be seen or too far for 32-bit numbers: export the splat "
+                "again, larger, or without the offset of map coordinates"
+            )
+        say(f"{path}: {splats}")
     option_prefix.set("--")
     preparation = settled(config)
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
-    stages = Stages(_SHARES if found is None else _SHARES | {"segment": 0.3})
-    worker = torch.device(device or best_device())
-    with stages.stage("splat"):
-        splats = read_splats(path).to(worker)
-        spread = float((splats.means - splats.means.median(0).values).norm(dim=1).median())
-        if spread < _SMALLEST:
-            raise UserError(
-                f"half of the Gaussians of {path} lie within {spread:.1g} units of one place, too close to "
-                "be seen: export the splat again, larger"
-            )
-        say(f"{path}: {splats}")
     with stages.stage("frame"):
         if data is None:
             assert place is not None
@@ -112,10 +116,9 @@ def attach(
             for word in config.segment:
                 scene = segmented(scene, word, segmenter, collection.photos, cameras)
     if place is not None:
-        scene = with_words_of(scene, place)
         made = f"attached to {path.name} from {len(collection.photos)} {what}"
         origin = Provenance(made_by=f"lang3dxl-ns {version('lang3dxl-ns')}", made_how=made)
-        written = write_scene(place, scene, origin)
+        scene, written = replace_scene(place, scene, origin)
         say(f"Wrote {written / 1e6:.1f} MB to {place}")
     return scene
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,7 +50,7 @@ class Attach(AttachConfig):
         scene = attach(self.splat, self.data, self.out, self)
         if prompts:
             _show(scene, prompts, self.out)
-        say(f'Ask it: lang3dxl query {self.out} --text "windows" --out found')
+        say(f'Ask it: lang3dxl query {shlex.quote(str(self.out))} --text "windows" --out found')
 
 
 def _show(scene: Scene, texts: Sequence[str | Prompt], out: Path) -> None:

@@ -1,18 +1,41 @@
-"""`lang3dxl prepare` and `lang3dxl needs`: a scene's targets, and the components that it needs."""
+"""`lang3dxl reconstruct`, `prepare` and `needs`: a scene before its training."""
 
 from __future__ import annotations
 
 import contextlib
+import shlex
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 if TYPE_CHECKING:
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+
+
+@dataclass(kw_only=True)
+class Reconstruct(ReconstructionSettings):
+    """Reconstruct photos: cameras, poses and points, as a COLMAP model.
+
+    `ns-train lang3dxl` does this itself for photos without a model; this command does it in advance. It can
+    be interrupted and repeated at any time, and never replaces an existing model.
+    """
+
+    data: Path
+    """Folder of photos (in it, in images/, or in sub-folders), or a video."""
+    cache_dir: Path | None = None
+    """Folder for features and matches (default: lang3dxl_cache inside the data folder)."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.scene.reconstruct import reconstruct_scene
+
+        data, model = reconstruct_scene(self.data, self.cache_dir, self)
+        say(f"The model is in {model}. Train with: ns-train lang3dxl --data {shlex.quote(str(data))}")
 
 
 @showing("data", "clip", "dense", "quality", "foreground", "regions", "workers", "cache_dir")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -26,7 +27,7 @@ from lang3dxl_ns.query.match import save_picture, together
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import Provenance, with_words_of, write_scene
+from lang3dxl_ns.query.scene_file import Provenance, replace_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
 from lang3dxl_ns.query.teach import run_lengths
 from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
@@ -261,16 +262,17 @@ class Export:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         if self.scene_file is not None:
-            kept = with_words_of(scene, self.scene_file)
-            size = write_scene(self.scene_file, kept, self._told())
-            say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: lang3dxl query {self.scene_file}")
+            _, size = replace_scene(self.scene_file, scene, self._told())
+            ask = f"lang3dxl query {shlex.quote(str(self.scene_file))}"
+            say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: {ask}")
         if self.web is not None:
             own = read_names(self.vocabulary, "words") if self.vocabulary else ()
             page = Page(scene, prompts, own, self._clip_words(scene.file.clip), self._told(), self.look)
             size = write_page(page, self.web)
             for left_out in page.left_out:
                 say(f"{left_out}.")
-            say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: python -m http.server -d {self.web}")
+            see = f"python -m http.server -d {shlex.quote(str(self.web))}"
+            say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
         if self.out is not None:
             text = prompts[0] if prompts else None
             count = scene.export(self.out, text, everything=self.all, look=self.look, index=self.index)

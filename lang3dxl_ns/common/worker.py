@@ -15,7 +15,6 @@ class Worker:
         self._failed = failed
         self._changed = threading.Condition()
         self._waiting: tuple[float, Callable[[], None]] | None = None
-        self._busy = False
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def submit(self, job: Callable[[], None], delay: float = 0.0) -> None:
@@ -24,22 +23,13 @@ class Worker:
             self._waiting = time.monotonic() + delay, job
             self._changed.notify_all()
 
-    def wait(self, timeout: float = 60.0) -> bool:
-        """Wait until all jobs are done. Return False if that takes longer than `timeout` seconds."""
-        with self._changed:
-            return self._changed.wait_for(lambda: self._waiting is None and not self._busy, timeout)
-
     def _run(self) -> None:
         while True:
             with self._changed:
                 while self._waiting is None or self._waiting[0] > time.monotonic():
                     self._changed.wait(None if self._waiting is None else self._waiting[0] - time.monotonic())
-                job, self._waiting, self._busy = self._waiting[1], None, True
+                job, self._waiting = self._waiting[1], None
             try:
                 job()
             except Exception as error:
                 self._failed(error)
-            finally:
-                with self._changed:
-                    self._busy = False
-                    self._changed.notify_all()

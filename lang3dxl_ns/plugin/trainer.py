@@ -42,7 +42,7 @@ from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.preparation.needs import write_needs
 from lang3dxl_ns.query.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE
-from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, with_words_of, write_scene
+from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, replace_scene
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 4.0}
 """Duration of an iteration in renderings of its photo, by whether semantics are trained with the scene: 1.5
@@ -361,10 +361,9 @@ class Lang3DXLTrainer(Trainer):
         how = f"{self.config.method_name}, {config.decoder.name}, {self.config.max_num_iterations} iterations"
         scene, place = self.pipeline.model.scene(self.pipeline.scene_file), self.config.load_checkpoint
         checkpoints = self.config.load_dir or (place and place.parent)
-        for folder in (self.base_dir, *([checkpoints.parent] if checkpoints else [])):
-            scene = with_words_of(scene, folder / path.name)
+        earlier = [checkpoints.parent / path.name] if checkpoints else []
         told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
-        size = write_scene(path, scene, told)
+        _, size = replace_scene(path, scene, told, *earlier)
         run = shlex.quote(os.path.relpath(self.base_dir))
         say(
             f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)",

@@ -28,7 +28,7 @@ from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
-from lang3dxl_ns.common.files import expanded, write_atomically
+from lang3dxl_ns.common.files import expanded, locked, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
@@ -141,9 +141,19 @@ def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
     write_atomically(path, save(content, {_KEY: json.dumps(described)}))
 
 
-def with_words_of(scene: Scene, earlier: Path) -> Scene:
-    """Return the scene with the taught words of the file that it replaces, where it doesn't know them. Log
-    which are kept and how, and which are lost. A missing file has no words."""
+def replace_scene(path: Path, scene: Scene, told: Provenance, *earlier: Path) -> tuple[Scene, int]:
+    """Write a scene over the file that it replaces, as `write_scene`, with the words taught there and in
+    `earlier` files. Return the written scene and the number of bytes. A command that teaches a word there at
+    this moment comes first, or waits."""
+    with locked(path.parent):
+        for file in (path, *earlier):
+            scene = _with_words_of(scene, file)
+        return scene, write_scene(path, scene, told)
+
+
+def _with_words_of(scene: Scene, earlier: Path) -> Scene:
+    """Return the scene with a file's taught words, where it doesn't know them. Log which are kept and how,
+    and which are lost. A missing file has no words."""
     if not earlier.is_file():
         return scene
     try:

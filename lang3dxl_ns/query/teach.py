@@ -176,8 +176,8 @@ class TaughtWord:
         finite = all(map(math.isfinite, (bias, text, doubt))) and bool(vector.isfinite().all())
         expect(finite and len(vector) > 0, "a word has a value that is not a number")
         name, scene, clip = content["name"], content["scene"], content["clip"]
-        named = isinstance(name, str) and isinstance(scene, str) and isinstance(clip, str | None)
-        expect(named, "a word has no name")
+        named = isinstance(name, str) and known_word(name) != ""
+        expect(named and isinstance(scene, str) and isinstance(clip, str | None), "a word has no name")
         precision = {str(photo): float(value) for photo, value in content["precision"].items()}
         examples = tuple(map(Example.from_json, content["examples"]))
         return cls(name, vector, bias, text, doubt, precision, examples, clip, scene)

@@ -113,6 +113,20 @@ def test_a_splat_in_one_place_is_refused(tmp_path):
         attach(tmp_path / "one.ply", None, tmp_path / "one.scene", SETTINGS)
 
 
+def test_a_splat_in_map_coordinates_is_refused(tmp_path):
+    splats = box_splat(0.1)
+    far = replace(splats, means=splats.means + torch.tensor([4e5, 5e6, 0]))
+    write_splats(tmp_path / "far.ply", far)
+    with pytest.raises(UserError, match=r"5,015,9.. units from the origin.* without the offset"):
+        attach(tmp_path / "far.ply", None, tmp_path / "far.scene", SETTINGS)
+
+
+def test_a_damaged_splat_is_told_before_encoders_are_looked_for(tmp_path):
+    (tmp_path / "cut.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\n")
+    with pytest.raises(UserError, match=r"cut\.ply is damaged"):
+        attach(tmp_path / "cut.ply", None, tmp_path / "a.scene", replace(SETTINGS, clip="absent/clip"))
+
+
 class Upper:
     """A segmenter that finds the upper half of every picture."""
 

@@ -1,9 +1,11 @@
 """`lang3dxl teach`, `lang3dxl words` and `lang3dxl query --coco`, on a scene file."""
 
 import json
+import shlex
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from threading import Event
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from PIL import Image
 
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
-from lang3dxl_ns.commands.query import CocoLabels
+from lang3dxl_ns.commands.query import CocoLabels, Export
 from lang3dxl_ns.commands.teach import Teach, forgotten
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.scene_file import keep_words, read_scene, write_scene
@@ -190,6 +192,34 @@ def test_a_scene_written_over_another_keeps_its_words_and_says_so(place, tmp_pat
     else:
         assert torch.allclose(after.vector, before.vector, atol=1e-5)
         assert len(after.examples) == (not change)
+
+
+def test_a_word_that_is_taught_while_its_scene_is_written_over_stays(place, tmp_path, monkeypatch):
+    write_scene(tmp_path / "new.scene", read_scene(place, "cpu"))
+    main(["teach", str(place), "--word", "widget", "--photo", "0003.jpg", "--box", DOME])
+    export = Export(scene=tmp_path / "new.scene", scene_file=place)
+    begun, taught = Event(), Event()
+
+    def slowly(*given):
+        begun.set()
+        taught.wait(1.5)  # in vain, since the other command waits for this one
+        return write_scene(*given)
+
+    monkeypatch.setattr("lang3dxl_ns.query.scene_file.write_scene", slowly)
+    with ThreadPoolExecutor() as both:
+        writing = both.submit(export.main)
+        begun.wait()
+        teach(place, "--box", DOME)
+        taught.set()
+        writing.result()
+    assert words(place).keys() == {"gizmo", "widget"}
+
+
+def test_the_next_command_can_be_pasted_whatever_the_name(place, tmp_path, capsys):
+    name = tmp_path / "my scene" / "it's.scene"
+    main(["export", str(place), "--scene-file", str(name)])
+    told = capsys.readouterr().out.replace("\n", "").partition("lang3dxl query ")[2]
+    assert shlex.split(told) == [str(name)]
 
 
 def test_a_scenes_own_words_win_and_a_damaged_file_is_written_over(place, tmp_path, capsys):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import make_trainer
+from idle_worker import idle
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
@@ -68,7 +69,7 @@ def type_in(panel, text: str) -> str:
     panel._question.value = text
     panel._asker.submit(panel._ask)
     time.sleep(0.05)  # setting a box tells the panel in a thread of viser's
-    assert panel._asker.wait() and panel._finder.wait()
+    assert idle(panel._asker) and idle(panel._finder)
     return panel._message.content
 
 
