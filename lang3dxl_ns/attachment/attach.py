@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -117,8 +116,7 @@ def attach(
                 scene = segmented(scene, word, segmenter, collection.photos, cameras)
     if place is not None:
         made = f"attached to {path.name} from {len(collection.photos)} {what}"
-        origin = Provenance(made_by=f"lang3dxl-ns {version('lang3dxl-ns')}", made_how=made)
-        scene, written = replace_scene(place, scene, origin)
+        scene, written = replace_scene(place, scene, Provenance(made_how=made))
         say(f"Wrote {written / 1e6:.1f} MB to {place}")
     return scene
 

@@ -21,8 +21,9 @@ from lang3dxl_ns.rendering import Splats, rasterize, render
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 
-FITS = 0.5
-"""Correlation of renderings with their photos above which a frame is right. Wrong ones reach 0.3."""
+FITS, FITS_FEW = 0.5, 0.65
+"""Correlation of renderings with their photos above which a frame is right, with many photos and with fewer
+than `_FEW`, to which a frame can be fitted by chance: wrong ones reach 0.3, and with three photos 0.55."""
 _CLOSE = 0.75
 """Correlation from which a frame is not refined, and no other one is tried."""
 _PROMISING = 0.15
@@ -59,7 +60,7 @@ class Fit:
     @property
     def fits(self) -> bool:
         """Whether the frame is right."""
-        return self.score >= FITS
+        return self.score >= (FITS if len(self.gains) >= _FEW else FITS_FEW)
 
     @property
     def lighting(self) -> float:

@@ -12,6 +12,7 @@ import tyro
 
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ class Attach(AttachConfig):
         from lang3dxl_ns.query.text import parse_prompts
 
         self.check()
+        if self.data is not None and (self.views, self.up) != (AttachConfig.views, AttachConfig.up):
+            raise UserError("--views and --up choose views of the splat, without --data: leave them off")
         prompts = [prompt for text in self.text for prompt in parse_prompts(text)]  # fail before the work
         scene = attach(self.splat, self.data, self.out, self)
         if prompts:

@@ -16,7 +16,6 @@ from numpy import ndarray as Array
 from PIL import Image
 from scipy.ndimage import find_objects, label
 
-from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomically
@@ -252,6 +251,8 @@ class Export:
         if ignored := [n for n, by in _READ_BY.items() if getattr(self, n) and targets[0] not in by]:
             option, target = (name.strip("_").replace("_", "-") for name in (ignored[0], targets[0]))
             raise UserError(f"--{option} has no effect on --{target}: leave it off")
+        if self.not_ and not self.text:
+            raise UserError("--not is a negative of texts: give --text too, or leave it off")
         if self.index is not None and (self.out is None or not self.text):
             raise UserError("--index lists the Gaussians that match: give --text and --out with it")
         prompts = parse_texts(self.text, self.not_)
@@ -292,4 +293,4 @@ class Export:
         """Return the provenance in the scene's own file, with what the flags override."""
         flags = {"title": self.title, "credit": self.credit, "license": self.license}
         told = {name: text for name, text in flags.items() if text}
-        return replace(provenance_of(self.scene), made_by=f"lang3dxl-ns {__version__}", **told)
+        return replace(provenance_of(self.scene), made_by=Provenance.made_by, **told)

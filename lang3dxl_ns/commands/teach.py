@@ -92,7 +92,8 @@ class Words:
             raise UserError(f"--save writes words as JSON: {self.save} is not the name of a .json file")
         scene = read_scene(file := existing_scene_file(self.scene))
         before = scene.words
-        for name in self.forget:
+        # The last example of a word goes first, so that the numbers of the others stay as they were listed.
+        for name in sorted(set(self.forget), key=lambda which: (len(which), which.lower()), reverse=True):
             scene = forgotten(scene, name)
         if self.load is not None:
             for word in load_words(self.load):

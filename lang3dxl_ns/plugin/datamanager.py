@@ -18,6 +18,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanagerConfig,
 )
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markdown import Markdown
 from rich.markup import escape
@@ -25,7 +26,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.device import to_device
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.reports import part
@@ -129,6 +130,9 @@ class Lang3DXLDataManager(FullImageDatamanager):
             config.dataparser.load_3D_points = True  # off by default in nerfstudio-data
         try:
             check_transforms(config.dataparser)
+            if isinstance(config.dataparser, NerfstudioDataParserConfig):
+                with readable(f"nerfstudio can't read {config.dataparser.data}", "make it again"):
+                    config.dataparser.setup().get_dataparser_outputs("train")
             super().__init__(config, *args, **kwargs)
         except (UserError, FileNotFoundError) as reason:
             recorded = recorded_scene(config.run)

@@ -44,10 +44,9 @@ def check_transforms(dataparser: DataParserConfig) -> None:
         _check_scene(content, path.parent)
     except FileNotFoundError as error:
         raise UserError(f"there is no {path}: give its folder as --data, or the file itself") from error
-    except KeyError as error:
-        raise UserError(f"{path} can't be used: a photo has no {error}; make the file again") from error
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} can't be used: {error}; correct it, or make it again") from error
+    except (OSError, KeyError, ValueError, TypeError, AttributeError) as error:
+        reason = f"a photo has no {error}, as in instant-ngp's form" if isinstance(error, KeyError) else error
+        raise UserError(f"{path} can't be used: {reason}; correct it, or make it again") from error
     if "ply_file_path" not in content and not (path.parent / "colmap").exists():
         say(
             f"{path} names no points (ply_file_path): training starts from random ones, which costs "
@@ -87,6 +86,9 @@ def _check_frame(frame: dict[str, Any], folder: Path) -> None:
     expect(numbers, "its lens has a distortion that is not a number")
     Lens(int(width), int(height), *focal).check()
     check_pose(frame["transform_matrix"])
+    expect(Path(frame["file_path"]).suffix != "", "its name lacks the suffix, such as .jpg: add it")
+    expect(len(frame["transform_matrix"]) == 4, "its pose has 3 rows: add the row 0, 0, 0, 1")
+    expect(not frame.get("is_fisheye"), "is_fisheye is not read: set camera_model OPENCV_FISHEYE instead")
 
 
 def _check_path(name: object, folder: Path) -> None:

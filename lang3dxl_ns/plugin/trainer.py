@@ -26,7 +26,6 @@ from rich.markup import escape
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from lang3dxl_ns import __version__
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError
@@ -322,7 +321,7 @@ class Lang3DXLTrainer(Trainer):
         return self._how_to_resume(self._last_iteration)
 
     def _how_to_resume(self, step: int) -> str:
-        folder = self.checkpoint_dir
+        folder = shlex.quote(str(self.checkpoint_dir))
         return f"Stopped after {step + 1} iterations. To resume: the same command with --load-dir {folder}"
 
     def _out_of_memory(self) -> str:
@@ -362,7 +361,7 @@ class Lang3DXLTrainer(Trainer):
         scene, place = self.pipeline.model.scene(self.pipeline.scene_file), self.config.load_checkpoint
         checkpoints = self.config.load_dir or (place and place.parent)
         earlier = [checkpoints.parent / path.name] if checkpoints else []
-        told = Provenance(title=path.stem, made_by=f"lang3dxl-ns {__version__}", made_how=how)
+        told = Provenance(title=path.stem, made_how=how)
         _, size = replace_scene(path, scene, told, *earlier)
         run = shlex.quote(os.path.relpath(self.base_dir))
         say(

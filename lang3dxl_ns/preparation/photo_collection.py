@@ -162,7 +162,7 @@ def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
             width, height = image.size
     angle = None if "fl_x" in frame else float(frame["camera_angle_x"])
     fx = float(frame["fl_x"]) if angle is None else width / 2 / math.tan(angle / 2)
-    fisheye = model == "OPENCV_FISHEYE"
+    fisheye = model == "OPENCV_FISHEYE" or bool(frame.get("is_fisheye"))  # instant-ngp's form
     names = ["k1", "k2", "k3", "k4"] if fisheye else ["k1", "k2", "p1", "p2", *["k3"] * bool(frame.get("k3"))]
     distortion = tuple(float(frame.get(key, 0.0)) for key in names)
     fy, cx, cy = (

@@ -12,8 +12,6 @@ from numpy import ndarray as Array
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import UserError
-
 _OPACITY = 0.7
 """Opacity of the heat over a pixel that matches."""
 
@@ -23,9 +21,9 @@ def heat(relevancy: Float[Tensor, "h w"], threshold: float = 0.5) -> Float[Tenso
     return ((relevancy - threshold) / max(float(relevancy.max()) - threshold, 1e-6)).clamp(0, 1)
 
 
-def color(values: Float[Tensor, "*shape"], color_map: str = "turbo") -> Float[Tensor, "*shape 3"]:
-    """Map values in 0…1 to colors of a matplotlib color map. Raises UserError for an unknown map."""
-    table = _colors(color_map).to(values)
+def color(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape 3"]:
+    """Map values in 0…1 to colors of matplotlib's turbo."""
+    table = _colors().to(values)
     return table[(values.clamp(0, 1) * (len(table) - 1)).round().long()]
 
 
@@ -34,23 +32,18 @@ def overlay(
     relevancy: Float[Tensor, "h w"],
     mask: Bool[Tensor, "h w"],
     threshold: float = 0.5,
-    opacity: float = _OPACITY,
-    color_map: str = "turbo",
 ) -> Float[Tensor, "h w 3"]:
     """Draw the heat map over the pixels that match, and keep the image (colors 0…1) elsewhere. The threshold
-    gets the first color of the matplotlib color map, and the highest relevancy its last. Raises UserError if
-    there is no such color map."""
-    hot = color(heat(relevancy * mask, threshold), color_map)
-    return torch.lerp(image, hot, opacity * mask.to(image)[..., None])
+    gets the first color, and the highest relevancy the last."""
+    hot = color(heat(relevancy * mask, threshold))
+    return torch.lerp(image, hot, _OPACITY * mask.to(image)[..., None])
 
 
 @lru_cache
-def _colors(name: str) -> Float[Tensor, "256 3"]:
+def _colors() -> Float[Tensor, "256 3"]:
     from matplotlib import colormaps
 
-    if name not in colormaps:
-        raise UserError(f"there is no color map {name!r}: choose one of matplotlib's, such as turbo")
-    return torch.tensor(colormaps[name](torch.linspace(0, 1, 256).numpy())[:, :3], dtype=torch.float32)
+    return torch.tensor(colormaps["turbo"](torch.linspace(0, 1, 256).numpy())[:, :3], dtype=torch.float32)
 
 
 def strongest(

@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.query.heat_maps import overlay, tinted, with_legend
 from lang3dxl_ns.query.places import Box, Viewpoint
 from lang3dxl_ns.query.text import Prompt
@@ -105,15 +105,15 @@ class Match:
         """Share of the view that matches."""
         return float(self.mask.mean())
 
-    def overlay(self, opacity: float = 0.7, color_map: str = "turbo") -> UInt8[Array, "h w 3"]:
-        """Draw the heat map over the rendering. Raises UserError for an unknown matplotlib color map."""
+    def overlay(self) -> UInt8[Array, "h w 3"]:
+        """Draw the heat map over the rendering."""
         image, mask = self.view.rendering.rgb.cpu(), torch.from_numpy(self.mask)
         relevancy = torch.from_numpy(self.relevancy)
-        return as_bytes(overlay(image, relevancy, mask, self.threshold, opacity, color_map))
+        return as_bytes(overlay(image, relevancy, mask, self.threshold))
 
     def save(self, path: str | Path) -> Path:
         """Write the overlay as a picture or, for a name that ends in .npy, the relevancy (float32)."""
-        path = Path(path)
+        path = expanded(path)
         if path.suffix != ".npy":
             return save_picture(self.overlay(), path)
         content = io.BytesIO()
@@ -166,7 +166,7 @@ def as_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[Array, "h w 3"]:
 
 def save_picture(pixels: UInt8[Array, "h w *c"], path: str | Path) -> Path:
     """Write a picture in the format that its name says. Raises UserError if that is no picture format."""
-    path, content = Path(path), io.BytesIO()
+    path, content = expanded(path), io.BytesIO()
     form = Image.registered_extensions().get(path.suffix.lower())
     if form not in ("PNG", "JPEG", "WEBP", "TIFF", "BMP"):
         raise UserError(f"{path.name} names no kind of picture: end it in .png or .jpg")

@@ -175,7 +175,7 @@ def _ply_header(file: BinaryIO) -> tuple[str, _Tables]:
     """Read the format and the tables of a PLY, and leave the file at the first table's data."""
     head = file.read(_HEADER)
     expect(head.startswith(b"ply"), "it doesn't begin like a PLY")
-    end = re.search(rb"end_header\r?\n", head)
+    end = re.search(rb"^end_header\r?\n", head, re.MULTILINE)
     if end is None:
         raise ValueError("its header doesn't end")
     form, order, listed = "", "<", dict[str, tuple[int, list[tuple[str, str]]]]()
@@ -203,7 +203,7 @@ def _of_table(table: Any) -> Splats:
         return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in names], axis=1))
 
     known = table.dtype.names if isinstance(table, np.ndarray) else tuple(table)
-    rest = sorted((name for name in known if name.startswith("f_rest_")), key=lambda name: int(name[7:]))
+    rest = sorted(filter(re.compile(r"f_rest_\d+").fullmatch, known), key=lambda name: int(name[7:]))
     if "f_dc_0" in known:
         first = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     else:

@@ -17,12 +17,13 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.console import tracked
+from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
-from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
+from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.learn_word import Weights, learn
 from lang3dxl_ns.query.match import Found, Match, View
@@ -213,16 +214,19 @@ class Scene:
             raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
         rivals = texts_of(negatives, "a negative")
         prompts = [replace(p, negatives=(*p.negatives, *rivals)) for p in self.prompts(texts)]
-        if own := [p.text for p in prompts if known_word(p.text) in map(known_word, p.negatives)]:
-            raise UserError(f"{own[0]!r} is its own negative, so nothing can match it: name another negative")
         within = self.config.foreground if foreground is None else foreground
         everything = [*prompts, *(self.prompts(within) if within else ())]
+        if own := [p.text for p in everything if known_word(p.text) in map(known_word, p.negatives)]:
+            raise UserError(f"{own[0]!r} is its own negative, so nothing can match it: name another negative")
         queries, count = self.queries(everything), len(prompts)
         relevancy = self.engine.of_gaussians(queries)
         doubts = [
             doubt if prompt.taught is None else prompt.taught.doubt
             for prompt, doubt in zip(everything, self.doubts.of(relevancy), strict=True)
         ]
+        for prompt, doubt in zip(everything[count:], doubts[count:], strict=True):
+            if advice := doubtful(prompt.text, doubt, prompt.taught is not None):
+                say(f"foreground {prompt.text}: {advice}")
         strict = [bool(prompt.negatives or prompt.taught) for prompt in everything]
         levels = match_thresholds(relevancy, doubts, strict)
         return Question(
@@ -330,9 +334,12 @@ class Scene:
     def best_views(self, question: Question) -> list[str]:
         """Return for each prompt the name of the training photo whose view shows it best, or comes closest.
         Raises UserError if the scene has no training photos."""
+        self._check_views()
+        return [self._ranked(question, row)[0].name for row in range(len(question.prompts))]
+
+    def _check_views(self) -> None:
         if not self.visible:
             raise UserError("this scene has no training photos to choose from: name a photo or a camera")
-        return [self._ranked(question, row)[0].name for row in range(len(question.prompts))]
 
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Compute the relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
@@ -365,7 +372,7 @@ class Scene:
         """
         splats = self.baked(look)
         if text is None:
-            return write_splats(Path(path), splats)
+            return write_splats(expanded(path), splats)
         question = self._one(text, threshold)
         relevancy, keep = question.relevancy[0], question.gaussians[0]
         if not everything and not keep.any():
@@ -377,8 +384,8 @@ class Scene:
         if not everything:
             splats, relevancy = splats.select(keep), relevancy[keep]
         if index is not None:
-            write_index(Path(index), keep)
-        return write_splats(Path(path), splats, relevancy)
+            write_index(expanded(index), keep)
+        return write_splats(expanded(path), splats, relevancy)
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 
@@ -401,7 +408,7 @@ class Scene:
             mask = self.file.photo(name).foreground(size)
             weight = torch.ones(size) if mask is None else mask.float()
             views[name] = VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
-        if self.cache is not None:
+        if self.cache is not None and views:
             save_visible(self.cache, views, key)
         return views
 
@@ -541,6 +548,7 @@ class Scene:
         taught = self.words.get(known_word(word))
         if taught is None:
             raise UserError(f"{word!r} was not taught: see lang3dxl words")
+        self._check_views()
         chance = self._one(taught.name).relevancy[0]
         marked = {self.file.photo(example.photo).name for example in taught.examples}
         views = {name: view for name, view in self.visible.items() if name not in marked} or self.visible

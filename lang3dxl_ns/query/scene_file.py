@@ -24,6 +24,7 @@ from numpy import ndarray as Array
 from PIL import Image
 from torch import Tensor
 
+from lang3dxl_ns import __version__
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
@@ -66,7 +67,7 @@ class Provenance:
     """Authors of the photos."""
     license: str = ""
     """Terms under which photos and scene may be used."""
-    made_by: str = ""
+    made_by: str = f"lang3dxl-ns {__version__}"
     """Program and version that wrote the file."""
     made_how: str = ""
     """How the scene was made, in one line: the method, its decoder and its iterations."""
@@ -209,12 +210,13 @@ def read_scene(
         if (settings := file.about.get("decoder")) is not None:
             decoder = _decoder(file, settings)
             expect({len(w.vector) for w in file.taught} <= {decoder.clip_dim}, "a word is of another CLIP")
-            codes = _codes(file, decoder.bounded, len(splats))
+            codes = _codes(file, decoder, len(splats))
         if (described := file.about.get("looks")) is not None:
             looks = _looks(file, described)
         if (words := file.about.get("words")) is not None:
             expect(all(isinstance(word, str) for word in words), "its words are no texts")
             rows = file.tensor("words", len(words), file.shapes["words"][1]).float()
+            expect(bool(rows.isfinite().all()), "its words are not made of numbers")
             vectors = dict(zip(words, F.normalize(rows, dim=1), strict=True))
         masks = [file.mask(i) for i in range(len(file.scene.photos))]
     photos = [replace(photo, mask=mask) for photo, mask in zip(file.scene.photos, masks, strict=True)]
@@ -260,7 +262,7 @@ class _File:
         expect(all(isinstance(t, str) for t in vars(self.provenance).values()), "its origin is no text")
         self.background: list[float] | None = self.about["background"]
         if self.background is not None:
-            channels = [0 <= float(x) <= 1 for x in self.background]
+            channels = [isinstance(x, int | float) and 0 <= x <= 1 for x in self.background]
             expect(channels == [True] * 3, "its background is no color")
         self.taught = [TaughtWord.from_json(word) for word in self.about.get("taught", [])]
 
@@ -317,6 +319,7 @@ def _opened(path: Path) -> Iterator[_File]:
 
 def _splats(file: _File) -> Splats:
     count, bands = file.shapes["means"][0], file.shapes["harmonics"][1]
+    expect(count > 0, "it holds no Gaussian")
     expect(bands in (1, 4, 9, 16), f"{bands} harmonics")
     antialiased = file.about["antialiased"]
     expect(isinstance(antialiased, bool), "antialiased")
@@ -330,9 +333,9 @@ def _splats(file: _File) -> Splats:
     )
 
 
-def _codes(file: _File, bounded: bool, count: int) -> Float[Tensor, "n d"]:
-    stored = file.tensor("codes", count, file.shapes["codes"][1])
-    if not bounded:
+def _codes(file: _File, decoder: Decoder, count: int) -> Float[Tensor, "n d"]:
+    stored = file.tensor("codes", count, getattr(decoder, "code_dim", file.shapes["codes"][1]))
+    if not decoder.bounded:
         return stored.float()
     expect(not stored.is_floating_point(), "its codes are no coordinates")
     codes = ((stored.double() - 1) / _STEPS).clamp(1e-9, 1 - 1e-9).logit().float()

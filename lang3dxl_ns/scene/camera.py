@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -206,7 +207,7 @@ def resized(camera: Camera, longer_side: int) -> Camera:
 def with_longer_side(camera: Camera, pixels: int) -> Camera:
     """Return the view at another resolution. Raises UserError for a side below 1 or above `LONGEST_SIDE`, and
     if over half of the memory is needed."""
-    if not (isinstance(pixels, int) and 1 <= pixels <= LONGEST_SIDE):
+    if not (isinstance(pixels, Integral) and 1 <= pixels <= LONGEST_SIDE):
         raise UserError(f"a picture of {pixels} pixels can't be rendered: give 1 to {LONGEST_SIDE}")
     width, height = scaled_size(camera.width, camera.height, pixels / max(camera.width, camera.height))
     needed, most = _PER_PIXEL * width * height, machine_memory() / 2
@@ -227,7 +228,7 @@ def at_size(camera: Camera, height: int, width: int) -> Camera:
 def with_field_of_view(camera: Camera, degrees: float) -> Camera:
     """Return the view through a centered lens with another vertical field of view and square pixels. Raises
     UserError unless the field of view lies between 1 and 170 degrees."""
-    if not (isinstance(degrees, int | float) and 1 <= degrees <= 170):
+    if not (isinstance(degrees, Real) and 1 <= degrees <= 170):
         raise UserError(f"the field of view is {degrees}: give 1 to 170 degrees")
     focal = camera.height / 2 / math.tan(math.radians(degrees) / 2)
     lens = Lens(camera.width, camera.height, focal, focal, camera.width / 2, camera.height / 2)

@@ -127,6 +127,12 @@ def test_a_damaged_splat_is_told_before_encoders_are_looked_for(tmp_path):
         attach(tmp_path / "cut.ply", None, tmp_path / "a.scene", replace(SETTINGS, clip="absent/clip"))
 
 
+def test_settings_of_views_beside_photos_are_told(tmp_path):
+    command = Attach(splat=tmp_path / "a.ply", data=tmp_path, out=tmp_path / "a.scene", views=8)
+    with pytest.raises(UserError, match="--views and --up choose views of the splat"):
+        command.main()
+
+
 class Upper:
     """A segmenter that finds the upper half of every picture."""
 

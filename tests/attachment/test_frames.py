@@ -11,7 +11,7 @@ from scenes import write_scene
 from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.attachment import frames
-from lang3dxl_ns.attachment.frames import camera_in, find_frame
+from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame
 from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames
 from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.rendering import render
@@ -130,3 +130,10 @@ def test_a_transforms_json_is_read_like_the_colmap_model(collection, tmp_path):
     for name, tracked in found.reconstruction.photos.items():
         wanted = collection.reconstruction.photos[name].camera_from_world
         np.testing.assert_allclose(tracked.camera_from_world, wanted, atol=1e-9)
+
+
+def test_few_photos_must_agree_better_than_many():
+    def fit(score: float, photos: int) -> Fit:
+        return Fit("a frame", np.eye(4), score, (1.0,) * photos)
+
+    assert fit(0.55, 12).fits and not fit(0.55, 3).fits and fit(0.7, 3).fits and not fit(0.45, 12).fits

@@ -10,6 +10,7 @@ from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms
+from lang3dxl_ns.preparation.photo_collection import read_collection
 
 POSE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
 
@@ -57,6 +58,9 @@ def test_a_sound_scene_passes_and_one_without_points_is_told(folder, capsys):
         *({key: "../secret.png"} for key in ("file_path", "mask_path", "depth_file_path")),
         *({key: "/etc/hostname"} for key in ("file_path", "mask_path", "depth_file_path")),
         {"file_path": "a\0b"},
+        {"file_path": "images/a"},
+        {"transform_matrix": POSE[:3]},
+        {"is_fisheye": True},
     ],
 )
 def test_frames_that_nothing_can_be_rendered_from_or_that_lead_outside_are_named(folder, frame):
@@ -105,6 +109,30 @@ def test_pipes_are_refused_instead_of_waited_for(folder):
     os.mkfifo(folder / "images" / "pipe.png")
     with pytest.raises(UserError, match="not a regular file"):
         check_transforms(write(folder, mask_path="images/pipe.png"))
+
+
+@pytest.mark.parametrize(
+    "top", [{}, {"applied_transform": POSE}, {"train_filenames": ["images/other.png"]}]
+)  # a single place, and two that only nerfstudio notices
+def test_what_nerfstudio_can_not_read_is_one_sentence(folder, train, top):
+    write(folder, top=top)
+    with pytest.raises(UserError, match=r"nerfstudio can't read .*: make it again"):
+        train(folder, semantics=False)
+
+
+def test_a_byte_order_mark_is_one_sentence(folder, train):
+    write(folder)
+    text = (folder / "transforms.json").read_text()
+    (folder / "transforms.json").write_text(text, encoding="utf-8-sig")
+    with pytest.raises(UserError, match=r"nerfstudio can't read .*BOM"):
+        train(folder, semantics=False)
+
+
+@pytest.mark.parametrize("fisheye", [True, False])
+def test_lenses_of_instant_ngp_are_fisheyes_where_it_says_so(folder, fisheye):
+    write(folder, is_fisheye=fisheye, k1=0.1)
+    (photo,) = read_collection(folder).photos
+    assert photo.lens.fisheye == fisheye and photo.lens.distortion[0] == 0.1
 
 
 def test_training_refuses_such_a_scene(folder, train):

@@ -111,6 +111,20 @@ def test_an_example_that_is_taught_while_its_word_is_forgotten_stays(place, monk
     assert len(words(place)["gizmo"].examples) == 2
 
 
+@pytest.mark.parametrize("which", [["gizmo/1", "gizmo/2"], ["Gizmo/2", "gizmo/1", "gizmo/1"]])
+def test_numbers_of_examples_are_those_of_the_list_however_many_are_forgotten(place, which):
+    for at in ("69,69", "70,70", "71,71"):
+        teach(place, "--at", at)
+    main(["words", str(place), *(word for name in which for word in ("--forget", name))])
+    (left,) = words(place)["gizmo"].examples
+    assert left.points == ((71, 71),)
+
+
+def test_a_negative_of_no_text_is_told(place, tmp_path):
+    with pytest.raises(SystemExit, match="--not is a negative of texts"):
+        main(["export", str(place), "--not", "window", "--out", str(tmp_path / "a.ply")])
+
+
 def test_evaluate_takes_a_scene_or_the_folder_that_holds_it(place):
     for given in (place, place.parent):
         with pytest.raises(SystemExit, match=r"wall\.scene is scored with --ground-truth"):

@@ -309,6 +309,18 @@ def test_rows_that_are_not_as_announced_are_refused_rather_than_read_shifted(for
         read_splats(tmp_path / "b.ply")
 
 
+def test_comments_and_properties_of_other_programs_are_skipped(tmp_path):
+    write_splats(tmp_path / "a.ply", some_splats(5))
+    _, rows = table(tmp_path / "a.ply")
+    write_table(tmp_path / "b.ply", rows, "ascii", "<f4", "float")
+    content = (tmp_path / "b.ply").read_bytes().replace(b"comment by hand", b"comment not the end_header")
+    renamed = content.replace(b"float nx\n", b"float f_rest_of_mine\n")
+    assert renamed != content and b"not the end_header" in content
+    for path, written in (("c.ply", content), ("d.ply", renamed)):
+        (tmp_path / path).write_bytes(written)
+        torch.testing.assert_close(read_splats(tmp_path / path).means, read_splats(tmp_path / "a.ply").means)
+
+
 def test_a_missing_file_and_a_folder_without_a_splat_are_named(tmp_path):
     for place in (tmp_path / "nothing.ply", tmp_path):
         with pytest.raises(UserError, match=place.name):

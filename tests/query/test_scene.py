@@ -314,6 +314,29 @@ def test_nothing_is_found_outside_a_photos_mask(tmp_path):
     np.testing.assert_array_equal(scene.query("window", "0003").mask, whole.mask)
 
 
+def test_a_foreground_that_is_not_there_is_told_and_its_negatives_are_checked(scene, capsys):
+    scene.ask("dome", foreground="window")
+    assert "foreground" not in capsys.readouterr().out
+    scene.ask("dome", foreground="saxophone")
+    assert "foreground saxophone: doubtful" in capsys.readouterr().out
+    with pytest.raises(UserError, match="its own negative"):
+        scene.ask("dome", foreground='"window" not "window"')
+
+
+def test_numbers_of_numpy_are_sizes_and_angles(scene):
+    view = scene.render(scene.photos[0].name, size=np.int64(24), fov=np.float32(60))
+    assert max(view.pixels.shape) == 24
+
+
+def test_the_home_folder_is_found_for_every_output(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    match = scene.query("dome", scene.photos[0].name)
+    outputs = [match.save("~/a.png"), match.save("~/a.npy"), match.view.save("~/b.png")]
+    scene.export("~/a.ply", "dome", index="~/c.npy")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.png", "a.npy", "b.png", "a.ply", "c.npy"}
+    assert all(path.is_file() for path in outputs)
+
+
 def test_a_prompted_foreground_leaves_only_what_it_finds(scene):
     only = painted_scene(config=QueryConfig(foreground="dome"))
     assert not only.query("window", "0003").mask.any() and only.find("window").box is None

@@ -31,6 +31,7 @@ from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import Provenance, describe_scene_file, read_scene, write_scene
 from lang3dxl_ns.query.splat_file import write_splats
+from lang3dxl_ns.query.teach import Example
 
 ATOL = 1e-4 * TEMPERATURE
 """Of relevancies, whose slope is a quarter of the temperature: files hold half the digits."""
@@ -190,6 +191,7 @@ def set_at(told, value, *keys):
         (("provenance", "title"), 7),
         (("provenance",), {"evil": 1}),
         (("background",), [0, 0]),
+        (("background",), ["0", "0", "0"]),
         (("antialiased",), "yes"),
         (("decoder", "name"), "os.system"),
         (("decoder", "clip_dim"), 10**9),
@@ -240,6 +242,7 @@ def test_tensors_of_wrong_shapes_are_refused(written, name):
     [
         ("means", slice(None), "no value of means is a number"),
         ("words", slice(None), "no value of words is a number"),
+        ("words", slice(1), "its words are not made of numbers"),
         ("decoder.output.bias", slice(1), "its decoder is not made of numbers"),
     ],
 )
@@ -252,6 +255,38 @@ def test_a_scene_without_numbers_is_refused_rather_than_answered_with_0(written,
     path.write_bytes(save(tensors, metadata))
     with pytest.raises(UserError, match=rf"wall\.scene is not a readable scene \({said}\)"):
         read_scene(path, "cpu")
+
+
+def altered(path, change):
+    """The file with other tensors."""
+    with safe_open(path, "np") as file:
+        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    path.write_bytes(save(change(tensors), metadata))
+
+
+def test_codes_of_another_width_and_a_scene_of_nothing_are_refused(written):
+    _, path = written
+    whole = path.read_bytes()
+    altered(path, lambda t: t | {"codes": np.concatenate([t["codes"], t["codes"][:, :1]], axis=1)})
+    with pytest.raises(UserError, match=r"codes has the shape"):
+        read_scene(path, "cpu")
+    path.write_bytes(whole)
+    each = ("means", "quats", "log_scales", "logits", "harmonics", "codes")
+    altered(path, lambda t: {name: value[:0] if name in each else value for name, value in t.items()})
+    with pytest.raises(UserError, match=r"it holds no Gaussian"):
+        read_scene(path, "cpu")
+
+
+def test_a_scene_without_training_photos_answers_where_it_is_asked(written):
+    _, path = written
+    rewritten(path, lambda told, _: [photo.update(split="eval") for photo in told["scene"]["photos"]])
+    scene = read_scene(path, "cpu", encode_texts=encode_texts)
+    assert scene.find("dome").views == [] and scene.query("dome", scene.photos[0].name).relevancy.any()
+    with pytest.raises(UserError, match="no training photos to choose from"):
+        scene.query("dome")
+    taught = scene.teach("gizmo", Example(scene.photos[0].name, points=((48, 48),)))
+    with pytest.raises(UserError, match="no training photos to choose from"):
+        taught.unsure("gizmo")
 
 
 @pytest.mark.parametrize("size", [30_000, 24])

@@ -453,12 +453,15 @@ def test_at_the_width_of_a_phone_everything_is_in_reach(browser, address):
 
 
 def test_a_page_of_other_people_is_not_replaced(scene, tmp_path):
-    (tmp_path / "index.html").write_text("mine")
-    with pytest.raises(UserError, match=r"index\.html of another page"):
-        write_page(Page(scene), tmp_path)
-    assert (tmp_path / "index.html").read_text() == "mine"
+    for name in ("index.html", "scene.json", "page.css"):
+        folder = tmp_path / name.partition(".")[0]
+        folder.mkdir()
+        (folder / name).write_text("mine")
+        with pytest.raises(UserError, match=rf"holds {name}, which is not a scene's page"):
+            write_page(Page(scene), folder)
+        assert [path.read_text() for path in folder.iterdir()] == ["mine"]
     for _ in range(2):  # the second over its own
-        write_page(Page(scene), tmp_path / "page")
+        write_page(Page(scene), tmp_path / "own")
 
 
 @pytest.mark.slow

@@ -39,6 +39,8 @@ from lang3dxl_ns.query.web.pack import (
 )
 
 _HERE = Path(__file__).parent
+_TITLE = "<title>A scene to ask</title>"
+"""Part of index.html by which a page is recognized."""
 _KINDS = (".html", ".css", ".js", ".txt")
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
@@ -217,10 +219,12 @@ def _distinct(phrases: Sequence[str]) -> list[str]:
 
 def write_page(page: Page, folder: Path) -> int:
     """Write a page's files into a folder for any static web server; return the number of bytes. Raises
-    UserError for a folder with the index.html of another page."""
+    UserError for a folder that has files of these names and is not such a page."""
     make_folder(folder)
-    if (folder / "index.html").exists() and not (folder / "scene.json").exists():
-        raise UserError(f"{folder} holds the index.html of another page: name a folder of its own")
+    index, names = folder / "index.html", [*(path.name for path in _HERE.iterdir()), "scene.json"]
+    ours = index.is_file() and _TITLE in index.read_text(errors="replace")
+    if not ours and (taken := [name for name in names if (folder / name).exists()]):
+        raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()
     for name, content in files.items():
         write_atomically(folder / name, content)
