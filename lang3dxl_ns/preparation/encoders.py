@@ -90,12 +90,12 @@ class ImageTextEncoder:
         self.dim: int = self.encode_texts(["object"]).shape[-1]
 
     def in_known_light(self, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        """A photo as its crops should be cut from: in the light that the encoder knows."""
+        """Bring a photo into the light that the encoder knows, before crops are cut from it."""
         return photo if self.brightness is None else in_known_light(photo, self.brightness)
 
     @torch.no_grad()  # not inference_mode: embeddings may enter autograd later, inference tensors can't
     def encode_images(self, crops: Float[Tensor, "n 3 s s"]) -> Float[Tensor, "n c"]:
-        """Embeddings of square crops, RGB in 0…1, on the encoder's device; other sizes are resized first."""
+        """Embed square crops, RGB in 0…1, on the encoder's device. Other sizes are resized first."""
         crops = _resize(crops.to(self._device, torch.float32), self.crop_size, self._resample)
         with _precision_of_images(self._device):
             inputs = vision_inputs(self._model, (crops - self._mean) / self._std)
@@ -104,8 +104,8 @@ class ImageTextEncoder:
 
     @torch.no_grad()
     def encode_patches(self, windows: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n rows columns c"]:
-        """Features of patches that `join_sizes` makes comparable with texts, of windows whose sides are whole
-        patches. RGB in 0…1; on the encoder's device."""
+        """Compute features of patches, which `join_sizes` makes comparable with texts. The sides of windows
+        (RGB in 0…1) are whole patches. The result is on the encoder's device."""
         rows, columns = (side // self.patch_size for side in windows.shape[-2:])
         windows = windows.to(self._device, torch.float32)
         read = self._family.patches if self._head is None else patch_tokens
@@ -115,7 +115,7 @@ class ImageTextEncoder:
 
     @torch.no_grad()
     def join_sizes(self, features: Float[Tensor, "sizes rows columns d"]) -> Float[Tensor, "rows columns c"]:
-        """Join maps of windows of several sizes, coarse to fine: their mean, or what the head reads."""
+        """Join maps of windows of several sizes, coarse to fine, by the head, or else by their mean."""
         if self._head is None:
             return features.mean(0)
         # A few rows at a time, because the head's input is several times as wide as its output.
@@ -123,7 +123,7 @@ class ImageTextEncoder:
 
     @torch.no_grad()
     def encode_texts(self, texts: list[str]) -> Float[Tensor, "n c"]:
-        """Embeddings of texts, on the encoder's device; truncated to the model's context."""
+        """Embed texts, cut to the model's context, on the encoder's device."""
         fixed = self._family.fixed_length
         tokens = self._tokenizer(
             [text.lower() for text in texts] if fixed else texts,
@@ -206,8 +206,8 @@ class DenseEncoder:
 
     @torch.no_grad()
     def encode(self, photo: Float[Tensor, "h w 3"]) -> Float[Tensor, "t t d"]:
-        """Normalized patch tokens of the last layer, float32, for a photo (RGB in 0…1) squashed to a square.
-        Token (i, j) covers rows i/t…(i+1)/t and columns j/t…(j+1)/t of the photo."""
+        """Compute normalized patch tokens of the last layer, float32, for a photo (RGB in 0…1) squashed to a
+        square. Token (i, j) covers rows i/t…(i+1)/t and columns j/t…(j+1)/t of the photo."""
         image = _resize(photo.to(self._device, torch.float32).permute(2, 0, 1)[None], self._side)
         with _half_precision_on_cuda(self._device):
             output = self._model(pixel_values=(image - self._mean) / self._std, **self._arguments)
@@ -217,8 +217,8 @@ class DenseEncoder:
 
 
 def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str) -> ImageTextEncoder:
-    """An image-text encoder in Hugging Face format, from a folder, by name, or "builtin". Raises UserError if
-    it can't be found or downloaded, is of no known family, or is incomplete."""
+    """Load an image-text encoder in Hugging Face format, from a folder, by name, or "builtin". Raises
+    UserError if it can't be found or downloaded, is of no known family, or is incomplete."""
     from transformers import AutoModel
 
     files = find_model(name_or_dir, CLIP_OPTION)
@@ -240,7 +240,7 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
 
 
 def _tokenizer(files: ModelFiles) -> Any:
-    """A model's tokenizer. Raises UserError if its files are missing or can't be read."""
+    """Load a model's tokenizer. Raises UserError if its files are missing or can't be read."""
     from transformers import AutoTokenizer
 
     if not any(has_files(files.folder, *names) for names in _VOCABULARIES):
@@ -255,7 +255,7 @@ def _tokenizer(files: ModelFiles) -> Any:
 
 
 def _image_processor(files: ModelFiles) -> Any:
-    """The settings of a model's image preprocessing."""
+    """Load the settings of a model's image preprocessing."""
     from transformers import AutoImageProcessor, CLIPImageProcessor
 
     if not any(has_files(files.folder, f"{kind}_config.json") for kind in ("preprocessor", "processor")):
@@ -272,8 +272,8 @@ def _image_processor(files: ModelFiles) -> Any:
 
 
 def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, tokens: int = 64) -> DenseEncoder:
-    """DINOv2 or another vision transformer with patch tokens, read at `tokens`×`tokens`. Raises UserError if
-    it can't be found or downloaded, has no patch tokens, or is incomplete."""
+    """Load DINOv2 or another vision transformer with patch tokens, to read photos at `tokens`×`tokens`.
+    Raises UserError if it can't be found or downloaded, has no patch tokens, or is incomplete."""
     from transformers import AutoModel
 
     files = find_model(name_or_dir, DENSE_OPTION)
@@ -305,19 +305,19 @@ def _channels(values: Sequence[float], device: torch.device) -> Float[Tensor, "3
 def _resize(
     images: Float[Tensor, "n 3 h w"], side: int, mode: str = "bicubic"
 ) -> Float[Tensor, "n 3 side side"]:
-    """Images squashed to squares, antialiased, as in the training of the models."""
+    """Squash images to squares, antialiased, as in the training of the models."""
     if images.shape[-2:] == (side, side):
         return images
     return F.interpolate(images, (side, side), mode=mode, antialias=True).clamp(0.0, 1.0)
 
 
 def _precision_of_images(device: torch.device) -> torch.autocast:
-    """16 bits where the hardware multiplies them: float16 on a GPU, bfloat16 on some CPUs."""
+    """Use 16 bits where the hardware multiplies them: float16 on a GPU, bfloat16 on some CPUs."""
     if device.type == "cpu":
         return torch.autocast("cpu", dtype=torch.bfloat16, enabled=multiplies_bfloat16())
     return _half_precision_on_cuda(device)
 
 
 def _half_precision_on_cuda(device: torch.device) -> torch.autocast:
-    """float16 rather than bfloat16: three more bits, and the targets are stored in it anyway."""
+    """Use float16, not bfloat16: it has three more bits, and the targets are stored in it anyway."""
     return torch.autocast(device.type, dtype=torch.float16, enabled=device.type == "cuda")

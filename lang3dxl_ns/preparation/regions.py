@@ -166,8 +166,7 @@ def stored_labels(labels: Int[Tensor, "hl wl"]) -> Int[Tensor, "h w"]:
 
 def label_size(height: int, width: int) -> tuple[int, int]:
     """Compute the rows and columns of a stored label map, at most 256 on the longer side."""
-    shrink = min(LONGER_SIDE / max(height, width), 1.0)
-    return max(round(height * shrink), 1), max(round(width * shrink), 1)
+    return fitted_size((height, width), LONGER_SIDE)
 
 
 def _read_labels(path: Path, name: str) -> Int[Tensor, "hl wl"]:
