@@ -41,7 +41,7 @@ from lang3dxl_ns.query.web.pack import (
 _HERE = Path(__file__).parent
 _TITLE = "<title>A scene to ask</title>"
 """Part of index.html by which a page is recognized."""
-_KINDS = (".html", ".css", ".js", ".txt")
+_FILES = [path for path in _HERE.iterdir() if path.suffix in (".html", ".css", ".js", ".txt")]
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _RULES = {
@@ -91,7 +91,7 @@ class Page:
         scene, self.left_out = self.scene, []
         means = scene.splats.means[scene.splats.sound()]
         center = means.median(0).values if len(means) else self._toward
-        files = {path.name: path.read_bytes() for path in _HERE.iterdir() if path.suffix in _KINDS}
+        files = {path.name: path.read_bytes() for path in _FILES}
         files["splats.bin"] = pack_splats(scene.baked(self.look), center, self._toward).tobytes()
         up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
         told = self.provenance
@@ -221,7 +221,7 @@ def write_page(page: Page, folder: Path) -> int:
     """Write a page's files into a folder for any static web server; return the number of bytes. Raises
     UserError for a folder that has files of these names and is not such a page."""
     make_folder(folder)
-    index, names = folder / "index.html", [*(path.name for path in _HERE.iterdir()), "scene.json"]
+    index, names = folder / "index.html", [*(path.name for path in _FILES), "scene.json"]
     ours = index.is_file() and _TITLE in index.read_text(errors="replace")
     if not ours and (taken := [name for name in names if (folder / name).exists()]):
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
