@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -130,12 +131,9 @@ def _photo_name(folder: Path, name: str) -> str:
     """Return a photo's name relative to the folder, with the suffix that instant-ngp leaves out."""
     if Path(name).is_absolute() and Path(name).is_relative_to(folder):
         name = Path(name).relative_to(folder).as_posix()
-    name = name.removeprefix("./")
-    if Path(name).suffix:
-        return name
-    return next(
-        (name + s for s in (".png", ".jpg", ".jpeg", ".JPG") if (folder / (name + s)).is_file()), name
-    )
+    name, suffixes = os.path.normpath(name), (".png", ".jpg", ".jpeg", ".webp")
+    endings = ["", *suffixes, *map(str.upper, suffixes)]
+    return next((name + ending for ending in endings if (folder / (name + ending)).is_file()), name)
 
 
 def _transforms_photo(folder: Path, name: str, frame: Mapping[str, Any]) -> tuple[Photo, TrackedPhoto]:

@@ -128,6 +128,25 @@ def test_a_byte_order_mark_is_one_sentence(folder, train):
         train(folder, semantics=False)
 
 
+@pytest.mark.parametrize("name", ["images/a", "./images/a.png", ".//images/a", "images/../images/a.png"])
+def test_a_splats_photos_are_found_without_suffix_and_by_every_relative_name(folder, name):
+    (photo,) = read_collection(folder_of(folder, name)).photos
+    assert photo.name == "images/a.png"
+
+
+@pytest.mark.parametrize(("name", "file"), [("images/b.2020", "b.2020.JPEG"), ("images/c", "c.webp")])
+def test_names_with_dots_and_large_suffixes_are_found(folder, name, file):
+    Image.new("RGB", (40, 30)).save(folder / "images" / file)
+    (photo,) = read_collection(folder_of(folder, name)).photos
+    assert photo.name == f"images/{file}"
+
+
+def folder_of(folder, name):
+    """A scene whose only photo has this name in its transforms.json."""
+    write(folder, file_path=name)
+    return folder
+
+
 @pytest.mark.parametrize("fisheye", [True, False])
 def test_lenses_of_instant_ngp_are_fisheyes_where_it_says_so(folder, fisheye):
     write(folder, is_fisheye=fisheye, k1=0.1)
