@@ -25,7 +25,7 @@ from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, replace_scene
+from lang3dxl_ns.query.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.photo_folder import check_data
 
@@ -60,9 +60,9 @@ def attach(
         UserError: the splat or the photos cannot be read, or the photos do not show the splat.
     """
     config, place = config or AttachConfig(), None if out is None else expanded(out).absolute()
-    if place is not None and place.suffix != SUFFIX:
-        raise UserError(f"{place.name} doesn't name a scene: end it in {SUFFIX}")
-    if data is None and place is None:
+    if place is not None:
+        check_scene_name(place)
+    elif data is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
     path = find_splats(splat)
     check_data(None if data is None else Path(data))

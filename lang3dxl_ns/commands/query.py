@@ -26,7 +26,7 @@ from lang3dxl_ns.query.match import save_picture, together
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import Provenance, replace_scene
+from lang3dxl_ns.query.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
 from lang3dxl_ns.query.teach import run_lengths
 from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
@@ -256,6 +256,8 @@ class Export:
         if self.index is not None and (self.out is None or not self.text):
             raise UserError("--index lists the Gaussians that match: give --text and --out with it")
         prompts = parse_texts(self.text, self.not_)
+        if self.scene_file is not None:
+            check_scene_name(self.scene_file)
         if self.out is not None:
             make_folder(self.out.parent)
             check_splat_name(self.out)

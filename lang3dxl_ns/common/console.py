@@ -9,6 +9,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager
+from functools import cache
 from typing import TypeVar
 
 from lang3dxl_ns.common.errors import printable
@@ -58,6 +59,10 @@ def say(*lines: str) -> None:
 
     for line in lines:
         get_console().print(printable(line), markup=False, highlight=False, soft_wrap=True)
+
+
+say_once = cache(say)
+"""Like `say`, but once per process."""
 
 
 def accept_any_console() -> None:

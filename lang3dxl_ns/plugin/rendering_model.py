@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,12 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.console import say_once
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size
 from lang3dxl_ns.common.reports import part
-from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
+from lang3dxl_ns.components.appearance import AppearanceField, render_in_look
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.sky import Sky
@@ -44,8 +43,6 @@ from lang3dxl_ns.scene.camera import in_view
 
 DECODE_SIZES = 5
 """Number of sizes at which what Gaussians carry is drawn and decoded in training."""
-
-_say_once = cache(say)
 
 
 @dataclass(frozen=True)
@@ -157,7 +154,7 @@ class RenderingModel(SplatfactoModel):
             why = f"Gaussians are rendered in perspective, not as {kind}: choose the camera type perspective"
             if self.refuses_lenses:
                 raise UserError(why)
-            _say_once(why)
+            say_once(why)
         self.set_crop(obb_box)
         start, answers = time.perf_counter(), self.answers
         if answers is None:
@@ -174,14 +171,10 @@ class RenderingModel(SplatfactoModel):
             return self._training_outputs(camera)
         return self._shown(camera, None, self._code_colors())[1]
 
-    def seen(
-        self, camera: Cameras, look: Look | None = None, channels: Float[Tensor, "n d"] | None = None
-    ) -> Rendering:
-        """Render the present Gaussians, and composite further `channels`, from a camera, under a look
-        (default: by the appearance's rule)."""
+    def seen(self, camera: Cameras, channels: Float[Tensor, "n d"] | None = None) -> Rendering:
+        """Render the present Gaussians, and composite further `channels`, from a camera."""
         view, splats, background = to_rasterizer(camera), self.splats(), self._get_background_color()
-        if look is None and self.appearance is not None:
-            look = self.appearance.of_view(view)
+        look = None if self.appearance is None else self.appearance.of_view(view)
         if self.crop_box is not None:
             keep = self.crop_box.within(splats.means).squeeze(-1)
             splats, channels = splats.select(keep), None if channels is None else channels[keep]

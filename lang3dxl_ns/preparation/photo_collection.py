@@ -131,8 +131,7 @@ def _photo_name(folder: Path, name: str) -> str:
     """Return a photo's name relative to the folder, with the suffix that instant-ngp leaves out."""
     if Path(name).is_absolute() and Path(name).is_relative_to(folder):
         name = Path(name).relative_to(folder).as_posix()
-    name, suffixes = os.path.normpath(name), (".png", ".jpg", ".jpeg", ".webp")
-    endings = ["", *suffixes, *map(str.upper, suffixes)]
+    name, endings = os.path.normpath(name), ("", ".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
     return next((name + ending for ending in endings if (folder / (name + ending)).is_file()), name)
 
 

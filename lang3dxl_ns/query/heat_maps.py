@@ -28,14 +28,11 @@ def color(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape 3"]:
 
 
 def overlay(
-    image: Float[Tensor, "h w 3"],
-    relevancy: Float[Tensor, "h w"],
-    mask: Bool[Tensor, "h w"],
-    threshold: float = 0.5,
+    image: Float[Tensor, "h w 3"], relevancy: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"], level: float
 ) -> Float[Tensor, "h w 3"]:
-    """Draw the heat map over the pixels that match, and keep the image (colors 0…1) elsewhere. The threshold
-    gets the first color, and the highest relevancy the last."""
-    hot = color(heat(relevancy * mask, threshold))
+    """Draw the heat map over the pixels that match, and keep the image (colors 0…1) elsewhere. A relevancy of
+    `level` gets the first color, and the highest relevancy the last."""
+    hot = color(heat(relevancy * mask, level))
     return torch.lerp(image, hot, _OPACITY * mask.to(image)[..., None])
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say, tracked
+from lang3dxl_ns.common.console import say_once, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
@@ -226,7 +226,7 @@ class Scene:
         ]
         for prompt, doubt in zip(everything[count:], doubts[count:], strict=True):
             if advice := doubtful(prompt.text, doubt, prompt.taught is not None):
-                say(f"foreground {prompt.text}: {advice}")
+                say_once(f"foreground {prompt.text}: {advice}")
         strict = [bool(prompt.negatives or prompt.taught) for prompt in everything]
         levels = match_thresholds(relevancy, doubts, strict)
         return Question(

@@ -76,11 +76,16 @@ class Provenance:
 # ── writing ─────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) -> int:
-    """Write a scene as one file, atomically, with foreground masks read from their files. Return the number
-    of bytes. Raises UserError if the name doesn't end in .scene."""
+def check_scene_name(path: Path) -> None:
+    """Raise UserError if the name doesn't end in .scene."""
     if path.suffix != SUFFIX:
         raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}")
+
+
+def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) -> int:
+    """Write a scene as one file, atomically, with foreground masks read from their files. Return the number
+    of bytes. Raises UserError as `check_scene_name`."""
+    check_scene_name(path)
     from safetensors.numpy import save
 
     splats = scene.splats

@@ -229,6 +229,12 @@ def test_a_word_that_is_taught_while_its_scene_is_written_over_stays(place, tmp_
     assert words(place).keys() == {"gizmo", "widget"}
 
 
+def test_another_name_than_a_scenes_is_refused_before_a_folder_is_made(place, tmp_path):
+    with pytest.raises(SystemExit, match=r"a\.ply doesn't name a scene"):
+        main(["export", str(place), "--scene-file", str(tmp_path / "new" / "a.ply")])
+    assert not (tmp_path / "new").exists()
+
+
 def test_the_next_command_can_be_pasted_whatever_the_name(place, tmp_path, capsys):
     name = tmp_path / "my scene" / "it's.scene"
     main(["export", str(place), "--scene-file", str(name)])

@@ -5,6 +5,7 @@ from copy import deepcopy
 import pytest
 import torch
 from conftest import make_trainer
+from looks import in_look
 from nerfstudio.utils.eval_utils import eval_setup
 
 from lang3dxl_ns.common.errors import UserError
@@ -45,7 +46,7 @@ def eval_camera(trainer):
 
 def show(model, camera, look=None) -> dict[str, torch.Tensor]:
     model.eval()
-    rendering = model.seen(camera, None if look is None else model.appearance.of_photo(look))
+    rendering = in_look(model, camera, None if look is None else model.appearance.of_photo(look))
     return {"rgb": rendering.rgb, "accumulation": rendering.alpha[..., None], "depth": rendering.depth}
 
 

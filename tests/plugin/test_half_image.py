@@ -3,6 +3,7 @@
 import pytest
 import torch
 from conftest import make_trainer
+from looks import in_look
 
 from lang3dxl_ns.components.appearance import Look
 from lang3dxl_ns.components.losses import rgb_loss
@@ -58,7 +59,7 @@ def halves(image):
 
 @torch.no_grad()
 def shown(model, camera, vector=None):
-    return model.seen(camera, None if vector is None else Look(model.appearance, vector)).rgb
+    return in_look(model, camera, None if vector is None else Look(model.appearance, vector)).rgb
 
 
 def test_nothing_of_the_right_half_is_seen(pipeline, photo):

@@ -20,17 +20,17 @@ def test_a_map_below_the_threshold_is_cold():
 
 def test_only_what_matches_is_painted():
     mask = torch.tensor([[False] * 3, [True] * 3])
-    picture = overlay(IMAGE, RELEVANCY, mask)
+    picture = overlay(IMAGE, RELEVANCY, mask, 0.5)
     assert torch.equal(picture[0], IMAGE[0])
     assert (picture[1] != IMAGE[1]).any(1).all()
     assert picture.min() >= 0 and picture.max() <= 1
-    assert torch.equal(overlay(IMAGE, RELEVANCY, torch.zeros_like(mask)), IMAGE)
+    assert torch.equal(overlay(IMAGE, RELEVANCY, torch.zeros_like(mask), 0.5), IMAGE)
 
 
 def test_a_peak_outside_of_what_matches_does_not_cool_it():
     peak = torch.where(torch.tensor([[True, False, False], [False] * 3]), 1.0, RELEVANCY)
     mask = RELEVANCY > 0.5
-    assert torch.equal(overlay(IMAGE, peak, mask), overlay(IMAGE, RELEVANCY, mask))
+    assert torch.equal(overlay(IMAGE, peak, mask, 0.5), overlay(IMAGE, RELEVANCY, mask, 0.5))
 
 
 def test_the_most_relevant_prompt_that_matches_a_place_colors_it():

@@ -318,7 +318,8 @@ def test_a_foreground_that_is_not_there_is_told_and_its_negatives_are_checked(sc
     scene.ask("dome", foreground="window")
     assert "foreground" not in capsys.readouterr().out
     scene.ask("dome", foreground="saxophone")
-    assert "foreground saxophone: doubtful" in capsys.readouterr().out
+    scene.ask("window", foreground="saxophone")
+    assert capsys.readouterr().out.count("foreground saxophone: doubtful") == 1
     with pytest.raises(UserError, match="its own negative"):
         scene.ask("dome", foreground='"window" not "window"')
 

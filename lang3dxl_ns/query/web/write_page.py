@@ -39,8 +39,6 @@ from lang3dxl_ns.query.web.pack import (
 )
 
 _HERE = Path(__file__).parent
-_TITLE = "<title>A scene to ask</title>"
-"""Part of index.html by which a page is recognized."""
 _FILES = [path for path in _HERE.iterdir() if path.suffix in (".html", ".css", ".js", ".txt")]
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
@@ -222,7 +220,7 @@ def write_page(page: Page, folder: Path) -> int:
     UserError for a folder that has files of these names and is not such a page."""
     make_folder(folder)
     index, names = folder / "index.html", [*(path.name for path in _FILES), "scene.json"]
-    ours = index.is_file() and _TITLE in index.read_text(errors="replace")
+    ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
     if not ours and (taken := [name for name in names if (folder / name).exists()]):
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()

@@ -1,0 +1,19 @@
+"""Renderings of a model in a look of choice, where the model itself follows its rule."""
+
+from __future__ import annotations
+
+from nerfstudio.cameras.cameras import Cameras
+
+from lang3dxl_ns.components.appearance import Look, render_in_look
+from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.rendering_model import RenderingModel
+from lang3dxl_ns.rendering import Rendering
+
+
+def in_look(model: RenderingModel, camera: Cameras, look: Look | None) -> Rendering:
+    """Render the present Gaussians from a camera in a look (None: by the model's rule)."""
+    if look is None:
+        return model.seen(camera)
+    background = model._get_background_color()
+    view = to_rasterizer(camera)
+    return render_in_look(model.splats(), view, look, background=background, backend=model.backend)
