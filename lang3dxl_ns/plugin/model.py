@@ -166,7 +166,7 @@ class Lang3DXLModel(RenderingModel):
         c = self.config
         assert c.dense_weight is not None
         ramp = semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
-        clip, dense, small_mask = self._decode_small(codes, mask, (codes.shape[0], codes.shape[1]))
+        clip, dense, small_mask = self._decode(codes, mask)
         assert self.semantic_field is not None and self.downsampler is not None
         with part("downsample"):
             predicted, target, weight = self.downsampler.match(
@@ -186,12 +186,12 @@ class Lang3DXLModel(RenderingModel):
             own = self.semantic_field.own_losses(clip, dense)
         return loss | {name: ramp * value for name, value in own.items()}
 
-    def _decode_small(self, codes: Float[Tensor, "H W 3"], mask: Tensor | None, size: tuple[int, int]):
-        """Resize a code map to a size (nearest), and decode it → clip [h, w, C], dense, mask [h, w]."""
+    def _decode(self, codes: Float[Tensor, "h w 3"], mask: Tensor | None):
+        """Decode a code map → clip [h, w, C], dense [h, w, D] or None, and the mask resized to [h, w]."""
         assert self.semantic_field is not None
         with part("decode"):
-            clip, dense = self.semantic_field(resize_nearest(codes, size))
-        return clip, dense, None if mask is None else resize_nearest(mask, size)
+            clip, dense = self.semantic_field(codes)
+        return clip, dense, None if mask is None else resize_nearest(mask, (codes.shape[0], codes.shape[1]))
 
     def get_metrics_dict(self, outputs: dict, batch: Batch) -> dict[str, Tensor]:
         """Compute numbers for the log: PSNR of the step's photo, and the number of Gaussians."""
@@ -259,7 +259,7 @@ class Lang3DXLModel(RenderingModel):
         assert decoder is not None and carried is not None
         if not decoder.per_gaussian:
             codes = self.composite(camera, carried)
-            return self._decode_small(codes, mask, fitted_size(codes.shape, longer_side))
+            return self._decode(resize_nearest(codes, fitted_size(codes.shape, longer_side)), mask)
         # The last layer is linear, so hidden activations are composited and divided by coverage.
         known = carried.isfinite().all(1, keepdim=True)
         hidden = torch.where(known, decoder.hidden(torch.where(known, carried, 0.0)), 0.0)
