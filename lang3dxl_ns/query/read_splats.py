@@ -11,6 +11,7 @@ import re
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from io import BytesIO
 from math import isqrt
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -239,19 +240,36 @@ def _of_gsply(data: Any) -> Splats:
 
 
 def _spz(path: Path) -> Splats:
-    """Read Niantic's compressed format."""
+    """Read Niantic's compressed format: one gzip stream up to version 3, several zstd streams from version 4."""
     import gsply
+    import zstandard
 
-    with path.open("rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-    if packed:  # a small file may unpack to any size
-        with gzip.open(path) as stream:
-            _, _, count, degree, *_ = struct.unpack("<IIIBBBB", stream.read(16))
+    content = path.read_bytes()
+    packed = content[:2] == b"\x1f\x8b"
+    try:
+        with gzip.open(path) if packed else BytesIO(content) as stream:
+            _, _, count, degree, _, flags, parts = struct.unpack("<IIIBBBB", stream.read(16))
             _check_memory(count, _ALL_BANDS)
             most = 20 * count + 3 * 15 * count + (1 << 20)
-            fits = degree <= 3 and len(stream.read(most)) < most
-            expect(fits, "it unpacks to more than its header announces")
-    return _of_gsply(gsply.read_spz(path))
+            # A small file may unpack to any size.
+            size = len(stream.read(most)) if packed else _largest_part(memoryview(content), parts)
+            expect(degree <= 3 and size < most, "it unpacks to more than its header announces")
+        return replace(_of_gsply(gsply.read_spz(path)), antialiased=bool(flags & 1))
+    except zstandard.ZstdError as error:
+        raise ValueError(error) from error
+
+
+def _largest_part(content: memoryview, parts: int) -> int:
+    """Return the largest size that a zstd stream of an .spz file announces. gsply limits those that announce
+    none."""
+    import zstandard
+
+    table = struct.unpack_from("<I", content, 16)[0]
+    place, largest = table + 16 * parts, 0
+    for i in range(parts):
+        largest = max(largest, zstandard.frame_content_size(content[place:]))
+        place += struct.unpack_from("<Q", content, table + 16 * i)[0]
+    return largest
 
 
 _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])

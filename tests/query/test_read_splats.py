@@ -125,11 +125,20 @@ def test_supersplats_compressed_ply_is_read(tmp_path):
 
 
 def test_an_spz_is_read(tmp_path):
-    pytest.importorskip("gsply")
+    gsply = pytest.importorskip("gsply")
     splats = some_splats()
     write_splats(tmp_path / "a.spz", splats)
     found = read_splats(tmp_path / "a.spz")
     assert_alike(found, splats, means=1e-3, scales=0.04, opacities=5e-3, colors=0.02, turn=1e-4)
+    assert not found.antialiased
+    # Version 4 has streams of zstd. Its byte 14 has flags, of which the first is for antialiasing.
+    gsply.write_spz(tmp_path / "b.spz", gsply.read_spz(tmp_path / "a.spz"), version=4)
+    content = bytearray((tmp_path / "b.spz").read_bytes())
+    content[14] = 1
+    (tmp_path / "b.spz").write_bytes(content)
+    again = read_splats(tmp_path / "b.spz")
+    assert again.antialiased
+    assert_alike(again, splats, means=1e-3, scales=0.04, opacities=5e-3, colors=0.02, turn=1e-4)
 
 
 def test_a_splat_of_the_web_is_read(tmp_path):
@@ -220,11 +229,16 @@ class _Evil:
 
 
 def bad_files(folder) -> dict[str, bytes]:
+    zstandard = pytest.importorskip("zstandard")
     write_splats(folder / "good.ply", some_splats(20))
     good = (folder / "good.ply").read_bytes()
     torch.save({"splats": _Evil()}, folder / "evil.pt")
-    huge = struct.pack("<IIIBBBB", 0x5053474E, 3, 1_000_000_000, 3, 12, 0, 0)
+    huge = struct.pack("<IIIBBBB", 0x5053474E, 3, 4_000_000_000, 3, 12, 0, 0)
     bomb = struct.pack("<IIIBBBB", 0x5053474E, 3, 10, 0, 12, 0, 0) + bytes(20_000_000)
+    zeros = zstandard.ZstdCompressor().compress(bytes(20_000_000))
+    streams = struct.pack("<IIIBBBBI", 0x5053474E, 4, 10, 0, 12, 0, 5, 32) + bytes(12)
+    for size in (90, 10, 30, 30, 40):
+        streams += struct.pack("<QQ", len(zeros), size)
     return {
         "empty.ply": b"",
         "text.ply": b"hello",
@@ -242,6 +256,9 @@ def bad_files(folder) -> dict[str, bytes]:
         "huge.spz": gzip.compress(huge),
         "bomb.spz": gzip.compress(bomb),
         "text.spz": b"hello",
+        "huge-4.spz": struct.pack("<IIIBBBBI", 0x5053474E, 4, 4_000_000_000, 0, 12, 0, 5, 32) + bytes(12),
+        "bomb-4.spz": streams + 5 * zeros,
+        "text-4.spz": streams + b"hello" * 20,
         "evil.pt": (folder / "evil.pt").read_bytes(),
         "text.ckpt": b"hello",
         "a.obj": b"v 0 0 0",
@@ -256,6 +273,14 @@ def test_every_bad_file_ends_in_one_sentence(tmp_path, capsys):
         assert name in str(error.value), error.value
         assert "\n" not in str(error.value)
     assert capsys.readouterr().out == ""
+
+
+def test_an_spz_is_measured_before_it_is_unpacked(tmp_path):
+    files = bad_files(tmp_path)
+    for name in ("bomb.spz", "bomb-4.spz", "huge.spz", "huge-4.spz"):
+        (tmp_path / name).write_bytes(files[name])
+        with pytest.raises(UserError, match="unpacks to more" if "bomb" in name else "GB of memory"):
+            read_splats(tmp_path / name)
 
 
 def test_checkpoints_in_the_old_format_and_of_other_shapes_are_told(tmp_path):
