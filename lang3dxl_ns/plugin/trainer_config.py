@@ -88,6 +88,9 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             check_inert(self.pipeline.model, self.pipeline.datamanager)
         super().set_timestamp()
         self.fit_to_run()
+        resumed, own = requested_checkpoint(self), super().get_checkpoint_dir().absolute()
+        if any(own.glob("*.ckpt")) and (resumed is None or resumed.parent != own):
+            raise UserError(f"{own} is of an earlier run: resume it with --load-dir, or change --timestamp")
         data = self.pipeline.datamanager
         check_encoders(data.clip, data.dense)
         self._check_device()

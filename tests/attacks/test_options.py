@@ -4,10 +4,11 @@ import math
 from copy import deepcopy
 
 import pytest
+import torch
 
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.methods import lang3dxl, run_config
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.text import TextConfig
@@ -101,6 +102,19 @@ def test_what_makes_sense_passes():
     PreparationConfig(scale_range=(0.05, 0.5), scale_mode="relative", scales=1, crop_batch=1).check()
     QueryConfig(threshold=0.0)
     QueryConfig(threshold=1.0)
+
+
+def test_a_run_of_the_same_name_keeps_its_checkpoints(tmp_path, scene):
+    """A new run would delete all but its own latest one."""
+    config = run_config(scene, tmp_path, "a", 5, "none", "none")
+    config.timestamp = "mine"
+    config.set_timestamp()
+    (checkpoints := config.get_checkpoint_dir()).mkdir(parents=True)
+    torch.save({}, checkpoints / "step-000000400.ckpt")
+    with pytest.raises(UserError, match="is of an earlier run: resume it"):
+        config.set_timestamp()
+    config.load_dir = checkpoints
+    config.set_timestamp()
 
 
 def test_two_runs_that_start_in_one_second_have_a_folder_each(tmp_path, scene):
