@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 import unicodedata
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 DAMAGE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    *(MemoryError, AssertionError, struct.error),
+    *(MemoryError, AssertionError, struct.error, zlib.error),
 )
 """Exceptions raised when values are read that a damaged file does not have."""
 

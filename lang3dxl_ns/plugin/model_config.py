@@ -24,6 +24,16 @@ START_OF_CODES = 0.25
 """Fraction of the run after which codes start from photos; the paper's densification is over by then."""
 
 
+BOUNDS: dict[str, tuple[float, float]] = {
+    **{"max_gaussians": (0, 1e9), "sky_gaussians": (0, 1e7), "num_random": (4, 1e9)},
+    **{"sh_degree": (0, 3), "random_scale": (1e-9, 1e9), "cull_alpha_thresh": (0, 0.5)},
+    **dict.fromkeys(("densify_from", "densify_until", "densify_every", "semantic_ramp", "warm_up"), (0, 1)),
+    **dict.fromkeys(("clip_weight", "dense_weight", "region_weight", "densify_grad_thresh"), (0, 1e6)),
+    "ssim_lambda": (0, 1),
+}
+"""Smallest and largest values of settings."""
+
+
 @without(*OF_SPLATFACTO)
 @showing(
     *("decoder", "semantic_field", "appearance", "view_dependence", "camera_optimization", "sky_gaussians"),

@@ -22,6 +22,7 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.inert_settings import check_inert
+from lang3dxl_ns.plugin.model_config import BOUNDS
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer, requested_checkpoint
@@ -76,7 +77,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         for it. nerfstudio calls this once, before the configuration is printed and saved."""
         print_user_errors_plainly()
         check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
-        check_numbers(self.pipeline.model, {"max_gaussians": (0, 1e9)}, "--pipeline.model.")
+        check_numbers(self.pipeline.model, BOUNDS, "--pipeline.model.")
         check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
         self.pipeline.datamanager.check()
         check_data(self.pipeline.datamanager.data or self.data)

@@ -240,7 +240,7 @@ def _of_gsply(data: Any) -> Splats:
 
 
 def _spz(path: Path) -> Splats:
-    """Read Niantic's compressed format: one gzip stream up to version 3, several zstd streams from version 4."""
+    """Read Niantic's compressed format: one gzip stream up to version 3, zstd streams in version 4."""
     import gsply
     import zstandard
 

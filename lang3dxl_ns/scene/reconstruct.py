@@ -160,11 +160,12 @@ def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     numbers = []
     for index, name in enumerate(photos.names):
         source, suffix = photos.folder / name, Path(name).suffix.lower()
-        number = f"{index:06d}{'.png' if suffix in _CONVERTED else suffix}"
-        if suffix in _CONVERTED:
-            with open_picture(source) as image:
+        with open_picture(source) as image:  # browsers save WebP under other endings
+            foreign = suffix in _CONVERTED or f".{image.format}".lower() in _CONVERTED
+            number = f"{index:06d}{'.png' if foreign else suffix}"
+            if foreign:
                 image.convert("RGB").save(folder / number)
-        else:
+        if not foreign:
             try:
                 (folder / number).symlink_to(source.absolute())
             except OSError:  # the disk or system has no links
@@ -180,7 +181,7 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
     stamp = json.dumps(
         {
             "photos": [[n, s.st_size, s.st_mtime_ns] for n, s in zip(photos.names, states, strict=True)],
-            "settings": [settings.max_size, settings.features, settings.one_camera, "numbered"],
+            "settings": [settings.max_size, settings.features, settings.one_camera, copies.names],
         }
     )
     database, stamped = work / "database.db", work / "photos.json"

@@ -68,6 +68,28 @@ def test_runs(owner, name, value, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("sky_gaussians", -5), ("sky_gaussians", 1e12), ("sh_degree", -1), ("sh_degree", 4)),
+        *(
+            ("num_random", 0),
+            ("densify_every", math.nan),
+            ("densify_from", math.inf),
+            ("random_scale", math.nan),
+        ),
+        *(("cull_alpha_thresh", 2), ("clip_weight", -1), ("densify_grad_thresh", math.nan), ("warm_up", 1.5)),
+    ],
+)
+def test_settings_of_the_model(name, value, tmp_path):
+    config = deepcopy(lang3dxl.config)
+    config.output_dir = tmp_path / "outputs"
+    setattr(config.pipeline.model, name, value)
+    with pytest.raises(UserError, match=f"--pipeline.model.{name.replace('_', '-')} is .*: give a number"):
+        config.set_timestamp()
+    assert not config.output_dir.exists()
+
+
+@pytest.mark.parametrize(
     "options",
     [
         {"threshold": math.nan},

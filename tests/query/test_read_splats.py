@@ -256,6 +256,7 @@ def bad_files(folder) -> dict[str, bytes]:
         "huge.spz": gzip.compress(huge),
         "bomb.spz": gzip.compress(bomb),
         "text.spz": b"hello",
+        "altered.spz": gzip.compress(bomb)[:12] + 40 * b"\xff" + gzip.compress(bomb)[52:],
         "huge-4.spz": struct.pack("<IIIBBBBI", 0x5053474E, 4, 4_000_000_000, 0, 12, 0, 5, 32) + bytes(12),
         "bomb-4.spz": streams + 5 * zeros,
         "text-4.spz": streams + b"hello" * 20,

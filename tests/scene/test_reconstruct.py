@@ -106,6 +106,8 @@ def test_names_with_spaces_formats_of_the_web_and_odd_bytes(photos):
         image.save(folder / "one more.webp", quality=95)
     with Image.open(folder / "Foto 5 (ä).jpg") as image:
         image.save(folder / "five.avif", quality=95)
+    with Image.open(folder / "Foto 4 (ä).jpg") as image:  # as browsers save it
+        image.convert("RGB").save(folder / "Foto 4 (ä).jpg", format="WEBP", quality=95)
     os.remove(folder / "Foto 5 (ä).jpg")
     os.rename(folder / "photo_006.jpg", os.fsencode(folder) + b"/caf\xe9.jpg")
     report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
