@@ -82,6 +82,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
         """Raise UserError if an option is invalid, before any work."""
         super().check()
         check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
+        check_numbers(self.dataparser, {n: b for n, b in _OF_PARSER.items() if hasattr(self.dataparser, n)})
 
     def settle_targets(self, learned: bool, gathered: bool) -> None:
         """Resolve what is prepared: semantics `learned` with the scene use regions and targets in every step;
@@ -97,6 +98,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
 _IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regions": torch.int64}
 """Number types of targets in a step; in memory they are kept half as wide."""
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
+_OF_PARSER = {"scale_factor": (1e-9, 1e9), "scene_scale": (1e-9, 1e9), "train_split_fraction": (0, 1)}
 
 
 class PhotosGoneError(UserError):

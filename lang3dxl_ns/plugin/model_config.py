@@ -7,6 +7,8 @@ from typing import Literal
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
@@ -24,7 +26,7 @@ START_OF_CODES = 0.25
 """Fraction of the run after which codes start from photos; the paper's densification is over by then."""
 
 
-BOUNDS: dict[str, tuple[float, float]] = {
+_BOUNDS: dict[str, tuple[float, float]] = {
     **{"max_gaussians": (0, 1e9), "sky_gaussians": (0, 1e7), "num_random": (4, 1e9)},
     **{"sh_degree": (0, 3), "random_scale": (1e-9, 1e9), "cull_alpha_thresh": (0, 0.5)},
     **dict.fromkeys(("densify_from", "densify_until", "densify_every", "semantic_ramp", "warm_up"), (0, 1)),
@@ -110,6 +112,15 @@ class ModelSettings(SplatfactoModelConfig):
     densify_grad_thresh: float | None = None  # type: ignore[assignment]
     """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-3 in
     short runs, which densify while gradients are still large, falling to 2e-4 (the paper's) in long ones."""
+
+    def check(self) -> None:
+        """Raise UserError if a setting is out of its range."""
+        check_numbers(self, _BOUNDS, "--pipeline.model.")
+        smallest, largest = self.decode_size or (1, 1)
+        if not 1 <= smallest <= largest <= 4096:
+            raise UserError(
+                f"--pipeline.model.decode-size is {smallest} {largest}: give a range in 1 to 4096"
+            )
 
     def fit_to_run(self, iterations: int) -> None:
         """Resolve settings that depend on the length of the run. Numbers change gradually between short and

@@ -11,11 +11,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from math import isclose
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
@@ -29,7 +31,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import replace_durably
+from lang3dxl_ns.common.files import expanded, replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
@@ -40,7 +42,7 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.preparation.needs import write_needs
 from lang3dxl_ns.query.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
-from lang3dxl_ns.query.run_file import SCENE_FILE
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, replace_scene
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 4.0}
@@ -84,8 +86,10 @@ def requested_checkpoint(config: Any) -> Path | None:
     """Find the checkpoint that a run's settings resume. Raises UserError if it doesn't exist."""
     folder, path = config.load_dir, config.load_checkpoint
     if folder is not None:
+        folder = expanded(folder)
         step = "*" if config.load_step is None else f"{config.load_step:09d}"
         path = max(folder.glob(f"step-{step}.ckpt"), default=folder / f"step-{step}.ckpt")
+    path = path and expanded(path)
     if path is not None and not path.is_file():
         raise UserError(f"there is no checkpoint {path}: pass the folder nerfstudio_models of a run")
     return path
@@ -175,6 +179,15 @@ class Lang3DXLTrainer(Trainer):
         if (path := requested_checkpoint(self.config)) is None:
             return
         check_checkpoint(path)
+        if (before := path.parent.with_name(SCENE_FILE)).is_file():
+            old, new = SceneFile.read(before), self.pipeline.datamanager.scene_file()
+            if not (
+                np.allclose(old.transform, new.transform, 1e-3, 1e-3)
+                and isclose(old.scale, new.scale, rel_tol=1e-3)
+            ):
+                raise UserError(
+                    f"{path} is of other photos, or of another reconstruction of them: train anew"
+                )
         state = read_checkpoint(path)
         try:
             self._start_step = state["step"] + 1

@@ -22,7 +22,6 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.inert_settings import check_inert
-from lang3dxl_ns.plugin.model_config import BOUNDS
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer, requested_checkpoint
@@ -77,20 +76,19 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         for it. nerfstudio calls this once, before the configuration is printed and saved."""
         print_user_errors_plainly()
         check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
-        check_numbers(self.pipeline.model, BOUNDS, "--pipeline.model.")
+        self.pipeline.model.check()
         check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
         self.pipeline.datamanager.check()
         check_data(self.pipeline.datamanager.data or self.data)
         if self.is_viewer_enabled():
             check_address(self.viewer.websocket_host, self.viewer.websocket_port)
-        fresh = self.timestamp == "{timestamp}"
-        if fresh:  # a run's config.yml contains resolved values
-            requested_checkpoint(self)
+        if self.pipeline.datamanager.run is None:  # a run's config.yml contains resolved values
             check_inert(self.pipeline.model, self.pipeline.datamanager)
+        resumed, fresh = requested_checkpoint(self), self.timestamp == "{timestamp}"
         super().set_timestamp()
         self.fit_to_run()
-        resumed, own = requested_checkpoint(self), super().get_checkpoint_dir().absolute()
-        if any(own.glob("*.ckpt")) and (resumed is None or resumed.parent != own):
+        own = super().get_checkpoint_dir().absolute()
+        if any(own.glob("*.ckpt")) and (resumed is None or resumed.absolute().parent != own):
             raise UserError(f"{own} is of an earlier run: resume it with --load-dir, or change --timestamp")
         data = self.pipeline.datamanager
         check_encoders(data.clip, data.dense)

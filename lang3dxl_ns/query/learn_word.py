@@ -90,7 +90,8 @@ def learn(
     for example, one in zip(examples, weights, strict=True):
         marked, everything = float(one.word.sum()), float(one.seen.sum())
         if marked <= 1e-6 * max(everything, 1.0):
-            raise UserError(f"the marks of {name!r} in {example.photo} lie where the scene shows nothing")
+            trouble = "lie where the scene shows nothing, or cancel out"
+            raise UserError(f"the marks of {name!r} in {example.photo} {trouble}")
         if marked >= 0.98 * everything:
             raise UserError(f"{name!r} is everything that {example.photo} shows: mark the word alone")
     rows, photos = _sampled(examples, weights)

@@ -208,7 +208,8 @@ def _of_table(table: Any) -> Splats:
     if "f_dc_0" in known:
         first = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     else:
-        first = harmonics_of(columns("red", "green", "blue") / 255)
+        colors = columns("red", "green", "blue")  # 0 to 255, or 0 to 1
+        first = harmonics_of(colors / (255 if (colors > 1).any() else 1))
     # Coefficients are stored channel by channel.
     others = columns(*rest).reshape(len(first), 3, len(rest) // 3).mT if rest else first[:, :0]
     scales = columns("scale_0", "scale_1")
@@ -223,6 +224,8 @@ def _supersplat(path: Path, tables: _Tables) -> Splats:
     """Read SuperSplat's compressed PLY, which stores chunks of 256 Gaussians."""
     import gsply
 
+    if "min_r" not in (tables["chunk"][1].names or ()):
+        raise UserError("an older SuperSplat wrote it: open it in the present one, and save it again")
     count, chunks = tables["vertex"][0], tables["chunk"][0]
     expect(chunks == -(-count // 256), f"{count:,} Gaussians don't lie in {chunks:,} chunks")
     expect(tables.get("sh", (count,))[0] == count, "its harmonics are of other Gaussians")

@@ -1,11 +1,15 @@
 """Exact resume: a resumed run equals the uninterrupted one to the last bit."""
 
+import shutil
+from dataclasses import replace
+
 import pytest
 import torch
 from conftest import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
@@ -73,6 +77,16 @@ def test_one_seed_twice_gives_equal_checkpoints(train, scene, whole, tmp_path):
 def test_a_resume_from_a_folder_without_checkpoint_says_so(train, scene, tmp_path):
     with pytest.raises(UserError, match="there is no checkpoint"):
         train(scene, iterations=4, semantics=False, load_dir=tmp_path)
+
+
+def test_a_run_of_another_scene_is_not_resumed(train, scene, whole, tmp_path):
+    """Its Gaussians are in other coordinates."""
+    (folder := tmp_path / "run" / "nerfstudio_models").mkdir(parents=True)
+    shutil.copy(whole.checkpoint_dir / "step-000000010.ckpt", folder)
+    told = SceneFile.read(whole.base_dir / SCENE_FILE)
+    replace(told, scale=1.1 * told.scale).write(folder.with_name(SCENE_FILE))
+    with pytest.raises(UserError, match="is of other photos, or of another reconstruction of them"):
+        train(scene, iterations=20, load_dir=folder, **EVERYTHING)
 
 
 def test_a_damaged_photo_does_not_change_the_order_of_the_others(train, scene, whole, monkeypatch):

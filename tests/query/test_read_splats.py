@@ -100,6 +100,19 @@ def test_byte_order_number_type_and_order_of_columns_make_no_difference(form, ki
     assert_alike(read_splats(tmp_path / "b.ply"), splats)
 
 
+@pytest.mark.parametrize("most", [1, 255])
+def test_plain_colors_are_bytes_or_fractions(tmp_path, most):
+    splats = some_splats(bands=1)
+    write_splats(tmp_path / "a.ply", splats)
+    rows = table(tmp_path / "a.ply")[1].copy()
+    for i in range(3):
+        rows[f"f_dc_{i}"] = most * (rows[f"f_dc_{i}"] * 0.28209479 + 0.5)
+    plain = dict(zip(("f_dc_0", "f_dc_1", "f_dc_2"), ("red", "green", "blue"), strict=True))
+    rows = recfunctions.rename_fields(rows, plain)
+    write_table(tmp_path / "b.ply", rows, "binary_little_endian", "<f4", "float")
+    assert_alike(read_splats(tmp_path / "b.ply"), splats, colors=1e-5)
+
+
 def test_two_dimensional_gaussians_are_thin(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats())
     names, rows = table(tmp_path / "a.ply")
@@ -122,6 +135,11 @@ def test_supersplats_compressed_ply_is_read(tmp_path):
     order = [torch.cdist(found.means, splats.means).argmin(1)]
     wanted = splats.select(order[0])
     assert_alike(found, wanted, means=5e-3, scales=5e-3, opacities=5e-3, colors=0.03, turn=1e-4)
+    # Older versions stored no bounds of the colors.
+    content = (tmp_path / "a.compressed.ply").read_bytes()
+    (tmp_path / "b.compressed.ply").write_bytes(content.replace(b"float min_r\n", b"float other\n"))
+    with pytest.raises(UserError, match=r"b\.compressed\.ply: an older SuperSplat wrote it: open it"):
+        read_splats(tmp_path / "b.compressed.ply")
 
 
 def test_an_spz_is_read(tmp_path):
