@@ -88,7 +88,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         super().set_timestamp()
         self.fit_to_run()
         own = super().get_checkpoint_dir().absolute()
-        if any(own.glob("*.ckpt")) and (resumed is None or resumed.absolute().parent != own):
+        continues = resumed is not None and resumed.absolute().parent == own
+        if not (fresh or continues) and any(own.glob("*.ckpt")):
             raise UserError(f"{own} is of an earlier run: resume it with --load-dir, or change --timestamp")
         data = self.pipeline.datamanager
         check_encoders(data.clip, data.dense)
