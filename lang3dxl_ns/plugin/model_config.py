@@ -29,8 +29,10 @@ START_OF_CODES = 0.25
 _BOUNDS: dict[str, tuple[float, float]] = {
     **{"max_gaussians": (0, 1e9), "sky_gaussians": (0, 1e7), "num_random": (4, 1e9)},
     **{"sh_degree": (0, 3), "random_scale": (1e-9, 1e9), "cull_alpha_thresh": (0, 0.5)},
-    **dict.fromkeys(("densify_from", "densify_until", "densify_every", "semantic_ramp", "warm_up"), (0, 1)),
-    **dict.fromkeys(("clip_weight", "dense_weight", "region_weight", "densify_grad_thresh"), (0, 1e6)),
+    **dict.fromkeys(("densify_from", "densify_until", "densify_every", "semantic_ramp"), (0, 1)),
+    **dict.fromkeys(
+        ("clip_weight", "dense_weight", "region_weight", "densify_grad_thresh", "warm_up"), (0, 1e6)
+    ),
     "ssim_lambda": (0, 1),
 }
 """Smallest and largest values of settings."""

@@ -72,7 +72,7 @@ def test_runs(owner, name, value, tmp_path):
     [
         *(("sky_gaussians", -5), ("sky_gaussians", 1e12), ("sh_degree", -1), ("sh_degree", 4)),
         *(("num_random", 0), ("densify_every", math.nan), ("densify_from", math.inf)),
-        *(("random_scale", math.nan), ("cull_alpha_thresh", 2), ("clip_weight", -1), ("warm_up", 1.5)),
+        *(("random_scale", math.nan), ("cull_alpha_thresh", 2), ("clip_weight", -1), ("warm_up", -1)),
         *(("densify_grad_thresh", math.nan), ("decode_size", (0, 0)), ("decode_size", (9, 2))),
     ],
 )
