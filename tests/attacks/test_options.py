@@ -2,6 +2,7 @@
 
 import math
 from copy import deepcopy
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ import torch
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import lang3dxl, run_config
+from lang3dxl_ns.plugin.trainer import requested_checkpoint
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.text import TextConfig
@@ -120,6 +122,29 @@ def test_what_makes_sense_passes():
     PreparationConfig(scale_range=(0.05, 0.5), scale_mode="relative", scales=1, crop_batch=1).check()
     QueryConfig(threshold=0.0)
     QueryConfig(threshold=1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("train_split_fraction", math.nan), ("scale_factor", 0.0), ("scene_scale", math.nan)]
+)
+def test_settings_of_the_parser(name, value):
+    config = deepcopy(lang3dxl.config)
+    setattr(config.pipeline.datamanager.dataparser, name, value)
+    with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is .*: give a number"):
+        config.set_timestamp()
+
+
+def test_a_run_in_the_home_is_found(tmp_path, monkeypatch):
+    """Shells leave the ~ of --load-dir=~/run as it is."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    path = tmp_path / "run" / "step-000000007.ckpt"
+    path.parent.mkdir()
+    path.touch()
+    config = deepcopy(lang3dxl.config)
+    config.load_dir = Path("~/run")
+    assert requested_checkpoint(config) == path
+    config.load_dir, config.load_checkpoint = None, Path("~/run") / path.name
+    assert requested_checkpoint(config) == path
 
 
 def test_a_run_of_the_same_name_keeps_its_checkpoints(tmp_path, scene):
