@@ -71,7 +71,8 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         with _terminable():
             copy_context().run(_parsed(words).main)  # undoes the command's message settings
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed at the start
+                sys.stdout.flush()
     except UserError as error:
         # Messages name the options of ns-train, which these two pass on; others have them without the prefix.
         prefix = "--" if words[0] in ("demo", "benchmark") else "--pipeline.datamanager."

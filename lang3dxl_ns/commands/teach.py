@@ -97,7 +97,11 @@ class Words:
             scene = forgotten(scene, name)
         if self.load is not None:
             for word in load_words(self.load):
+                name, own = known_word(word.name), scene.words
                 scene = scene.carrying(word)
+                if name in own and own[name].examples and not scene.words[name].examples:
+                    hint = "--forget it too, or rename it in the file"
+                    raise UserError(f"{word.name!r} was taught here by examples, which would be lost: {hint}")
         words = list(scene.words.values())
         if self.forget or self.load is not None:
             changed = {name: scene.words.get(name) for name in {**before, **scene.words}}

@@ -47,7 +47,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, SceneFacts, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, ScenePhoto
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
 
@@ -130,6 +130,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
             config.data = config.dataparser.data
         if hasattr(config.dataparser, "load_3D_points"):
             config.dataparser.load_3D_points = True  # off by default in nerfstudio-data
+        opens = kwargs.get("test_mode", "val") != "val"
+        recorded = recorded_scene(config.run) if opens else None
         try:
             check_transforms(config.dataparser)
             if isinstance(config.dataparser, NerfstudioDataParserConfig):
@@ -137,13 +139,24 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 with readable(f"nerfstudio can't read {config.dataparser.data}", "make it again"):
                     config.dataparser.setup().get_dataparser_outputs("train")
             super().__init__(config, *args, **kwargs)
+            if recorded is not None:
+                self._check_recorded(SceneFile.read(recorded.run / SCENE_FILE))
         except (UserError, FileNotFoundError) as reason:
-            recorded = recorded_scene(config.run)
-            if recorded is None or kwargs.get("test_mode", "val") == "val":
+            if recorded is None:
                 raise
-            CONSOLE.log(f"[yellow]The run's own cameras are used, since the photos are gone: {reason}")
+            _log(f"The run's own cameras are used: {reason}")
             config.dataparser, config.camera_res_scale_factor = recorded, 1.0
             super().__init__(config, *args, **kwargs)
+
+    def _check_recorded(self, scene: SceneFile) -> None:
+        """Raise UserError if the photos are no longer those that the run was trained on: nerfstudio would
+        find another frame for the cameras, or hold other photos out."""
+        outputs = self.train_dataparser_outputs
+        names = [photo.name for photo in self.train_dataset.photos]
+        trained = [photo.name for photo in scene.photos if photo.split == "train"]
+        known = scene.has_frame(outputs.dataparser_transform, outputs.dataparser_scale)
+        if not known or set(names) != set(trained):
+            raise UserError(f"photos or cameras in {self.data_folder} are not those of the run's training")
 
     def get_datapath(self) -> Path:
         """Return the folder where the viewer keeps camera paths, which is the run's."""

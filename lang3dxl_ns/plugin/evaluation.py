@@ -27,6 +27,7 @@ from lang3dxl_ns.evaluation.score_scene import truths_of
 from lang3dxl_ns.evaluation.scores import LanguageScorer, bounds, inside, map_size, open_scorer
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+from lang3dxl_ns.plugin.dataparser import RecordedSceneDataParserConfig
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos
@@ -88,6 +89,12 @@ class Evaluation:
     def evaluate(self, split: Split | None = None) -> Iterator[EvaluatedPhoto]:
         """Render and score the photos of a split (default: the configured one), with a progress bar."""
         split = split or self._settings.evaluated_photos
+        if isinstance(self._data.config.dataparser, RecordedSceneDataParserConfig):
+            raise UserError(
+                "this run can't be evaluated without the photos that it was trained on (see above): restore "
+                "them, or correct data in its config.yml. `lang3dxl evaluate run NAME.scene --ground-truth "
+                "FOLDER` scores its words alone"
+            )
         return self.evaluate_photos(self._photos_of(split), self.scorer, self._fits_looks(split))
 
     @torch.no_grad()

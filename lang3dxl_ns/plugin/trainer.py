@@ -11,13 +11,11 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from math import isclose
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
@@ -180,11 +178,8 @@ class Lang3DXLTrainer(Trainer):
             return
         check_checkpoint(path)
         if (before := path.parent.with_name(SCENE_FILE)).is_file():
-            old, new = SceneFile.read(before), self.pipeline.datamanager.scene_file()
-            if not (
-                np.allclose(old.transform, new.transform, 1e-3, 1e-3)
-                and isclose(old.scale, new.scale, rel_tol=1e-3)
-            ):
+            new = self.pipeline.datamanager.train_dataparser_outputs
+            if not SceneFile.read(before).has_frame(new.dataparser_transform, new.dataparser_scale):
                 raise UserError(
                     f"{path} is of other photos, or of another reconstruction of them: train anew"
                 )

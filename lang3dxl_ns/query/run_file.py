@@ -137,6 +137,12 @@ class SceneFile:
             expect(content.pop("version") == _VERSION, "another version wrote it")
             return scene_from_json(content)
 
+    def has_frame(self, transform: Any, scale: float) -> bool:
+        """Return whether the model's frame is the one of a transform [3, 4] and scale."""
+        return np.allclose(self.transform, transform, 1e-3, 1e-3) and math.isclose(
+            self.scale, scale, rel_tol=1e-3
+        )
+
     def photo(self, name: str) -> ScenePhoto:
         """Find the photo with this name, or with this file name or stem if only one photo has it. Raises
         UserError, which names similar photos, if there is none."""

@@ -515,7 +515,10 @@ class Scene:
             raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")
         listed = [examples] if isinstance(examples, Example) else list(examples)
         photos = [self.file.photo(example.photo) for example in listed]
-        listed = [replace(example, photo=photo.name) for example, photo in zip(listed, photos, strict=True)]
+        listed = [
+            replace(example, photo=photo.name, size=photo.file_size)
+            for example, photo in zip(listed, photos, strict=True)
+        ]
         pairs = zip(listed, photos, strict=True)
         weights = [Weights.of(example, photo, self.splats, self.backend) for example, photo in pairs]
         if selection is not None:
@@ -536,9 +539,10 @@ class Scene:
         if not, or if its marks no longer show anything, it is kept as it was learned there. Raises UserError
         if it was learned with another CLIP."""
         if word.examples and word.scene == Path(self.file.data).name:
-            with suppress(UserError):
-                return self.teach(word.name, word.examples)
-        if word.clip != self.file.clip_identity or len(word.vector) != self._semantics()[0].clip_dim:
+            with suppress(UserError):  # two folders may have one name, with photos of the same names
+                if all(e.size in (None, self.file.photo(e.photo).file_size) for e in word.examples):
+                    return self.teach(word.name, word.examples)
+        if len(word.vector) != self._semantics()[0].clip_dim or word.clip != self.file.clip_identity:
             raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
         return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
 

@@ -46,6 +46,8 @@ class Example:
     """Columns and rows of pixels that are the word."""
     not_points: tuple[Point, ...] = ()
     """Columns and rows of pixels that are not the word."""
+    size: tuple[int, int] | None = None
+    """Width and height of the photo's file; `Scene.teach` sets it."""
 
     def __post_init__(self) -> None:
         """Raise UserError unless something is marked, with finite coordinates."""
@@ -77,7 +79,7 @@ class Example:
     def to_json(self) -> dict[str, Any]:
         """Convert the example to JSON, with masks as run lengths."""
         described: dict[str, Any] = {"photo": self.photo}
-        described |= {"points": self.points, "not_points": self.not_points}
+        described |= {"points": self.points, "not_points": self.not_points, "size": self.size}
         if self.mask is not None:
             described["mask"] = {"size": self.mask.shape, "counts": run_lengths(self.mask)}
         return described if self.box is None else described | {"box": self.box}
@@ -96,7 +98,9 @@ class Example:
         points, others = (
             tuple((float(x), float(y)) for x, y in content[name]) for name in ("points", "not_points")
         )
-        return cls(str(content["photo"]), mask, box, points, others)
+        size = content.get("size")
+        size = None if size is None else (int(size[0]), int(size[1]))
+        return cls(str(content["photo"]), mask, box, points, others, size)
 
 
 def _finite(values: Sequence[Any], count: int) -> tuple[float, ...]:

@@ -178,8 +178,26 @@ def test_words_are_carried_to_another_scene(place, tmp_path, capsys):
     main(["words", str(other), "--load", str(kept)])
     assert "carried over from wall" in capsys.readouterr().out
     assert torch.equal(words(other)["gizmo"].vector, words(place)["gizmo"].vector)
+    alike = tmp_path / "alike.json"  # another folder of this name, with other photos of the same names
+    content = json.loads(kept.read_text())
+    content["words"][0]["examples"][0]["size"][0] += 1
+    alike.write_text(json.dumps(content))
+    main(["words", str(same), "--forget", "gizmo", "--load", str(alike)])
+    assert not words(same)["gizmo"].examples
     with pytest.raises(SystemExit, match="another CLIP"):
         main(["words", str(foreign), "--load", str(kept)])
+
+
+def test_words_that_are_loaded_do_not_replace_examples_of_the_scene(place, tmp_path):
+    teach(place, "--box", DOME)
+    kept = tmp_path / "words.json"
+    main(["words", str(place), "--save", str(kept)])
+    kept.write_text(kept.read_text().replace('"wall"', '"tower"'))
+    with pytest.raises(SystemExit, match="'gizmo' was taught here by examples, which would be lost"):
+        main(["words", str(place), "--load", str(kept)])
+    assert words(place)["gizmo"].examples
+    main(["words", str(place), "--forget", "gizmo", "--load", str(kept)])
+    assert not words(place)["gizmo"].examples
 
 
 @pytest.mark.parametrize(

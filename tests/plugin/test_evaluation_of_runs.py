@@ -16,6 +16,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
 from lang3dxl_ns.evaluation.score_scene import score_scene
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.load_scene import load_run
+from lang3dxl_ns.plugin.trainer_config import open_run
 
 
 def label(scene, folder, numbers):
@@ -173,3 +174,28 @@ def test_a_scene_alone_has_the_scores_of_its_run(evaluate, trainer, scene, tmp_p
     for photo, figures in found.items():
         for name in ("ap_dome", "raw_ap_dome", "authors_ap_dome", "iou_dome"):
             assert figures[name] == pytest.approx(expected[photo][name], abs=1e-5)
+
+
+def test_a_run_of_other_photos_keeps_its_cameras_and_is_not_evaluated(train, tmp_path):
+    """nerfstudio would turn and shift the cameras, and hold other photos out."""
+    data = write_scene(tmp_path / "scene", photos=10, points=60)
+    trainer = train(data, iterations=2)
+    recorded = {p.name: p.pose for p in trainer.pipeline.scene_file.photos}
+
+    def opened():
+        pipeline = open_run(trainer.base_dir)[1]
+        dataset = pipeline.datamanager.train_dataset
+        for photo, pose in zip(dataset.photos, dataset.cameras.camera_to_worlds, strict=True):
+            np.testing.assert_allclose(pose, recorded[photo.name][:3], atol=1e-5)
+        return pipeline
+
+    (away := tmp_path / "away").mkdir()
+    for name in ("photo_001.jpg", "photo_002.jpg", "photo_003.jpg"):
+        (data / "images" / name).rename(away / name)
+    pipeline = opened()
+    assert len(pipeline.datamanager.train_dataset) == len(trainer.pipeline.datamanager.train_dataset)
+    with pytest.raises(UserError, match="can't be evaluated without the photos"):
+        pipeline.evaluation.scored()
+    for path in away.iterdir():
+        path.rename(data / "images" / path.name)
+    assert "psnr" in opened().evaluation.scored()

@@ -453,7 +453,7 @@ def test_at_the_width_of_a_phone_everything_is_in_reach(browser, address):
 
 
 def test_a_page_of_other_people_is_not_replaced(scene, tmp_path):
-    for name in ("index.html", "scene.json", "page.css"):
+    for name in ("index.html", "scene.json", "page.css", "views.bin", "look0.bin", "vocabulary.json"):
         folder = tmp_path / name.partition(".")[0]
         folder.mkdir()
         (folder / name).write_text("mine")
@@ -462,6 +462,22 @@ def test_a_page_of_other_people_is_not_replaced(scene, tmp_path):
         assert [path.read_text() for path in folder.iterdir()] == ["mine"]
     for _ in range(2):  # the second over its own
         write_page(Page(scene), tmp_path / "own")
+
+
+def test_a_page_whose_writing_was_stopped_is_written_again(scene, tmp_path, monkeypatch):
+    written = []
+
+    def stop(path, content):
+        written.append(path)
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        path.write_bytes(content)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("lang3dxl_ns.query.web.write_page.write_atomically", stop)
+        with pytest.raises(KeyboardInterrupt):
+            write_page(Page(scene), tmp_path)
+    assert write_page(Page(scene), tmp_path) == sum(path.stat().st_size for path in tmp_path.iterdir())
 
 
 @pytest.mark.slow

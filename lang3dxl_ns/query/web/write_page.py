@@ -39,7 +39,9 @@ from lang3dxl_ns.query.web.pack import (
 )
 
 _HERE = Path(__file__).parent
-_FILES = [path for path in _HERE.iterdir() if path.suffix in (".html", ".css", ".js", ".txt")]
+_INDEX = _HERE / "index.html"
+# The index comes first: it marks the folder of a page whose writing was stopped as ours.
+_FILES = [_INDEX, *(path for path in _HERE.iterdir() if path.suffix in (".css", ".js", ".txt"))]
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _RULES = {
@@ -219,9 +221,10 @@ def write_page(page: Page, folder: Path) -> int:
     """Write a page's files into a folder for any static web server; return the number of bytes. Raises
     UserError for a folder that has files of these names and is not such a page."""
     make_folder(folder)
-    index, names = folder / "index.html", [*(path.name for path in _FILES), "scene.json"]
+    index, names = folder / _INDEX.name, {*(path.name for path in _FILES), "scene.json", "vocabulary.json"}
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
-    if not ours and (taken := [name for name in names if (folder / name).exists()]):
+    taken = sorted(path.name for path in folder.iterdir() if path.name in names or path.suffix == ".bin")
+    if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()
     for name, content in files.items():
