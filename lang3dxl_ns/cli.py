@@ -69,6 +69,10 @@ def main(arguments: list[str] | None = None) -> None:
     if words[:1] == ["--version"]:
         return print(version("lang3dxl-ns"))
     try:
+        os.getcwd()  # torch's libraries can't be loaded in a folder that is gone
+    except FileNotFoundError:
+        sys.exit("Error: the current folder was deleted: change to another one")
+    try:
         with _terminable():
             copy_context().run(_parsed(words).main)  # undoes the command's message settings
             if sys.stdout is not None:  # closed at the start

@@ -101,6 +101,19 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     assert b"Traceback" not in done.stderr and b"Exception ignored" not in done.stderr
 
 
+def test_a_folder_that_is_gone_is_named(tmp_path, monkeypatch):
+    (gone := tmp_path / "gone").mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(SystemExit, match="the current folder was deleted"):
+        cli.main(["info", str(tmp_path / "a.scene")])
+
+
+def test_a_closed_output_is_no_error(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    cli.main(["preset", "official"])
+
+
 def test_a_full_output_is_one_line():
     done = shell("preset > /dev/full")
     assert done.returncode == 1
