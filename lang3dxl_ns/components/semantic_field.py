@@ -127,6 +127,10 @@ class SemanticFieldConfig:
         settings = replace(PRESETS[name], **{k: v for k, v in given.items() if v is not None})
         if settings.hidden_layers < 1:
             raise UserError(f"hidden_layers is {settings.hidden_layers}: the decoder needs at least one")
+        if settings.min_resolution > settings.max_resolution:
+            raise UserError(
+                f"min_resolution {settings.min_resolution} is above max_resolution {settings.max_resolution}"
+            )
         if settings.levels == 0 and (settings.fourier_frequencies == 0 or settings.indexed):
             raise UserError("without levels the decoder sees Fourier features alone: set fourier_frequencies")
         most = MOST_DIMENSIONS - settings.indexed

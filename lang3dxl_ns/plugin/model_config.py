@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Literal
 
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -36,6 +37,21 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "ssim_lambda": (0, 1),
 }
 """Smallest and largest values of settings."""
+_OF_PARTS: dict[str, dict[str, tuple[float, float]]] = {
+    "semantic_field": {
+        **{"code_std": (0, 1e3), "coarse_to_fine": (0, 1), "fourier_frequencies": (0, 32)},
+        **{"levels": (0, 64), "features_per_level": (1, 256), "log2_table_size": (3, 30)},
+        **{"min_resolution": (3, 1e6), "max_resolution": (3, 1e6)},
+        **{"hidden_layers": (1, 64), "hidden_width": (1, 1e5)},
+    },
+    "downsampler": {"hidden": (0, 1e5), "logit_bound": (0.01, 1e4)},
+    "appearance": {"vector_dim": (1, 1e4)},
+    "decoder.compression": {
+        **{"steps": (1, 1e6), "batch": (1, 1e7), "sample": (1, 1e8)},
+        **{"code_rate": (0, 100), "field_rate": (0, 100)},
+    },
+}
+"""The same for the settings of components."""
 
 
 @without(*OF_SPLATFACTO)
@@ -118,6 +134,8 @@ class ModelSettings(SplatfactoModelConfig):
     def check(self) -> None:
         """Raise UserError if a setting is out of its range."""
         check_numbers(self, _BOUNDS, "--pipeline.model.")
+        for part, bounds in _OF_PARTS.items():
+            check_numbers(attrgetter(part)(self), bounds, f"--pipeline.model.{part.replace('_', '-')}.")
         smallest, largest = self.decode_size or (1, 1)
         if not 1 <= smallest <= largest <= 4096:
             raise UserError(
@@ -146,6 +164,7 @@ class ModelSettings(SplatfactoModelConfig):
             self.warm_up = START_OF_CODES
         if self.appearance.preset == "auto":
             self.appearance.preset = "coarse" if iterations < SHORT_FIELD_RUN else "paper"
+        self.semantic_field.resolved()  # a combination that is impossible is told before the work
         self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
         if self.densify_grad_thresh is None:
             self.densify_grad_thresh = log_linear(x, 2e-3, 2e-4)

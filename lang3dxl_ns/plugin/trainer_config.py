@@ -78,6 +78,9 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
         self.pipeline.model.check()
         check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
+        for name, group in self.optimizers.items():
+            option = f"--optimizers.{name.replace('_', '-')}.optimizer."
+            check_numbers(group["optimizer"], {"lr": (1e-12, 1e3)}, option)
         self.pipeline.datamanager.check()
         check_data(self.pipeline.datamanager.data or self.data)
         if self.is_viewer_enabled():

@@ -2,6 +2,7 @@
 
 import math
 from copy import deepcopy
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.methods import lang3dxl, run_config
+from lang3dxl_ns.methods import METHODS, lang3dxl, run_config
 from lang3dxl_ns.plugin.trainer import requested_checkpoint
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.question import QueryConfig
@@ -85,6 +86,40 @@ def test_settings_of_the_model(name, value, tmp_path):
     with pytest.raises(UserError, match=f"--pipeline.model.{name.replace('_', '-')} is "):
         config.set_timestamp()
     assert not config.output_dir.exists()
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "told"),
+    [
+        ("pipeline.model.semantic_field.hidden_width", 0, "semantic-field.hidden-width is 0"),
+        ("pipeline.model.semantic_field.levels", -1, "semantic-field.levels is -1"),
+        ("pipeline.model.semantic_field.coarse_to_fine", math.nan, "coarse-to-fine is nan"),
+        (
+            "pipeline.model.semantic_field.min_resolution",
+            5_000,
+            "min_resolution 5000 is above",
+        ),
+        ("pipeline.model.semantic_field.code_dim", 9, "code_dim is 9"),
+        ("pipeline.model.downsampler.logit_bound", 0.0, "downsampler.logit-bound is 0.0"),
+        ("pipeline.model.appearance.vector_dim", -1, "appearance.vector-dim is -1"),
+        ("pipeline.model.decoder.compression.sample", 0, "decoder.compression.sample is 0"),
+    ],
+)
+def test_settings_of_components(path, value, told, tmp_path):
+    config = deepcopy(METHODS["lang3dxl-paper"].config)
+    config.output_dir = tmp_path / "outputs"
+    owner, name = path.rsplit(".", 1)
+    setattr(attrgetter(owner)(config), name, value)
+    with pytest.raises(UserError, match=told):
+        config.set_timestamp()
+    assert not config.output_dir.exists()
+
+
+def test_a_learning_rate_below_zero(tmp_path):
+    config = deepcopy(lang3dxl.config)
+    config.optimizers["features_dc"]["optimizer"].lr = -1.0
+    with pytest.raises(UserError, match="features-dc.optimizer.lr is -1"):
+        config.set_timestamp()
 
 
 @pytest.mark.parametrize(

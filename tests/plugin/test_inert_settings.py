@@ -49,6 +49,7 @@ def test_the_help_does_not_offer_them(capsys):
         ("pipeline.model.codes_from", "photos"),
         ("pipeline.model.feature_gradient_to_geometry", True),
         ("pipeline.model.downsampler", DownsamplerConfig(hidden=8)),
+        ("pipeline.model.semantic_field.code_std", 0.1),
         ("pipeline.datamanager.regions", "felzenszwalb"),
     ],
 )
