@@ -99,8 +99,8 @@ def find_scene_file(path: str | Path | None = None) -> Path | None:
     if place.suffix == SUFFIX or place.is_file():
         return None if place.suffix == ".yml" else place
     folder = place if any(place.glob(f"*{SUFFIX}")) else find_config(path).parent
-    scenes = sorted(folder.glob(f"*{SUFFIX}"), key=lambda file: file.stat().st_mtime)
-    if len(scenes) > 1 and not (folder / "config.yml").exists():
+    scenes = sorted(folder.glob(f"*{SUFFIX}"))
+    if len(scenes) > 1:
         names = ", ".join(file.name for file in scenes[:5])
         raise UserError(f"{place} holds several scenes ({names}): name one of them")
     return scenes[-1] if scenes else None

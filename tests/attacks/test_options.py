@@ -118,7 +118,7 @@ def test_settings_of_components(path, value, told, tmp_path):
 def test_a_learning_rate_below_zero(tmp_path):
     config = deepcopy(lang3dxl.config)
     config.optimizers["features_dc"]["optimizer"].lr = -1.0
-    with pytest.raises(UserError, match="features-dc.optimizer.lr is -1"):
+    with pytest.raises(UserError, match=r"features-dc\.optimizer\.lr is -1"):
         config.set_timestamp()
 
 

@@ -5,6 +5,7 @@ import os
 import pytest
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.open_scene import existing_scene_file
 from lang3dxl_ns.query.run_file import SCENE_FILE, find_config
 
 
@@ -57,3 +58,14 @@ def test_folders_without_a_run_say_how_to_make_one(tmp_path, monkeypatch):
         find_config()
     with pytest.raises(UserError, match=r"holds no run.*ns-train"):
         find_config(tmp_path)
+
+
+def test_a_run_with_a_copy_of_its_scene_asks_which_is_meant(runs):
+    """A word must not be taught to the backup."""
+    scene, backup = runs[1].with_name("b.scene"), runs[1].with_name("backup.scene")
+    scene.touch()
+    assert existing_scene_file().samefile(scene)
+    backup.touch()
+    with pytest.raises(UserError, match=r"holds several scenes \(b.scene, backup.scene\): name one"):
+        existing_scene_file()
+    assert existing_scene_file(backup) == backup
