@@ -68,9 +68,6 @@ class PlaceField(Decoder):
     def set_output_statistics(self, mean: Float[Tensor, " out"], std: Float[Tensor, " out"]) -> None:
         self.field.set_output_statistics(mean, std)
 
-    def set_progress(self, fraction: float) -> None:
-        self.field.set_progress(fraction)
-
 
 def pixel_alignment_loss(clip: Float[Tensor, "h w c"], dense: Float[Tensor, "h w d"]) -> Float[Tensor, ""]:
     """Average how far CLIP and dense features differ in neighbor similarity; dense ones get no gradient."""

@@ -83,7 +83,7 @@ ROWS = (
     _decoder("paper", "as published: codes composited, then decoded"),
     Row("hash", "field", "hash grid alone", {f"{_FIELD}fourier_frequencies": 0}),
     Row("fourier", "field", "Fourier features alone",
-        {f"{_FIELD}levels": 0, f"{_FIELD}fourier_frequencies": 4, f"{_FIELD}coarse_to_fine": 0.0}),
+        {f"{_FIELD}levels": 0, f"{_FIELD}fourier_frequencies": 4}),
     Row("both", "field", "hash grid and Fourier features", {f"{_FIELD}fourier_frequencies": 4}),
     Row("field-paper", "field", "preset paper", {f"{_FIELD}preset": "paper"}),
     Row("field-official", "field", "preset official", {f"{_FIELD}preset": "official"}),

@@ -86,15 +86,14 @@ def decode_reference(field: SemanticField, leaves: Maps) -> Maps:
     s, codes = field.settings, leaves["codes"]
     sigmoid = s.bounding == "sigmoid"
     x = codes.sigmoid() if sigmoid else codes.clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT)
-    weights = None if field.level_weights is None else field.level_weights.double()
     table = leaves["grid.table"]
     if s.indexed:
         passes = math.ceil(CLIP / field.grid.output_dim)
         points = [torch.cat([torch.full_like(x[:, :1], k / passes), x], dim=1) for k in range(passes)]
-        values = torch.cat([interpolate_reference(field.grid, table, p, weights) for p in points], dim=1)
+        values = torch.cat([interpolate_reference(field.grid, table, p) for p in points], dim=1)
         values = values[:, :CLIP]
     else:
-        values = interpolate_reference(field.grid, table, x, weights)
+        values = interpolate_reference(field.grid, table, x)
     if s.fourier_frequencies:
         angles = torch.stack([2 * math.pi * 2**k * x for k in range(s.fourier_frequencies)], dim=2).flatten(1)
         values = torch.cat([x, angles.sin(), angles.cos(), values], dim=1)

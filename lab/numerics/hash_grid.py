@@ -116,10 +116,7 @@ def _problem(
 
 
 def interpolate_reference(
-    grid: HashGrid,
-    table: Float[Tensor, "entries f"],
-    x: Float[Tensor, "n d"],
-    level_weights: Float[Tensor, " levels"] | None = None,
+    grid: HashGrid, table: Float[Tensor, "entries f"], x: Float[Tensor, "n d"]
 ) -> Float[Tensor, "n out"]:
     """Interpolate a hash grid level by level and corner by corner; autograd gives the gradients."""
     x = x.clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT)
@@ -143,5 +140,4 @@ def interpolate_reference(
             features = features + weight[:, None] * table[offset + entry.remainder(capacity)]
         levels.append(features)
         offset += min(-(-(resolution**grid.input_dim) // 8) * 8, capacity)
-    stacked = torch.stack(levels, 1)
-    return (stacked if level_weights is None else stacked * level_weights[:, None]).flatten(1)
+    return torch.stack(levels, 1).flatten(1)

@@ -122,7 +122,6 @@ def fit(
         place = torch.rand(config.batch, generator=generator, dtype=torch.float64) * chances[-1]
         return torch.searchsorted(chances, place).clamp_max(len(chances) - 1)
 
-    field.set_progress(1.0)
     with torch.enable_grad():
         for step in range(config.steps):
             if step in searches and step:
@@ -297,7 +296,6 @@ class CompressedField(_LearningField):
         """Take over the weights and settings of another field, whose codes may have another length."""
         self.settings, self.code_dim = other.settings, other.code_dim
         self.grid, self.layers, self.output = other.grid, other.layers, other.output
-        self.level_weights = other.level_weights
         self.set_output_statistics(other.output_mean, other.output_std)
 
     def fit_codes(self, codes: Float[Tensor, "n code"]) -> None:

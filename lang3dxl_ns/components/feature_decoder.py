@@ -142,6 +142,3 @@ class Decoder(nn.Module, ABC):
             raise ValueError("output statistics must be finite and the deviations not negative")
         self.output_mean.copy_(mean)
         self.output_std.copy_(std)
-
-    def set_progress(self, fraction: float) -> None:
-        """Set the fraction of the run done (0 to 1)."""

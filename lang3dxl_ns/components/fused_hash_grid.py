@@ -33,20 +33,17 @@ class Lattices(NamedTuple):
 
 
 def interpolate(
-    x: Float[Tensor, "n d"],
-    table: Float[Tensor, "entries f"],
-    lattices: Lattices,
-    level_weights: Float[Tensor, " levels"],
+    x: Float[Tensor, "n d"], table: Float[Tensor, "entries f"], lattices: Lattices
 ) -> Float[Tensor, "n out"]:
     """Interpolate the features of points like `HashGrid.forward`; differentiable in points and table, which
     must be on the CPU and of one number type, float32 or float64."""
-    return _Interpolate.apply(x, table, lattices, level_weights)
+    return _Interpolate.apply(x, table, lattices)
 
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, table: Tensor, lattices: Lattices, level_weights: Tensor) -> Tensor:  # type: ignore[override]
-        ctx.arrays = [tensor.numpy() for tensor in (x, table, level_weights)]
+    def forward(ctx: Any, x: Tensor, table: Tensor, lattices: Lattices) -> Tensor:  # type: ignore[override]
+        ctx.arrays = x.numpy(), table.numpy()
         ctx.lattices = lattices
         features = x.new_empty(len(x), len(lattices.cells) * table.shape[1])
         shared = (*ctx.arrays, lattices, features.numpy())
@@ -56,7 +53,7 @@ class _Interpolate(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> Any:  # type: ignore[override]
-        x, table, _ = ctx.arrays
+        x, table = ctx.arrays
         grad, levels = upstream.contiguous().numpy(), len(ctx.lattices.cells)
         grad_table = np.zeros_like(table)
         # Each thread has a range of levels, so no two of them add to the same rows.
@@ -64,7 +61,7 @@ class _Interpolate(torch.autograd.Function):
         parts = in_threads(_gradients, [(*part, *shared) for part in ranges(levels)])
         grad_x = sum(parts) if parts else np.zeros_like(x)
         moved = torch.from_numpy(grad_x) if ctx.needs_input_grad[0] else None
-        return moved, torch.from_numpy(grad_table), None, None
+        return moved, torch.from_numpy(grad_table), None
 
 
 @numba.njit(forceinline=True)
@@ -98,15 +95,15 @@ def _look_up(point, level, lattices, entries, sides):
 
 
 @numba.njit(forceinline=True)
-def _weight(sides, corner, weight):
-    """Compute a corner's weight; `weight` is its level's."""
-    for axis in range(len(sides)):
+def _weight(sides, corner):
+    weight = sides[0, corner & 1]
+    for axis in range(1, len(sides)):
         weight *= sides[axis, corner >> axis & 1]
     return weight
 
 
 @kernel
-def _features(first, last, x, table, level_weights, lattices, features):
+def _features(first, last, x, table, lattices, features):
     dimensions, width = x.shape[1], table.shape[1]
     entries, sides = np.empty(1 << dimensions, np.int64), np.empty((dimensions, 2), x.dtype)
     for n in range(first, last):
@@ -118,14 +115,14 @@ def _features(first, last, x, table, level_weights, lattices, features):
             found = features[n, level * width : (level + 1) * width]
             found[:] = 0
             for corner in range(1 << dimensions):
-                weight = _weight(sides, corner, level_weights[level])
+                weight = _weight(sides, corner)
                 row = table[entries[corner]]
                 for f in range(width):
                     found[f] += weight * row[f]
 
 
 @kernel
-def _gradients(first, last, x, table, level_weights, lattices, grad, grad_table, of_points):
+def _gradients(first, last, x, table, lattices, grad, grad_table, of_points):
     """Add to the table's gradient, and return the part of the points' gradient that comes from these levels.
     The latter is two thirds of the work, and 0 unless `of_points`."""
     dimensions, width = x.shape[1], table.shape[1]
@@ -138,9 +135,9 @@ def _gradients(first, last, x, table, level_weights, lattices, grad, grad_table,
         for level in range(first, last):
             _look_up(x[n], level, lattices, entries, sides)
             above = grad[n, level * width : (level + 1) * width]
-            scale = level_weights[level] * x.dtype.type(lattices.cells[level])
+            scale = x.dtype.type(lattices.cells[level])
             for corner in range(1 << dimensions):
-                weight = _weight(sides, corner, level_weights[level])
+                weight = _weight(sides, corner)
                 row, grad_row = table[entries[corner]], grad_table[entries[corner]]
                 product = x.dtype.type(0)
                 for f in range(width):

@@ -91,12 +91,9 @@ class HashGrid(nn.Module):
         dense = torch.tensor(resolutions[: self.dense_levels], dtype=torch.int64)
         self.register_buffer("dense_resolutions", dense, persistent=False)
 
-    def forward(
-        self, x: Float[Tensor, "n d"], level_weights: Float[Tensor, " levels"] | None = None
-    ) -> Float[Tensor, "n out"]:
-        """Interpolate the features of every point; `level_weights` scales each level (see `coarse_to_fine`).
-        Features have the table's number type. Coordinates are computed in at least float32, because in 16
-        bits a fine level would have no fractions left."""
+    def forward(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n out"]:
+        """Interpolate the features of every point, in the table's number type. Coordinates are computed in at
+        least float32, because in 16 bits a fine level would have no fractions left."""
         if not self.levels:
             return x.new_zeros(len(x), 0)
         x = x.to(torch.promote_types(self.table.dtype, torch.float32)).clamp(
@@ -104,30 +101,21 @@ class HashGrid(nn.Module):
         )
         narrow = self.features_per_level <= _WIDEST_ROW_OF_KERNELS
         if narrow and takes_kernels(x, self.kernels) and x.dtype == self.table.dtype:
-            return self._interpolated_by_kernels(x, level_weights)
+            return self._interpolated_by_kernels(x)
         # Whole units are separate integers: far from 0, a float32 product has no digits left for a fraction.
         whole = x.detach().floor()
         position = (x.detach() - whole).T[:, None] * self.cells[:, None] + 0.5
         lower = position.floor()
         index = self._vertex_entries(lower.long() + whole.long().T[:, None] * self.cells[:, None])
-        return _Interpolate.apply(x, self.table, index, position - lower, self.cells, level_weights)
+        return _Interpolate.apply(x, self.table, index, position - lower, self.cells)
 
-    def _interpolated_by_kernels(
-        self, x: Float[Tensor, "n d"], level_weights: Float[Tensor, " levels"] | None
-    ) -> Float[Tensor, "n out"]:
+    def _interpolated_by_kernels(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n out"]:
         from lang3dxl_ns.components.fused_hash_grid import Lattices, interpolate  # numba is slow to import
 
         primes = torch.tensor(HASH_PRIMES[: self.input_dim])
         buffers = [values.numpy() for values in (self.cells, self.offsets, primes)]
         lattices = Lattices(buffers[0], buffers[1], self.dense_levels, self.hash_mask, buffers[2])
-        weights = x.new_ones(self.levels) if level_weights is None else level_weights.to(x)
-        return interpolate(x.contiguous(), self.table.contiguous(), lattices, weights.contiguous())
-
-    def coarse_to_fine(self, fraction: float) -> Float[Tensor, " levels"]:
-        """Compute level weights: at fraction 0 the coarsest level is open, at 1 all; the newest fades in."""
-        opened = 1 + min(max(fraction, 0.0), 1.0) * (self.levels - 1)
-        amount = (opened - torch.arange(self.levels, dtype=torch.float64)).clamp(0, 1)
-        return (0.5 - 0.5 * torch.cos(math.pi * amount)).to(self.table)
+        return interpolate(x.contiguous(), self.table.contiguous(), lattices)
 
     def _vertex_entries(self, lower: Int[Tensor, "d levels n"]) -> Int[Tensor, "corners levels n"]:
         """Compute the table rows of the corners of each point's cell; the last axis varies fastest. Any
@@ -155,19 +143,19 @@ class _Interpolate(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, x, table, index, fraction, cells, level_weights):
+    def forward(ctx, x, table, index, fraction, cells):
         # Points vary fastest in `index` and `fraction`, which suits elementwise work; corners do in bags.
         rows = _as_bags(index)
         axis_weights = torch.stack((1 - fraction, fraction), 1)
-        weights = _as_bags(_corner_weights(list(axis_weights), level_weights)).to(table.dtype)
-        ctx.save_for_backward(table, rows, weights, axis_weights, cells, level_weights)
+        weights = _as_bags(_corner_weights(list(axis_weights))).to(table.dtype)
+        ctx.save_for_backward(table, rows, weights, axis_weights, cells)
         features = F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
         return features.view(len(x), len(cells) * table.shape[1])
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):
-        table, rows, weights, axis_weights, cells, level_weights = ctx.saved_tensors
+        table, rows, weights, axis_weights, cells = ctx.saved_tensors
         grad_bags = grad.reshape(-1, table.shape[1])
         grad_x = grad_table = None
         if ctx.needs_input_grad[1]:
@@ -181,18 +169,16 @@ class _Interpolate(torch.autograd.Function):
             for axis in range(len(axis_weights)):
                 factors = list(axis_weights)
                 factors[axis] = torch.stack((-slope, slope))
-                slopes = _as_bags(_corner_weights(factors, level_weights)).to(table.dtype)
+                slopes = _as_bags(_corner_weights(factors)).to(table.dtype)
                 derivative = F.embedding_bag(rows, table, per_sample_weights=slopes, mode="sum")
                 derivatives.append((derivative * grad_bags).view(grad.shape).sum(1, dtype=slope.dtype))
             grad_x = torch.stack(derivatives, 1)
-        return grad_x, grad_table, None, None, None, None
+        return grad_x, grad_table, None, None, None
 
 
-def _corner_weights(
-    factors: list[Float[Tensor, "2 levels n"]], level_weights: Float[Tensor, " levels"] | None
-) -> Float[Tensor, "corners levels n"]:
+def _corner_weights(factors: list[Float[Tensor, "2 levels n"]]) -> Float[Tensor, "corners levels n"]:
     """Multiply the axes' weights for all corners of a cell, in the order of `_vertex_entries`."""
-    weights = factors[0] if level_weights is None else factors[0] * level_weights[:, None]
+    weights = factors[0]
     for factor in factors[1:]:
         weights = (weights[:, None] * factor).flatten(0, 1)
     return weights

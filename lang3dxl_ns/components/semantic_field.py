@@ -7,7 +7,7 @@ into CLIP features and, through the same hidden layers, dense (DINO) features.
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -39,7 +39,6 @@ class FieldSettings:
     log2_table_size: int = 15
     min_resolution: int = 16
     max_resolution: int = 512
-    coarse_to_fine: float = 1 / 3
     hidden_layers: int = 2
     hidden_width: int = 512
     activation: Literal["every", "last"] = "every"
@@ -51,14 +50,14 @@ _DEFAULT = FieldSettings()
 # size. Values that the paper does not give (range, initial codes, features per level) are safe choices.
 _PAPER = replace(
     _DEFAULT, indexed=True, features_per_level=8, log2_table_size=8, max_resolution=2048,
-    coarse_to_fine=0.0, hidden_layers=3, activation="last", whiten=False,
+    hidden_layers=3, activation="last", whiten=False,
 )  # fmt: skip
 PRESETS: dict[Preset, FieldSettings] = {
     "default": _DEFAULT,
     # A hash grid alone needs thousands of steps; Fourier features and a small grid learn within hundreds.
     "short": replace(
         _DEFAULT, fourier_frequencies=4, levels=8, features_per_level=4, log2_table_size=12,
-        max_resolution=256, coarse_to_fine=0.0, hidden_layers=1, hidden_width=64,
+        max_resolution=256, hidden_layers=1, hidden_width=64,
     ),
     "paper": _PAPER,
     # The values of the code that the authors released.
@@ -104,8 +103,6 @@ class SemanticFieldConfig:
     """Vertices per axis of the finest level. Presets keep it low, because Adam with epsilon 1e-15 moves every
     touched entry equally far: fine levels would grow as large as coarse ones, and neighboring codes would
     decode to unrelated features."""
-    coarse_to_fine: float | None = None
-    """Fraction of the run over which levels open, coarsest first; 0 opens all from the start."""
     hidden_layers: int | None = None
     """Number of hidden linear layers of the decoder."""
     hidden_width: int | None = None
@@ -115,6 +112,10 @@ class SemanticFieldConfig:
     whiten: bool | None = None
     """Output mean + deviation × network, with the targets' statistics, so that training starts at their mean.
     Otherwise the network's output is used as it is."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore settings from config.yml. Earlier versions could open levels one after another."""
+        self.__dict__.update({name: value for name, value in state.items() if name != "coarse_to_fine"})
 
     def resolved(self) -> FieldSettings:
         """Return all settings, with unset ones taken from the preset. Raises UserError if the preset is
@@ -170,10 +171,6 @@ class SemanticField(Decoder):
         self.layers = _hidden_layers(grid_dim + fourier_dim, s, generator)
         self.output = linear(s.hidden_width, clip_dim + dense_dim, generator)
 
-        self.level_weights: Tensor | None
-        # All levels are open until `set_progress` is called.
-        self.register_buffer("level_weights", torch.ones(s.levels) if s.coarse_to_fine > 0 else None)
-
     @property
     def bounded(self) -> bool:  # type: ignore[override]
         return self.settings.bounding == "sigmoid"
@@ -186,11 +183,6 @@ class SemanticField(Decoder):
         """Set the targets' statistics (see `Decoder.set_output_statistics`), which need `whiten`."""
         if self.settings.whiten:
             super().set_output_statistics(mean, std)
-
-    def set_progress(self, fraction: float) -> None:
-        """Open grid levels by the fraction of the run done (0 to 1); checkpoints contain them."""
-        if self.level_weights is not None:
-            self.level_weights.copy_(self.grid.coarse_to_fine(fraction / self.settings.coarse_to_fine))
 
     def forward(self, codes: Float[Tensor, "*batch code"]) -> Features:
         """Decode the CLIP and dense features of every code."""
@@ -228,12 +220,12 @@ class SemanticField(Decoder):
 
     def _read_grid(self, coordinates: Float[Tensor, "n code"]) -> Float[Tensor, "n channels"]:
         if not self.settings.indexed:
-            return self.grid(coordinates, self.level_weights)
+            return self.grid(coordinates)
         passes = math.ceil(self.clip_dim / self.grid.output_dim)
         index = torch.arange(passes, device=coordinates.device, dtype=coordinates.dtype) / passes
         index = index.expand(len(coordinates), -1)[..., None]
         points = torch.cat((index, coordinates[:, None].expand(-1, passes, -1)), 2)
-        features = self.grid(points.flatten(0, 1), self.level_weights)
+        features = self.grid(points.flatten(0, 1))
         return features.reshape(len(coordinates), passes * self.grid.output_dim)[:, : self.clip_dim]
 
     def _fourier(self, coordinates: Float[Tensor, "n code"]) -> Float[Tensor, "n features"]:

@@ -44,8 +44,7 @@ def check_inert(model: Any, data: Any) -> None:
     if model.decoder.learns_from_renderings:
         return
     changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")
-    unused = "code_std", "coarse_to_fine"
-    changed += _changed(model.semantic_field, unused, "--pipeline.model.semantic-field.")
+    changed += _changed(model.semantic_field, ("code_std",), "--pipeline.model.semantic-field.")
     if data.regions not in ("auto", "none"):
         changed.append("--pipeline.datamanager.regions")
     if changed:

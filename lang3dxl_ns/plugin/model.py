@@ -83,12 +83,6 @@ class Lang3DXLModel(RenderingModel):
 
     # ── training ────────────────────────────────────────────────────────────────────────────────────
 
-    def step_cb(self, optimizers, step: int) -> None:
-        """Tell the components the fraction of the run that is done; called before an iteration."""
-        super().step_cb(optimizers, step)
-        if self.semantic_field is not None:
-            self.semantic_field.set_progress(step / self.config.total_steps)
-
     def step_post_backward(self, step: int) -> None:
         """Finish an iteration: densify and prune (except at step 0, where the strategy would reset opacities,
         and after a skipped step), keep Gaussians in bounds, and write the sky's colors."""

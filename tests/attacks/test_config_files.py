@@ -151,6 +151,17 @@ def test_a_run_with_an_unknown_setting_does_not_open(copy):
         open_run(path)
 
 
+def test_a_run_with_a_setting_that_is_gone_still_opens(copy):
+    path, field = (
+        copy / "config.yml",
+        "!!python/object:lang3dxl_ns.components.semantic_field.SemanticFieldConfig\n",
+    )
+    text = path.read_text()
+    indent = " " * (len(text.split(field)[1]) - len(text.split(field)[1].lstrip()))
+    path.write_text(text.replace(field, f"{field}{indent}coarse_to_fine: null\n"))
+    assert not hasattr(open_run(path)[0].pipeline.model.semantic_field, "coarse_to_fine")
+
+
 def cuts(text: str) -> list[int]:
     """Places to truncate a config: after some lines, and inside others."""
     ends = [i for i, c in enumerate(text) if c == "\n"]

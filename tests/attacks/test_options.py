@@ -93,7 +93,7 @@ def test_settings_of_the_model(name, value, tmp_path):
     [
         ("pipeline.model.semantic_field.hidden_width", 0, "semantic-field.hidden-width is 0"),
         ("pipeline.model.semantic_field.levels", -1, "semantic-field.levels is -1"),
-        ("pipeline.model.semantic_field.coarse_to_fine", math.nan, "coarse-to-fine is nan"),
+        ("pipeline.model.semantic_field.code_std", math.nan, "code-std is nan"),
         (
             "pipeline.model.semantic_field.min_resolution",
             5_000,

@@ -52,10 +52,9 @@ def test_values_and_gradients_equal_the_reference(dim, spread):
 def test_gradients_equal_finite_differences(dim):
     grid = make_grid(dim, levels=3, highest=14)
     x = make_points(5, dim).requires_grad_()
-    level_weights = torch.tensor([1.0, 0.3, 0.6], dtype=torch.float64)
 
     def features(x, table):
-        return torch.func.functional_call(grid, {"table": table}, (x, level_weights))
+        return torch.func.functional_call(grid, {"table": table}, (x,))
 
     assert torch.autograd.gradcheck(features, (x, grid.table), eps=1e-7, fast_mode=True)
 
@@ -134,30 +133,6 @@ def test_no_points_give_no_features_and_no_gradient():
     features.sum().backward()
     assert features.shape == (0, grid.output_dim)
     assert not grid.table.grad.any()
-
-
-def test_levels_open_from_coarse_to_fine():
-    grid = make_grid(levels=4)
-    weights = torch.stack([grid.coarse_to_fine(step / 60) for step in range(-5, 70)])
-    assert weights[0].tolist() == [1, 0, 0, 0]
-    assert weights[-1].tolist() == [1, 1, 1, 1]
-    assert (weights[1:] >= weights[:-1]).all()
-    assert (weights[:, 1:] <= weights[:, :-1]).all()
-    assert (weights[1:] - weights[:-1]).max() < 0.1
-
-
-def test_a_closed_level_gives_zeros_and_gets_no_gradient():
-    grid = make_grid(levels=4, features=2)
-    x = make_points(30, 3)
-    features = grid(x, grid.coarse_to_fine(0.5))  # two levels open, the third half way, the fourth closed
-    features.sum().backward()
-    first_of_level = grid.offsets.tolist()
-    full = grid(x)
-    torch.testing.assert_close(features[:, :4], full[:, :4])
-    torch.testing.assert_close(features[:, 4:6], 0.5 * full[:, 4:6])
-    assert not features[:, 6:].any()
-    assert grid.table.grad[first_of_level[2] : first_of_level[3]].any()
-    assert not grid.table.grad[first_of_level[3] :].any()
 
 
 def test_initial_entries_are_small_and_follow_the_generator():

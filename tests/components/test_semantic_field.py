@@ -101,7 +101,6 @@ def test_without_a_dense_head_there_is_no_dense_output():
 @pytest.mark.parametrize("start", ["initial", "zero"])
 def test_codes_have_a_gradient_at_the_start_and_at_exactly_zero(name, start):
     field = make_field(name)
-    field.set_progress(0.0)
     torch.manual_seed(0)
     codes = torch.zeros(6, 3) if start == "zero" else field.initial_codes(6)
     codes.requires_grad_()
@@ -198,22 +197,10 @@ def test_unusable_statistics_are_refused():
             field.set_output_statistics(torch.full((10,), mean), torch.full((10,), std))
 
 
-def test_closed_levels_get_no_gradient_until_they_open():
-    field = make_field("default")
-    finest = field.grid.offsets[-1]
-    for progress, learns in [(0.0, False), (0.3, False), (1 / 3, True), (1.0, True)]:
-        field.zero_grad()
-        field.set_progress(progress)
-        field.decode_clip(make_codes(20, 3)).sum().backward()
-        assert field.grid.table.grad[finest:].any() == learns
-        assert field.grid.table.grad[: field.grid.offsets[1]].any()
-
-
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_restored_field_decodes_as_the_saved_one(name):
     field, codes = make_field(name), make_codes(9, 3)
     field.set_output_statistics(torch.rand(520), torch.rand(520))
-    field.set_progress(0.17)
     restored = make_field(name, seed=5)
     restored.load_state_dict(field.state_dict())
     for ours, theirs in zip(restored(codes), field(codes), strict=True):
@@ -257,7 +244,6 @@ def test_a_setting_wins_over_its_preset():
     assert SemanticFieldConfig("short", levels=5).resolved() == dataclasses.replace(
         PRESETS["short"], levels=5
     )
-    assert SemanticFieldConfig("default", coarse_to_fine=0.0).resolved().coarse_to_fine == 0.0
 
 
 def test_the_config_has_every_setting():
@@ -315,7 +301,6 @@ def test_fourier_features_alone_decode_and_teach_the_codes():
     codes = make_codes(5, 3).requires_grad_()
     field(codes)[0].square().sum().backward()
     assert codes.grad.abs().max() > 0
-    field.set_progress(0.5)
 
 
 def test_a_picture_has_three_channels_whatever_the_code():

@@ -129,9 +129,6 @@ def _is_small(field: SemanticField) -> bool:
 def _packed_field(field: SemanticField) -> tuple[dict[str, Any], dict[str, bytes]]:
     grid, settings, table = field.grid, field.settings, field.grid.table.detach()
     layers = [layer for layer in field.layers if isinstance(layer, torch.nn.Linear)]
-    if field.level_weights is not None:
-        sizes = torch.tensor([*grid.offsets.tolist(), grid.entries]).diff()
-        table = table * field.level_weights.cpu().repeat_interleave(sizes)[:, None].to(table)
     described = {
         "dimensions": settings.code_dim,
         "frequencies": settings.fourier_frequencies,
