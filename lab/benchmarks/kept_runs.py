@@ -64,9 +64,6 @@ def _train_and_keep(
     parser = config.pipeline.datamanager.dataparser
     assert isinstance(parser, PhotoCollectionDataParserConfig)
     parser.eval_mode = "all"
-    checkpoints = config.get_base_dir() / config.relative_model_dir
-    latest = max(checkpoints.glob("step-*.ckpt"), default=None)
-    config.load_dir = None if latest is None else checkpoints
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()

@@ -181,7 +181,7 @@ def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
 
 
 def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTrainerConfig:
-    """Build the configuration of a run."""
+    """Build the configuration of a run, which goes on where an earlier attempt in the folder was stopped."""
     from lang3dxl_ns.methods import run_config
 
     names = settings.clip, settings.dense, run.row.method
@@ -198,6 +198,9 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
     config.machine.seed = run.seed
     data.train_cameras_sampling_seed = run.seed
     apply_changes(config, run.row.changes)
+    checkpoints = config.get_base_dir() / config.relative_model_dir
+    if any(checkpoints.glob("step-*.ckpt")):
+        config.load_dir = checkpoints
     config.set_timestamp()
     return config
 
