@@ -41,7 +41,7 @@ _OF_PARTS: dict[str, dict[str, tuple[float, float]]] = {
     "semantic_field": {
         **{"code_std": (0, 1e3), "fourier_frequencies": (0, 32), "levels": (0, 64)},
         **{"features_per_level": (1, 256), "log2_table_size": (3, 30), "min_resolution": (3, 1e6)},
-        **{"max_resolution": (3, 1e6), "hidden_layers": (1, 64), "hidden_width": (1, 1e5)},
+        **{"max_resolution": (3, 1e6), "hidden_width": (1, 1e5)},
     },
     "downsampler": {"hidden": (0, 1e5), "logit_bound": (0.01, 1e4)},
     "appearance": {"vector_dim": (1, 1e4)},

@@ -515,10 +515,7 @@ class Scene:
             raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")
         listed = [examples] if isinstance(examples, Example) else list(examples)
         photos = [self.file.photo(example.photo) for example in listed]
-        listed = [
-            replace(example, photo=photo.name, size=photo.file_size)
-            for example, photo in zip(listed, photos, strict=True)
-        ]
+        listed = [replace(e, photo=p.name, size=p.file_size) for e, p in zip(listed, photos, strict=True)]
         pairs = zip(listed, photos, strict=True)
         weights = [Weights.of(example, photo, self.splats, self.backend) for example, photo in pairs]
         if selection is not None:

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import re
 import shutil
 import zipfile
 
@@ -152,13 +153,10 @@ def test_a_run_with_an_unknown_setting_does_not_open(copy):
 
 
 def test_a_run_with_a_setting_that_is_gone_still_opens(copy):
-    path, field = (
-        copy / "config.yml",
-        "!!python/object:lang3dxl_ns.components.semantic_field.SemanticFieldConfig\n",
-    )
-    text = path.read_text()
-    indent = " " * (len(text.split(field)[1]) - len(text.split(field)[1].lstrip()))
-    path.write_text(text.replace(field, f"{field}{indent}coarse_to_fine: null\n"))
+    path = copy / "config.yml"
+    text, known = path.read_text(), re.compile(r"^( +)code_std: ", re.MULTILINE)
+    assert known.search(text)
+    path.write_text(known.sub(r"\1coarse_to_fine: null\n\g<0>", text))
     assert not hasattr(open_run(path)[0].pipeline.model.semantic_field, "coarse_to_fine")
 
 

@@ -94,11 +94,7 @@ def test_settings_of_the_model(name, value, tmp_path):
         ("pipeline.model.semantic_field.hidden_width", 0, "semantic-field.hidden-width is 0"),
         ("pipeline.model.semantic_field.levels", -1, "semantic-field.levels is -1"),
         ("pipeline.model.semantic_field.code_std", math.nan, "code-std is nan"),
-        (
-            "pipeline.model.semantic_field.min_resolution",
-            5_000,
-            "min_resolution 5000 is above",
-        ),
+        ("pipeline.model.semantic_field.min_resolution", 5_000, "min_resolution 5000 is above"),
         ("pipeline.model.semantic_field.code_dim", 9, "code_dim is 9"),
         ("pipeline.model.downsampler.logit_bound", 0.0, "downsampler.logit-bound is 0.0"),
         ("pipeline.model.appearance.vector_dim", -1, "appearance.vector-dim is -1"),
