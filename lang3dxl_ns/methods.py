@@ -1,20 +1,18 @@
-"""Method registration for nerfstudio: `ns-train lang3dxl` and `lang3dxl-paper`, optimizers and schedules."""
+"""Method registration for nerfstudio: `ns-train lang3dxl` and `lang3dxl-paper`."""
 
 from __future__ import annotations
 
 import sys
 from copy import deepcopy
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import torch
 from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from lang3dxl_ns.common.settings_help import asked_for_all
-from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
+from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig, parameter_groups
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 from lang3dxl_ns.query.run_settings import check_command_line
@@ -26,32 +24,6 @@ DEVICE: Literal["cuda", "cpu"] = "cuda" if torch.cuda.is_available() else "cpu"
 EXTENT = 1.1
 """The published extent, 1.1 times the largest distance of a camera from the cameras' center. nerfstudio
 scales that distance to about 1."""
-
-
-def _optimizers() -> dict[str, dict]:
-    """Return the paper's parameter groups, with schedules in fractions of the run, and short-run rates."""
-    adam, schedule = RunAdamConfig, RunScheduleConfig
-    learned = partial(schedule, start=0.1, warm=0.05, end=0.01, power=2.0)
-    groups = {
-        "means": (adam(lr=1.6e-4, short_lr=6.4e-4), schedule(shape="log-linear", end=0.01)),
-        "features_dc": (adam(lr=2.5e-3, short_lr=7.5e-3), schedule(end=0.1, power=2.0)),
-        "features_rest": (adam(lr=2.5e-3 / 20), schedule(end=0.1, power=2.0)),
-        "opacities": (adam(lr=0.05), None),
-        "scales": (adam(lr=5e-3, short_lr=1.5e-2), None),
-        "quats": (adam(lr=1e-3, short_lr=5e-3), None),
-        "sky": (adam(lr=1e-3, short_lr=5e-3), schedule(end=0.1)),
-        "codes": (adam(lr=1e-3, short_lr=3e-2), schedule(end=0.05)),
-        "field_encoding": (adam(lr=5e-4, short_lr=1e-2), learned()),
-        "field_decoder": (adam(lr=5e-4, short_lr=1e-2, weight_decay=1e-5), learned()),
-        "downsampler": (adam(lr=5e-4, short_lr=5e-3, weight_decay=1e-5), learned()),
-        "appearance": (adam(lr=5e-4, short_lr=5e-3), schedule(start=0.1, warm=0.05, end=0.1)),
-        "appearance_vectors": (adam(lr=1e-3, short_lr=5e-3), schedule(end=0.1)),
-        "camera_opt": (
-            AdamOptimizerConfig(lr=1e-4, eps=1e-15),
-            schedule(shape="log-linear", end=5e-3),
-        ),
-    }
-    return {name: {"optimizer": rates, "scheduler": decay} for name, (rates, decay) in groups.items()}
 
 
 def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
@@ -66,7 +38,7 @@ def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
         steps_per_eval_image=500,
         steps_per_eval_all_images=0,
         pipeline=Lang3DXLPipelineConfig(),
-        optimizers=_optimizers(),
+        optimizers=parameter_groups(),
         logging=LoggingConfig(profiler="none"),  # the profiler's table would end every command's output
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
@@ -82,7 +54,6 @@ def _paper_config() -> Lang3DXLTrainerConfig:
     model, data, groups = config.pipeline.model, config.pipeline.datamanager, config.optimizers
     model.decoder.name = "paper"
     model.dense_weight = 0.5
-    model.dense_compare, model.mask_dense = "target", False
     model.feature_gradient_to_geometry, model.semantic_ramp = True, 15_000 * x
     model.densify_from, model.densify_until, model.densify_every = 2_000 * x, 15_000 * x, 2_000 * x
     model.densify_size_thresh = 0.2 * EXTENT

@@ -165,7 +165,7 @@ def test_every_decoder_trains(trained, name, monkeypatch):
     trained(2, pipeline__model__decoder__name=name, pipeline__model__densify_until=0.0)
 
 
-@pytest.mark.parametrize("preset", ["default", "official", "paper"])
+@pytest.mark.parametrize("preset", ["official", "paper"])
 def test_every_preset_of_the_field_trains(trained, preset):
     field = {"preset": preset, "log2_table_size": 12}  # half a million entries a level take seconds to save
     changes = {f"pipeline__model__semantic_field__{name}": value for name, value in field.items()}

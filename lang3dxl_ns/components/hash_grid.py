@@ -130,7 +130,7 @@ class HashGrid(nn.Module):
             stride = self.dense_resolutions[:, None] ** axis
             dense_entry = (dense_entry[:, None] + dense[axis] * stride).flatten(0, 1)
             hashed_entry = (hashed_entry[:, None] ^ keys[axis]).flatten(0, 1)
-        # 32 bits suffice for a row number, and halve the time of sorting in the backward pass.
+        # 32 bits suffice for a row number, and halve what is read.
         return (torch.cat((dense_entry, hashed_entry), 1) + self.offsets[:, None]).int()
 
 
@@ -159,10 +159,9 @@ class _Interpolate(torch.autograd.Function):
         grad_bags = grad.reshape(-1, table.shape[1])
         grad_x = grad_table = None
         if ctx.needs_input_grad[1]:
-            # A GPU adds atomically, since a single thread would sum a bag of thousands of samples of one
-            # coarse entry. On a CPU sorting into bags is up to three times faster than adding in place.
-            gather = _table_gradient_added if grad.is_cuda else _table_gradient_sorted
-            grad_table = gather(len(table), rows, weights, grad_bags)
+            grad_table = grad.new_zeros(len(table), grad_bags.shape[1])
+            for corner_rows, corner_weights in zip(rows.T, weights.T, strict=True):
+                grad_table.index_add_(0, corner_rows, grad_bags * corner_weights[:, None])
         if ctx.needs_input_grad[0]:
             slope = cells.to(axis_weights)[:, None].expand_as(axis_weights[0, 0])
             derivatives = []
@@ -187,28 +186,3 @@ def _corner_weights(factors: list[Float[Tensor, "2 levels n"]]) -> Float[Tensor,
 def _as_bags(per_corner: Tensor) -> Tensor:
     """Reorder [corners, levels, n] to contiguous [n · levels, corners]."""
     return per_corner.permute(2, 1, 0).reshape(-1, per_corner.shape[0])
-
-
-def _table_gradient_sorted(
-    entries: int, rows: Int[Tensor, "b c"], weights: Float[Tensor, "b c"], grad: Float[Tensor, "b f"]
-) -> Float[Tensor, "entries f"]:
-    """Sort the samples by table row, so that each row's gradient is one weighted bag of output gradients."""
-    order = rows.flatten().argsort()
-    counts = torch.bincount(rows.flatten(), minlength=entries)
-    return F.embedding_bag(
-        order // rows.shape[1],
-        grad,
-        counts.cumsum(0) - counts,
-        per_sample_weights=weights.flatten().index_select(0, order),
-        mode="sum",
-    )
-
-
-def _table_gradient_added(
-    entries: int, rows: Int[Tensor, "b c"], weights: Float[Tensor, "b c"], grad: Float[Tensor, "b f"]
-) -> Float[Tensor, "entries f"]:
-    """Add each corner's weighted output gradients to the table rows, in a device-dependent order."""
-    total = grad.new_zeros(entries, grad.shape[1])
-    for corner_rows, corner_weights in zip(rows.T, weights.T, strict=True):
-        total.index_add_(0, corner_rows, grad * corner_weights[:, None])
-    return total

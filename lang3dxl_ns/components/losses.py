@@ -7,7 +7,6 @@ empty mask gives zero with zero gradient.
 from __future__ import annotations
 
 import functools
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -53,23 +52,11 @@ def clip_loss(
 def dense_loss(
     prediction: Float[Tensor, "h w d"],
     target: Float[Tensor, "hd wd d"],
-    weight: Bool[Tensor, "hw ww"] | Float[Tensor, "hw ww"] | None = None,
-    compare_at: Literal["auto", "target"] = "auto",
 ) -> Float[Tensor, ""]:
-    """Compute the mean absolute difference between decoded dense features and their target, on one grid.
-
-    With `compare_at` "target", the prediction is resized to the target's grid, as in the published system.
-    "auto" resizes the target instead, which needs no gradient and costs a fraction, unless the target has
-    less than half as many cells as the prediction: then it would suppress detail that the target doesn't
-    show. The resize is bilinear and antialiased: it averages when shrinking, and keeps positions within a
-    tenth of a cell. The weight, of any size, is resized like the features.
-    """
-    at_prediction = compare_at == "auto" and prediction.numel() <= 2 * target.numel()
-    rows, columns, _ = (prediction if at_prediction else target).shape
-    grid = (rows, columns)
-    if weight is not None:
-        weight = resize(weight.to(prediction.dtype)[..., None], grid)[..., 0]
-    return _weighted_mean((resize(prediction, grid) - resize(target, grid)).abs(), weight)
+    """Compute the mean absolute difference between decoded dense features, resized to their target's grid,
+    and the target. As in the published system, it has no mask. The resize is bilinear and antialiased: it
+    averages when shrinking, and keeps positions within a tenth of a cell."""
+    return (resize(prediction, (target.shape[0], target.shape[1])) - target).abs().mean()
 
 
 @in_full_precision

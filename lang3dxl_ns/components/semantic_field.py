@@ -7,7 +7,7 @@ into CLIP features and, through the same hidden layers, dense (DINO) features.
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -20,44 +20,38 @@ from lang3dxl_ns.components.feature_decoder import Decoder, Features
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, MOST_DIMENSIONS, HashGrid
 from lang3dxl_ns.components.linear import linear
 
-Preset = Literal["default", "short", "paper", "official"]
+Preset = Literal["short", "paper", "official"]
 
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """Resolved settings of a semantic field (see `SemanticFieldConfig`); defaults are preset `default`."""
+    """Resolved settings of a semantic field (see `SemanticFieldConfig`); defaults are preset `paper`."""
 
-    # One lookup of 16 × 32 features replaces the method's four indexed passes of 16 × 8 in a fraction of the
-    # time. The table size is a compromise between capacity for a large scene and the optimizer's memory.
+    # Values as printed. The index coordinate is kept, not folded into a wider row, so the table has the
+    # printed size. Values that the paper does not give (range, initial codes, features per level) are safe
+    # choices.
     code_dim: int = 3
     code_std: float = 0.01
     bounding: Literal["sigmoid", "raw"] = "sigmoid"
     fourier_frequencies: int = 0
-    indexed: bool = False
+    indexed: bool = True
     levels: int = 16
-    features_per_level: int = 32
-    log2_table_size: int = 15
+    features_per_level: int = 8
+    log2_table_size: int = 8
     min_resolution: int = 16
-    max_resolution: int = 512
-    hidden_layers: int = 2
+    max_resolution: int = 2048
+    hidden_layers: int = 3
     hidden_width: int = 512
-    activation: Literal["every", "last"] = "every"
-    whiten: bool = True
+    activation: Literal["every", "last"] = "last"
+    whiten: bool = False
 
 
-_DEFAULT = FieldSettings()
-# Values as printed. The index coordinate is kept, not folded into a wider row, so the table has the printed
-# size. Values that the paper does not give (range, initial codes, features per level) are safe choices.
-_PAPER = replace(
-    _DEFAULT, indexed=True, features_per_level=8, log2_table_size=8, max_resolution=2048,
-    hidden_layers=3, activation="last", whiten=False,
-)  # fmt: skip
+_PAPER = FieldSettings()
 PRESETS: dict[Preset, FieldSettings] = {
-    "default": _DEFAULT,
     # A hash grid alone needs thousands of steps; Fourier features and a small grid learn within hundreds.
     "short": replace(
-        _DEFAULT, fourier_frequencies=4, levels=8, features_per_level=4, log2_table_size=12,
-        max_resolution=256, hidden_layers=1, hidden_width=64,
+        _PAPER, fourier_frequencies=4, indexed=False, levels=8, features_per_level=4, log2_table_size=12,
+        max_resolution=256, hidden_layers=1, hidden_width=64, activation="every", whiten=True,
     ),
     "paper": _PAPER,
     # The values of the code that the authors released.
@@ -73,10 +67,9 @@ class SemanticFieldConfig:
     """Settings of a semantic field: a preset, and values that override it."""
 
     preset: Preset | Literal["auto"] = "auto"
-    """Values of all unset options. `default`: for long GPU runs. `short`: for hundreds to a few thousand
-    steps. `paper`: as printed. `official`: as released by the authors. `auto`: `short` in runs of under 5,000
-    iterations; in longer ones `paper` with the paper's method, otherwise `default`, which also applies if
-    the length is unknown."""
+    """Values of all unset options. `short`: for hundreds to a few thousand steps, and for codes that are
+    learned after training. `paper`: as printed. `official`: as released by the authors. `auto`: `short` for
+    those and in runs of under 5,000 iterations, otherwise `paper`."""
     code_dim: int | None = None
     """Channels of the rendered code, 2 to 6 (2 to 5 with `indexed`). Each doubles the cost of a lookup."""
     code_std: float | None = None
@@ -113,15 +106,11 @@ class SemanticFieldConfig:
     """Output mean + deviation × network, with the targets' statistics, so that training starts at their mean.
     Otherwise the network's output is used as it is."""
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore settings from config.yml. Earlier versions could open levels one after another."""
-        self.__dict__.update({name: value for name, value in state.items() if name != "coarse_to_fine"})
-
     def resolved(self) -> FieldSettings:
         """Return all settings, with unset ones taken from the preset. Raises UserError if the preset is
         unknown, the code has too many or too few channels for the grid, or the decoder has no hidden layer or
         no input."""
-        name = "default" if self.preset == "auto" else self.preset
+        name = "paper" if self.preset == "auto" else self.preset
         if name not in PRESETS:
             raise UserError(f"unknown field preset {name!r}: choose one of auto, {', '.join(PRESETS)}")
         given = {field.name: getattr(self, field.name) for field in fields(FieldSettings)}

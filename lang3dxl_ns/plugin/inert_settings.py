@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.compression import CompressionConfig
+from lang3dxl_ns.plugin.optimizers import parameter_groups
 
 OF_SPLATFACTO = (
     *("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt"),
@@ -27,14 +31,16 @@ OF_COLMAP = (
 """Settings of nerfstudio's COLMAP reader; this package's reads points always, and depths never."""
 _OF_RENDERINGS = (
     *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up", "semantic_ramp"),
-    *("codes_from", "dense_compare", "mask_dense", "feature_gradient_to_geometry", "downsampler"),
+    *("codes_from", "feature_gradient_to_geometry", "downsampler"),
 )
 """Settings that matter only for semantics that are trained with the scene."""
+_GROUPS_OF_RENDERINGS = ("codes", "field_encoding", "field_decoder", "downsampler")
+"""Optimizer groups of such semantics."""
 
 
-def check_inert(model: Any, data: Any) -> None:
+def check_inert(model: Any, data: Any, optimizers: Mapping[str, Any] = MappingProxyType({})) -> None:
     """Raise UserError if a setting that has no effect in this run differs from its default. model, data:
-    settings of the model and of the data manager."""
+    settings of the model and of the data manager. optimizers: the parameter groups that may differ."""
     changed = [
         *_changed(model, OF_SPLATFACTO, "--pipeline.model."),
         *_changed(data, OF_IMAGE_CACHES, "--pipeline.datamanager."),
@@ -42,9 +48,20 @@ def check_inert(model: Any, data: Any) -> None:
     if changed:
         raise UserError(f"{changed[0]} has no effect here: no method of this package reads it; leave it off")
     if model.decoder.learns_from_renderings:
+        if model.codes_from == "noise" and model.decoder.compression != CompressionConfig():
+            raise UserError(
+                "--pipeline.model.decoder.compression has no effect on codes that start from noise: leave "
+                "it off, or pass --pipeline.model.codes-from photos"
+            )
         return
     changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")
     changed += _changed(model.semantic_field, ("code_std",), "--pipeline.model.semantic-field.")
+    default = parameter_groups()
+    changed += [
+        f"--optimizers.{name.replace('_', '-')}"
+        for name in _GROUPS_OF_RENDERINGS
+        if optimizers.get(name, default[name]) != default[name]
+    ]
     if data.regions not in ("auto", "none"):
         changed.append("--pipeline.datamanager.regions")
     if changed:

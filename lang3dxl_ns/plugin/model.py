@@ -171,8 +171,7 @@ class Lang3DXLModel(RenderingModel):
             difference = losses.clip_loss(predicted, target, None if small_mask is None else weight)
             loss = {"clip": ramp * c.clip_weight * difference}
             if dense is not None and "dense_target" in batch:
-                shown = small_mask if c.mask_dense else None
-                difference = losses.dense_loss(dense, batch["dense_target"], shown, c.dense_compare)
+                difference = losses.dense_loss(dense, batch["dense_target"])
                 loss["dense"] = ramp * c.dense_weight * difference
             if "regions" in batch:
                 labels = resize_nearest(batch["regions"], (clip.shape[0], clip.shape[1]))

@@ -80,11 +80,6 @@ class ModelSettings(SplatfactoModelConfig):
     decode_size: tuple[int, int] | None = None
     """Range of the longer side in pixels, inclusive, at which the code map is decoded; five sizes in it are
     used. None: 56 to 72 in short runs, growing to 80 to 120 (the paper's) in long ones."""
-    dense_compare: Literal["auto", "target"] = "auto"
-    """Grid on which dense features are compared. `target`: the target's, as published. `auto`: the
-    prediction's, which costs a fraction, unless the target is much coarser."""
-    mask_dense: bool = True
-    """Whether the dense loss leaves out the background, as the other losses do. The published one doesn't."""
     semantic_ramp: float = 0.5
     """Fraction of the run over which the weight of the CLIP and dense losses rises from 0.1 to 1."""
     warm_up: float = 0.0
@@ -149,8 +144,7 @@ class ModelSettings(SplatfactoModelConfig):
         if self.semantic_field.preset == "auto":
             # Compression is a direct regression and does not depend on the run's length.
             compressed = self.decoder.name == "gathered"
-            long = "paper" if self.decoder.name == "paper" else "default"
-            preset = "short" if compressed or iterations < SHORT_FIELD_RUN else long
+            preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "paper"
             self.semantic_field.preset = preset  # type: ignore[assignment]
             if self.decoder.name == "paper":
                 CONSOLE.log(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import torch
@@ -116,6 +117,32 @@ class RunSchedule(Scheduler):
         if c.shape == "log-linear":
             return log_linear(rest, 1.0, c.end)
         return cosine_decay(rest, 1.0, c.end, c.power)
+
+
+def parameter_groups() -> dict[str, dict]:
+    """Return the paper's parameter groups, with schedules in fractions of the run, and short-run rates."""
+    adam, schedule = RunAdamConfig, RunScheduleConfig
+    learned = partial(schedule, start=0.1, warm=0.05, end=0.01, power=2.0)
+    groups = {
+        "means": (adam(lr=1.6e-4, short_lr=6.4e-4), schedule(shape="log-linear", end=0.01)),
+        "features_dc": (adam(lr=2.5e-3, short_lr=7.5e-3), schedule(end=0.1, power=2.0)),
+        "features_rest": (adam(lr=2.5e-3 / 20), schedule(end=0.1, power=2.0)),
+        "opacities": (adam(lr=0.05), None),
+        "scales": (adam(lr=5e-3, short_lr=1.5e-2), None),
+        "quats": (adam(lr=1e-3, short_lr=5e-3), None),
+        "sky": (adam(lr=1e-3, short_lr=5e-3), schedule(end=0.1)),
+        "codes": (adam(lr=1e-3, short_lr=3e-2), schedule(end=0.05)),
+        "field_encoding": (adam(lr=5e-4, short_lr=1e-2), learned()),
+        "field_decoder": (adam(lr=5e-4, short_lr=1e-2, weight_decay=1e-5), learned()),
+        "downsampler": (adam(lr=5e-4, short_lr=5e-3, weight_decay=1e-5), learned()),
+        "appearance": (adam(lr=5e-4, short_lr=5e-3), schedule(start=0.1, warm=0.05, end=0.1)),
+        "appearance_vectors": (adam(lr=1e-3, short_lr=5e-3), schedule(end=0.1)),
+        "camera_opt": (
+            AdamOptimizerConfig(lr=1e-4, eps=1e-15),
+            schedule(shape="log-linear", end=5e-3),
+        ),
+    }
+    return {name: {"optimizer": rates, "scheduler": decay} for name, (rates, decay) in groups.items()}
 
 
 class GuardedOptimizers(Optimizers):

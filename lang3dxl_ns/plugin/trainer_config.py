@@ -86,7 +86,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         if self.is_viewer_enabled():
             check_address(self.viewer.websocket_host, self.viewer.websocket_port)
         if self.pipeline.datamanager.run is None:  # a run's config.yml contains resolved values
-            check_inert(self.pipeline.model, self.pipeline.datamanager)
+            check_inert(self.pipeline.model, self.pipeline.datamanager, self.optimizers)
         resumed, fresh = requested_checkpoint(self), self.timestamp == "{timestamp}"
         super().set_timestamp()
         self.fit_to_run()

@@ -26,7 +26,7 @@ from lang3dxl_ns.preparation.segmentation import (
     find_text_segmenter,
     is_sam3,
 )
-from lang3dxl_ns.preparation.settings import PreparationConfig, RegionLevel
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.companions import companion, named_folder
 from lang3dxl_ns.scene.photo import Photo
 
@@ -60,16 +60,14 @@ def region_source(config: PreparationConfig, data: Path, device: torch.device | 
     """Create the source that `config.regions` names; None for "none", or "auto" without a folder regions/. A
     folder is relative to `data`. Raises UserError if it does not exist, or a network can't be found or
     downloaded, or is no SAM 3 where prompts name the regions."""
-    choice, level = config.regions, config.region_level
+    choice = config.regions
     if choice == "none" or (choice == "auto" and not (data / "regions").is_dir()):
         return None
     if choice == "felzenszwalb":
         return FelzenszwalbRegions()
     if choice == "sam":
         files = find_sam(config.sam)
-        return MaskRegions(
-            lambda: AutomaticSam(files, device).masks, level, regions="sam", model=files.identity
-        )
+        return MaskRegions(lambda: AutomaticSam(files, device).masks, regions="sam", model=files.identity)
     if choice == "text":
         found = find_text_segmenter(config.foreground_model, config.sam)
         prompts = sorted(config.region_prompts)
@@ -78,7 +76,7 @@ def region_source(config: PreparationConfig, data: Path, device: torch.device | 
                 f"regions text needs a SAM 3, and {found.words.name} is none: {TEXT_OPTION} facebook/sam3"
             )
         load = partial(_masks_of_instances, found.words, prompts, device)
-        return MaskRegions(load, level, regions="text", prompts=prompts, model=found.identity)
+        return MaskRegions(load, regions="text", prompts=prompts, model=found.identity)
     return FolderRegions(data / "regions" if choice == "auto" else named_folder(choice, data, "regions"))
 
 
@@ -97,13 +95,13 @@ class FelzenszwalbRegions:
 
 
 class MaskRegions:
-    """Regions from a network's masks, which may overlap: a pixel of several gets the mask of `level`. `load`
-    loads the network, when the first photo needs it, and returns its masks' function; `made_with` are the
-    settings of the masks, the network's identity among them."""
+    """Regions from a network's masks, which may overlap: a pixel of several gets the smallest. `load` loads
+    the network, when the first photo needs it, and returns its masks' function; `made_with` are the settings
+    of the masks, the network's identity among them."""
 
-    def __init__(self, load: Callable[[], FindMasks], level: RegionLevel, **made_with: Any) -> None:
-        self._load, self._level = load, level
-        self._made_with = {**made_with, "level": level, "rule": _RULE}
+    def __init__(self, load: Callable[[], FindMasks], **made_with: Any) -> None:
+        self._load = load
+        self._made_with = {**made_with, "level": "small", "rule": _RULE}
 
     @cached_property
     def _masks(self) -> FindMasks:
@@ -118,7 +116,7 @@ class MaskRegions:
         small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
         size = label_size(*small.shape[:2])
         masks = [resize_nearest(mask, size) for mask in self._masks(small)]
-        return label_map(torch.stack(masks), self._level) if masks else torch.full(size, -1)
+        return label_map(torch.stack(masks)) if masks else torch.full(size, -1)
 
 
 def _masks_of_instances(files: ModelFiles, prompts: Sequence[str], device: torch.device | str) -> FindMasks:
@@ -147,15 +145,11 @@ class FolderRegions:
         return photo.undistort_labels(_numbered(_read_labels(path, photo.name)))
 
 
-def label_map(masks: Bool[Tensor, "n h w"], level: RegionLevel) -> Int[Tensor, "h w"]:
-    """Choose one label per pixel from overlapping masks: the smallest mask that contains it, the largest, or
-    the median by area; −1 outside all masks."""
+def label_map(masks: Bool[Tensor, "n h w"]) -> Int[Tensor, "h w"]:
+    """Choose one label per pixel from overlapping masks: the smallest mask that contains it, as in the paper;
+    −1 outside all masks."""
     masks = masks[masks.sum(dim=(1, 2)).argsort(stable=True)]
-    rank = masks.cumsum(dim=0, dtype=torch.int32)  # the smallest of a pixel's masks has rank 1
-    count = rank[-1]
-    wanted = {"small": torch.ones_like(count), "medium": (count + 1) // 2, "large": count}[level]
-    chosen = (masks & (rank == wanted)).to(torch.uint8).argmax(dim=0)
-    return torch.where(count > 0, chosen, -1)
+    return torch.where(masks.any(dim=0), masks.to(torch.uint8).argmax(dim=0), -1)
 
 
 def stored_labels(labels: Int[Tensor, "hl wl"]) -> Int[Tensor, "h w"]:

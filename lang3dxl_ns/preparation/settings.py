@@ -15,7 +15,6 @@ from lang3dxl_ns.common.errors import UserError
 ClipFeatures = Literal["auto", "crops", "dense"]
 DistanceRule = Literal["median", "mean", "mean-inner"]
 AngleRule = Literal["half", "paper", "exact"]
-RegionLevel = Literal["small", "medium", "large"]
 Quality = Literal["fast", "normal", "fine"]
 DENSE_MODEL = "facebook/dinov2-small"
 """Dense encoder for semantics that are trained with the scene."""
@@ -112,8 +111,6 @@ class PreparationConfig:
     or .npy, where negative is no region)."""
     region_prompts: tuple[str, ...] = ("window", "door", "tower", "roof", "column", "statue")
     """Prompts for regions "text": each instance of any of them is a region."""
-    region_level: RegionLevel = "small"
-    """Which of SAM's masks a pixel gets where they overlap: small (as in the paper), medium, or large."""
     sam: str = "facebook/sam-vit-base"
     """SAM for regions and for boxes: a name or a folder. The authors use facebook/sam-vit-huge, which is
     several times as slow; label maps are too small to show much difference."""

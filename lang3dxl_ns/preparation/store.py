@@ -86,7 +86,7 @@ class FeatureStore:
                 ) from error
             raise UserError(
                 f"{self.root} can't be written to ({error.strerror or error}): keep the targets elsewhere "
-                "with --pipeline.datamanager.cache-dir DIR (`lang3dxl prepare`: --cache-dir DIR)"
+                "with --pipeline.datamanager.cache-dir DIR"
             ) from error
 
     def read(self, kind: str, name: str) -> dict[str, Tensor]:

@@ -152,12 +152,23 @@ def test_a_run_with_an_unknown_setting_does_not_open(copy):
         open_run(path)
 
 
-def test_a_run_with_a_setting_that_is_gone_still_opens(copy):
+@pytest.mark.parametrize(
+    ("gone", "before"),
+    [
+        ("coarse_to_fine: null", "code_std"),
+        ("dense_compare: target", "ssim_lambda"),
+        ("mask_dense: false", "ssim_lambda"),
+        ("region_level: large", "sam"),
+    ],
+)
+def test_a_run_with_a_setting_that_is_gone_still_opens(copy, gone, before):
     path = copy / "config.yml"
-    text, known = path.read_text(), re.compile(r"^( +)code_std: ", re.MULTILINE)
-    assert known.search(text)
-    path.write_text(known.sub(r"\1coarse_to_fine: null\n\g<0>", text))
-    assert not hasattr(open_run(path)[0].pipeline.model.semantic_field, "coarse_to_fine")
+    text, known = path.read_text(), re.compile(rf"^( +){before}: ", re.MULTILINE)
+    assert len(known.findall(text)) == 1
+    path.write_text(known.sub(rf"\g<1>{gone}\n\g<0>", text))
+    pipeline = open_run(path)[0].pipeline
+    for settings in (pipeline.model, pipeline.model.semantic_field, pipeline.datamanager):
+        assert not hasattr(settings, gone.partition(":")[0])
 
 
 def cuts(text: str) -> list[int]:

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from lab.numerics.hash_grid import interpolate_reference
-from lang3dxl_ns.components import hash_grid
 from lang3dxl_ns.components.hash_grid import HASH_PRIMES, HashGrid
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -57,17 +56,6 @@ def test_gradients_equal_finite_differences(dim):
         return torch.func.functional_call(grid, {"table": table}, (x,))
 
     assert torch.autograd.gradcheck(features, (x, grid.table), eps=1e-7, fast_mode=True)
-
-
-def test_both_ways_to_gather_the_table_gradient_agree():
-    generator = torch.Generator().manual_seed(0)
-    rows = torch.randint(50, (300, 8), generator=generator, dtype=torch.int32)
-    weights = torch.rand(300, 8, generator=generator, dtype=torch.float64)
-    grad = torch.rand(300, 4, generator=generator, dtype=torch.float64)
-    torch.testing.assert_close(
-        hash_grid._table_gradient_sorted(60, rows, weights, grad),
-        hash_grid._table_gradient_added(60, rows, weights, grad),
-    )
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 0.5, 0.25])

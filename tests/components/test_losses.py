@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 from pytorch_msssim import SSIM
 
+from lang3dxl_ns.common.image import resize
 from lang3dxl_ns.components.losses import clip_loss, dense_loss, region_variance_loss, rgb_loss
 
 
@@ -87,8 +88,6 @@ def test_images_below_the_ssim_window_have_a_finite_loss_and_gradient(size):
     [
         lambda x: rgb_loss(x, torch.ones_like(x), torch.zeros(12, 14)),
         lambda x: clip_loss(x, torch.ones_like(x), torch.zeros(12, 14)),
-        lambda x: dense_loss(x, torch.ones(6, 7, 3), torch.zeros(6, 7)),
-        lambda x: dense_loss(x, torch.ones(20, 20, 3), torch.zeros(20, 20)),
         lambda x: region_variance_loss(x, torch.zeros(12, 14, dtype=torch.long), torch.zeros(12, 14)),
         lambda x: region_variance_loss(x, torch.full((12, 14), -1)),
     ],
@@ -115,55 +114,34 @@ def test_clip_loss_is_a_weighted_mean_over_cells_and_channels():
     torch.testing.assert_close(clip_loss(a, b, mask), by_cell[mask].mean())
 
 
-@pytest.mark.parametrize("compare_at", ["auto", "target"])
 @pytest.mark.parametrize(("size", "grid"), [((12, 16), (24, 24)), ((20, 30), (9, 9)), ((7, 9), (7, 9))])
-def test_dense_loss_keeps_a_ramp_within_a_tenth_of_a_cell_on_any_two_grids(size, grid, compare_at):
-    """Away from the border, where a resize lacks neighbors."""
+def test_dense_loss_keeps_positions_within_a_tenth_of_a_cell_on_any_two_grids(size, grid):
+    """A wave that is flat at the border has there what a resize extends it by."""
 
-    def ramp(n, m):
-        return ((torch.arange(m, dtype=torch.float64) + 0.5) / m).expand(n, m)[..., None]
+    def wave(n, m):
+        return torch.cos(torch.pi * (torch.arange(m, dtype=torch.float64) + 0.5) / m).expand(n, m)[..., None]
 
-    weight = torch.zeros(grid, dtype=torch.float64)
-    weight[:, grid[1] // 3 : -(grid[1] // 3)] = 1
-    assert dense_loss(ramp(*size), ramp(*grid), weight, compare_at).item() < 0.1 / max(size + grid)
-    shifted = dense_loss(ramp(*size) + 0.25, ramp(*grid), None, compare_at)
-    assert shifted.item() == pytest.approx(0.25, abs=1e-6)
+    mean_slope, cell = 2, 1 / min(size[1], grid[1])
+    assert dense_loss(wave(*size), wave(*grid)).item() < 0.1 * cell * mean_slope
+    shifted = dense_loss(wave(*size) + 2, wave(*grid))
+    assert shifted.item() == pytest.approx(2, abs=1e-6)
 
 
-def test_dense_loss_at_the_target_is_the_published_resize_for_a_finer_target():
+def test_dense_loss_is_the_published_resize_for_a_finer_target():
     prediction, target = seeded(9, 12, 4), seeded(16, 16, 4, seed=1)
     resized = F.interpolate(prediction.permute(2, 0, 1)[None], (16, 16), mode="bilinear", align_corners=False)
     expected = F.l1_loss(resized[0].permute(1, 2, 0), target)
-    torch.testing.assert_close(dense_loss(prediction, target, compare_at="target"), expected)
+    torch.testing.assert_close(dense_loss(prediction, target), expected)
 
 
-def test_dense_loss_resizes_the_target_unless_that_would_blur_the_prediction():
-    prediction = seeded(16, 16, 2).requires_grad_()
-    same_as_target = dense_loss(prediction, seeded(4, 4, 2), compare_at="target")
-    torch.testing.assert_close(dense_loss(prediction, seeded(4, 4, 2)), same_as_target)
-    dense_loss(
-        prediction, seeded(13, 13, 2, seed=1)
-    ).backward()  # every pixel is compared with its own target
-    torch.testing.assert_close(prediction.grad.abs(), torch.full_like(prediction, 1 / prediction.numel()))
-
-
-def test_dense_weights_choose_cells_of_the_target():
-    prediction, target = torch.zeros(6, 6, 2), torch.zeros(12, 12, 2)
-    target[:, 6:] = 1
-    weight = torch.zeros(12, 12, dtype=torch.bool)
-    weight[:, 9:] = True
-    assert dense_loss(prediction, target, weight).item() == pytest.approx(1)
-    assert dense_loss(prediction, target, ~weight).item() < 0.5
-    assert dense_loss(prediction, target, weight, "target").item() == pytest.approx(1)
-
-
-def test_dense_weights_may_have_the_size_of_the_prediction():
-    prediction, target = torch.zeros(10, 14, 2), torch.zeros(12, 12, 2)
-    target[:, 8:] = 1
-    mask = torch.zeros(10, 14, dtype=torch.bool)
-    mask[:, 12:] = True
-    assert dense_loss(prediction, target, mask).item() == pytest.approx(1)
-    assert dense_loss(prediction, target, mask, "target").item() == pytest.approx(1)
+def test_dense_loss_averages_a_finer_prediction():
+    prediction, target = seeded(16, 16, 2), seeded(4, 4, 2, seed=1)
+    checkered = prediction + (torch.arange(16)[:, None, None] % 2 - 0.5)
+    inner = slice(1, -1)  # at the border an average has fewer rows
+    resized = [resize(values, (4, 4))[inner] for values in (prediction, checkered)]
+    torch.testing.assert_close(*resized)
+    expected = (resize(prediction, (4, 4)) - target).abs().mean()
+    torch.testing.assert_close(dense_loss(prediction, target), expected)
 
 
 # ------------------------------------------------------------------ regions
@@ -216,6 +194,6 @@ def test_losses_keep_the_type_of_the_prediction():
     for dtype in (torch.float32, torch.float64):
         a, b = seeded(12, 14, 3, dtype=dtype), seeded(12, 14, 3, seed=1, dtype=dtype)
         mask = torch.ones(12, 14, dtype=torch.bool)
-        losses = [rgb_loss(a, b, mask), clip_loss(a, b, mask), dense_loss(a, b, mask)]
+        losses = [rgb_loss(a, b, mask), clip_loss(a, b, mask), dense_loss(a, b)]
         losses.append(region_variance_loss(a, mask.long(), mask))
         assert {loss.dtype for loss in losses} == {dtype}

@@ -11,7 +11,6 @@ from lang3dxl_ns.components.semantic_field import PRESETS, FieldSettings, Semant
 
 # Every preset, at a size affordable in a test.
 CONFIGS = {
-    "default": {"preset": "default", "log2_table_size": 10, "hidden_width": 32},
     "short": {"preset": "short"},
     "paper": {"preset": "paper", "hidden_width": 32},
     "official": {"preset": "official", "log2_table_size": 12, "hidden_width": 32},
@@ -50,12 +49,6 @@ def test_paper_preset_has_the_printed_size():
     assert decoder == 3 * (512 * 512 + 512) + 512 * 896 + 896
     kinds = [type(layer).__name__ for layer in field.layers]
     assert kinds == ["Linear", "Linear", "Linear", "ReLU"]
-
-
-def test_default_preset_reads_as_many_channels_as_the_official_one():
-    field, _ = parameters_on_paper("default")
-    assert field.layers[0].in_features == parameters_on_paper("official")[0].layers[0].in_features == 512
-    assert [type(layer).__name__ for layer in field.layers] == ["Linear", "ReLU", "Linear", "ReLU"]
 
 
 def test_short_preset_puts_fourier_features_beside_eight_levels():
@@ -233,7 +226,7 @@ def test_one_seed_gives_one_field_and_leaves_the_global_generator_alone():
 
 def test_initial_codes_are_small_noise_and_exact_zeros_for_the_official_preset():
     torch.manual_seed(0)
-    codes = make_field("default").initial_codes(4000)
+    codes = make_field("paper").initial_codes(4000)
     assert codes.shape == (4000, 3)
     assert abs(codes.std().item() - 0.01) < 5e-4
     assert abs(codes.mean().item()) < 5e-4
@@ -252,7 +245,7 @@ def test_the_config_has_every_setting():
 
 
 def test_wrong_settings_are_explained():
-    with pytest.raises(UserError, match="choose one of auto, default, short, paper, official"):
+    with pytest.raises(UserError, match="choose one of auto, short, paper, official"):
         SemanticFieldConfig("large").resolved()
     with pytest.raises(UserError, match="2 to 5"):
         SemanticFieldConfig("official", code_dim=6).resolved()

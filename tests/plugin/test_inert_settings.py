@@ -74,3 +74,24 @@ def test_an_unknown_decoder_is_refused_with_the_names_there_are():
     config = changed("pipeline.model.decoder.name", "fancy")
     with pytest.raises(UserError, match="unknown feature decoder 'fancy': choose one of gathered, paper"):
         check_inert(config.pipeline.model, config.pipeline.datamanager)
+
+
+def test_rates_of_semantics_that_are_trained_with_the_scene_are_an_error_without_them(tmp_path):
+    config = deepcopy(lang3dxl.config)
+    config.output_dir, config.optimizers["codes"]["optimizer"].lr = tmp_path, 0.5
+    with pytest.raises(UserError, match=r"--optimizers\.codes has no effect"):
+        config.set_timestamp()
+    config.pipeline.model.decoder.name = "paper"
+    check_inert(config.pipeline.model, config.pipeline.datamanager, config.optimizers)
+    others = deepcopy(lang3dxl.config)
+    others.optimizers["means"]["optimizer"].lr = 0.5
+    check_inert(others.pipeline.model, others.pipeline.datamanager, others.optimizers)
+
+
+def test_compression_is_an_error_for_codes_that_start_from_noise():
+    config = changed("pipeline.model.decoder.name", "paper")
+    config.pipeline.model.decoder.compression.steps = 7
+    with pytest.raises(UserError, match=r"decoder\.compression has no effect on codes that start from noise"):
+        check_inert(config.pipeline.model, config.pipeline.datamanager)
+    config.pipeline.model.codes_from = "photos"
+    check_inert(config.pipeline.model, config.pipeline.datamanager)

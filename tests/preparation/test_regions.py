@@ -38,25 +38,20 @@ def disc(radius, size=64):
 # ------------------------------------------------------------------ from masks that overlap
 
 
-def test_nested_masks_give_the_smallest_the_middle_or_the_largest():
+def test_nested_masks_give_the_smallest():
     discs = torch.stack([disc(20), disc(5), disc(30), disc(10)])
     by_size = [1, 3, 0, 2]  # positions of the masks, smallest first
-    found = {level: label_map(discs, level) for level in ("small", "medium", "large")}
-    for level, labels in found.items():
-        assert torch.equal(labels >= 0, discs.any(dim=0))
-        for row in range(64):
-            inside = [rank for rank, mask in enumerate(by_size) if discs[mask, row, 32]]
-            middle = len(inside) and inside[(len(inside) - 1) // 2]
-            expected = {"small": inside[:1], "medium": [middle], "large": inside[-1:]}[level]
-            assert int(labels[row, 32]) == (expected[0] if inside else -1)
-    assert not torch.equal(found["small"], found["large"])
+    labels = label_map(discs)
+    assert torch.equal(labels >= 0, discs.any(dim=0))
+    for row in range(64):
+        inside = [rank for rank, mask in enumerate(by_size) if discs[mask, row, 32]]
+        assert int(labels[row, 32]) == (inside[0] if inside else -1)
 
 
 def test_the_order_of_masks_does_not_matter():
     masks = torch.rand(7, 20, 30, generator=torch.manual_seed(0)) > torch.linspace(0.2, 0.9, 7)[:, None, None]
     shuffled = masks[torch.randperm(7, generator=torch.manual_seed(1))]
-    for level in ("small", "medium", "large"):
-        assert torch.equal(label_map(masks, level), label_map(shuffled, level))
+    assert torch.equal(label_map(masks), label_map(shuffled))
 
 
 # ------------------------------------------------------------------ as stored
@@ -109,21 +104,15 @@ def test_sam_labels_are_made_of_its_masks(sam, monkeypatch):
     source = region_source(PreparationConfig(regions="sam", sam=sam), PHOTO.path, "cpu")
     assert isinstance(source, MaskRegions)
     masks = torch.stack(source._masks((image * 255).round().byte()))
-    assert torch.equal(source.labels(PHOTO, image), label_map(masks, "small"))
+    assert torch.equal(source.labels(PHOTO, image), label_map(masks))
     assert source.labels(PHOTO, torch.rand(300, 512, 3)).shape == (150, 256)
     monkeypatch.setitem(segmentation._AUTOMATIC, "pred_iou_thresh", 1e9)
     assert torch.equal(source.labels(PHOTO, image), torch.full((60, 90), -1))
 
 
 def test_sam_settings_name_weights_and_level(sam):
-    small, large = (
-        region_source(PreparationConfig(regions="sam", sam=sam, region_level=level), None, "cpu").settings(
-            PHOTO
-        )
-        for level in ("small", "large")
-    )
-    assert small != large
-    assert small["model"] == large["model"]
+    settings = region_source(PreparationConfig(regions="sam", sam=sam), None, "cpu").settings(PHOTO)
+    assert settings["level"] == "small" and settings["model"]
 
 
 # ------------------------------------------------------------------ from a folder
