@@ -9,6 +9,7 @@ from typing import Literal
 import tyro
 
 from lang3dxl_ns.common.checks import check_numbers
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.settings import PreparationConfig
 
 Up = Literal["auto", "x", "-x", "y", "-y", "z", "-z"]
@@ -31,3 +32,5 @@ class AttachConfig(PreparationConfig):
         """Raise UserError if a setting is invalid."""
         super().check()
         check_numbers(self, {"views": (4, 10_000)})
+        if self.crops == "pyramid" or self.regions not in ("auto", "none"):
+            raise UserError("attach learns from fine crops alone: leave --crops and --regions off")

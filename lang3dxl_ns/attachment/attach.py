@@ -26,6 +26,7 @@ from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import Provenance, check_scene_name, replace_scene
+from lang3dxl_ns.query.text import taught_prompt
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.photo_folder import check_data
 
@@ -60,6 +61,8 @@ def attach(
         UserError: the splat or the photos cannot be read, or the photos do not show the splat.
     """
     config, place = config or AttachConfig(), None if out is None else expanded(out).absolute()
+    for word in config.segment:
+        taught_prompt(word)  # fail before the work
     if place is not None:
         check_scene_name(place)
     elif data is None:
@@ -99,7 +102,10 @@ def attach(
         cache = expanded(config.cache_dir or collection.folder / "lang3dxl_cache")
         collection, targets = prepare_photos(collection, preparation, cache, worker)
     tracked = collection.reconstruction.photos
-    cameras = {photo.name: camera_in(similarity, tracked[photo.name]) for photo in collection.photos}
+    cameras = {
+        photo.name: camera_in(similarity, tracked[photo.name].resized(photo.width, photo.height))
+        for photo in collection.photos
+    }
     with stages.stage("learn"):
         decoder, codes = learn(splats, collection, cameras, targets)
     seen = float(codes.isfinite().all(1).float().mean())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, registered_frames
 from lang3dxl_ns.common.console import progress, tracked
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes
 from lang3dxl_ns.rendering import Splats, rasterize, render
@@ -141,14 +143,23 @@ class _Compared:
 
 
 def _compared(collection: PhotoCollection, count: int, side: int) -> list[_Compared]:
-    """Read some photos, evenly spread from the first to the last, at a longer side of `side` pixels."""
-    found, last = [], len(collection.photos) - 1
+    """Read some photos, evenly spread from the first to the last, at a longer side of `side` pixels, without
+    those that are damaged, and without damaged masks. Raises UserError if all are."""
+    found, last, trouble = list[_Compared](), len(collection.photos) - 1, None
     for i in np.linspace(0, last, min(count, last + 1)).round().astype(int):
         photo = collection.photos[i].at_most(side)
-        gray, mask = photo.read().mean(-1), photo.read_mask()
+        try:
+            gray, mask = photo.read().mean(-1), None
+        except UserError as error:
+            trouble = error
+            continue
+        with suppress(UserError):
+            mask = photo.read_mask()
         tracked = collection.reconstruction.photos[photo.name].resized(photo.width, photo.height)
         mask = torch.ones_like(gray, dtype=torch.bool) if mask is None else mask
         found.append(_Compared(tracked, gray, mask))
+    if trouble is not None and not found:
+        raise trouble
     return found
 
 

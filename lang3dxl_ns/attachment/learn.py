@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
@@ -44,7 +45,8 @@ def prepare_photos(
 ) -> tuple[PhotoCollection, TargetReader]:
     """Prepare the photos' foreground and targets with `settled` settings, in the folder `cache`, where
     training also finds them. Photos that cannot be read are left out."""
-    masked = with_foreground(collection.photos, config, collection.folder, cache, device, say)
+    photos = [photo.at_most(config.longer_side) for photo in collection.photos]
+    masked = with_foreground(photos, config, collection.folder, cache, device, say)
     plan, names = plan_crops(masked, collection.reconstruction, config), [photo.name for photo in masked]
     say(*plan.reasons)
     reader = prepare(masked, plan.pixel_sizes, config, plan.scales, FeatureStore(cache), device, fine=names)
@@ -56,7 +58,7 @@ def learn(
     splats: Splats, collection: PhotoCollection, cameras: Mapping[str, Camera], targets: TargetReader
 ) -> tuple[Decoder, Float[Tensor, "n code"]]:
     """Learn a decoder and the Gaussians' codes, which are NaN for Gaussians that no photo shows, on the
-    splat's device. `cameras` holds the photos' cameras, at the files' resolution, in the splat's frame."""
+    splat's device. `cameras` holds the photos' cameras in the splat's frame."""
     field = SemanticFieldConfig(preset="short")
     decoder = make_decoder(DecoderConfig(), field, targets.clip_dim, 0)
     decoder = decoder.to(splats.means.device)
@@ -74,13 +76,13 @@ def _views(
     for photo in photos:
         camera = resized(cameras[photo.name], LONGER_SIDE)
         dense = targets.dense(photo.name)
-        mask = photo.read_mask(camera.width / photo.width)
+        size, mask = (camera.height, camera.width), photo.read_mask()
         yield TargetView(
             partial(composite, splats, camera),
-            (camera.height, camera.width),
+            size,
             targets.clip(photo.name).features.to(place),
             None if dense is None else dense.to(place),
-            None if mask is None else mask.to(place.device),
+            None if mask is None else resize_nearest(mask, size).to(place.device),
         )
 
 

@@ -135,7 +135,8 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCol
     """Render this many pictures of a splat as a photo collection, in the splat's frame. They are kept in
     `folder`, and rendered again only for another splat or other settings. Raises UserError if no view shows
     the splat well."""
-    stamp = fingerprint(vars(splats.gaussians) | {"harmonics": splats.harmonics}, [_RULE, count, up])
+    how = [_RULE, count, up, splats.antialiased]
+    stamp = fingerprint(vars(splats.gaussians) | {"harmonics": splats.harmonics}, how)
     kept = _kept(folder, stamp)
     cameras = kept or choose_views(splats, Extent.of(splats, up), count)
     background = splats.means.new_tensor(BACKGROUND)

@@ -124,5 +124,6 @@ def near_cameras(
     means: Float[Tensor, "n 3"], cameras: Float[Tensor, "p 3"], distance: float
 ) -> Bool[Tensor, " n"]:
     """Return which positions lie within a distance of any of the cameras, all in world units."""
-    cameras = cameras.to(means)
-    return torch.cat([torch.cdist(some, cameras).amin(1) < distance for some in means.split(_ROWS)])
+    middle = cameras.to(means).mean(0)  # far from the origin, distances by matrix products are inexact
+    cameras = cameras.to(means) - middle
+    return torch.cat([torch.cdist(some - middle, cameras).amin(1) < distance for some in means.split(_ROWS)])

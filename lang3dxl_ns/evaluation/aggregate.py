@@ -93,7 +93,8 @@ def pool(scenes: Mapping[str, Sequence[Figures]]) -> dict[str, dict[str, Any]]:
     `map` is the mean of those over categories. `per_scene` has the `average` of each scene."""
     per_scene = {name: average(photos) for name, photos in scenes.items()}
     values = _by_name(per_scene.values())
-    means = {name: float(np.mean(v)) for name, v in values.items() if not name.endswith("_photos")}
+    counts = {f"{name}_photos" for name in values}
+    means = {name: float(np.mean(v)) for name, v in values.items() if name not in counts}
     means |= _mean_average_precisions(means)
     everything = [photo for photos in scenes.values() for photo in photos]
     return {"image_pooled": average(everything), "scene_mean": means, "per_scene": per_scene}
@@ -160,5 +161,6 @@ def pooled_table(pooled: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _categories(results: Mapping[str, Any]) -> list[str]:
-    counts = (name for name in results if name.startswith("ap_") and name.endswith("_photos"))
-    return [name.removeprefix("ap_").removesuffix("_photos") for name in counts]
+    """List the categories: each has a figure and a count, and its name may end as a count's does."""
+    named = (name.removesuffix("_photos") for name in results if name.endswith("_photos"))
+    return [name.removeprefix("ap_") for name in named if name.startswith("ap_") and name in results]

@@ -67,7 +67,7 @@ class GroundTruth:
     def key(self, photo: str) -> str | None:
         """Find the labels' name for a photo (whose name may contain folders); None if it has no label."""
         path = PurePosixPath(photo)
-        names = (path.with_suffix("").as_posix(), path.as_posix(), path.stem, path.name)
+        names = (path.as_posix(), path.with_suffix("").as_posix(), path.name, path.stem)
         return next((name for name in names if name in self._labeled), None)
 
     def check(self, photos: Collection[str]) -> None:

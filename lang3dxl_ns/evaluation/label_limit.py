@@ -41,7 +41,7 @@ def lifted_labels(
 
     lifted, _ = gather(len(splats), probes(), 2 * len(categories), splats.means)
     labels, labeled = lifted.chunk(2, dim=1)
-    return torch.where(labeled > 0, labels / labeled, 0.0)
+    return torch.where(labeled > 0, labels / labeled, 0.0).to(splats.means)
 
 
 def _labels(masks: Masks, categories: list[str], size: tuple[int, int]) -> Float[Tensor, "h w channels"]:

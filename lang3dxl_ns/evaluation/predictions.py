@@ -50,17 +50,17 @@ def score_predictions(
         raise UserError(f"{maps} is not a folder: pass the one that holds <prompt>/<photo>.npy")
     scorer, folders = MapScorer(truth), dict(zip(truth.categories, slugs(truth.categories), strict=True))
     keys = truth.labeled if photos is None else list(dict.fromkeys(_key(truth, photo) for photo in photos))
-    keeps = {key: None if masks is None else _read_mask(masks, key) for key in keys}
+    files = {} if masks is None else {key: _mask_file(masks, key) for key in keys}
     figures: dict[str, dict[str, float]] = {}
     for key in tracked(keys, "scoring"):
         size = truth.scoring_size(*truth.size(key))
         truths = truth.truths(key, size)
         found: Maps = {c: _read_map(maps, (c, folders[c]), key, size) for c in truths}
-        figures[key] = scorer.scores(key, scorer.variants(found, keeps[key], temperature), truths)
-    masked = sum(keep is not None for keep in keeps.values())
-    statement = f"predictions are 0 outside the masks of {masked} of {len(keys)} photos, {masks}"
+        keep = _read_mask(files[key]) if files else None
+        figures[key] = scorer.scores(key, scorer.variants(found, keep, temperature), truths)
+    statement = f"predictions are 0 outside the masks of {len(files)} of {len(keys)} photos, {masks}"
     protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(
-        statement if masked else "none beyond those in the maps"
+        statement if files else "none beyond those in the maps"
     )
     return figures, protocol
 
@@ -105,8 +105,12 @@ def _key(truth: GroundTruth, photo: str) -> str:
     return key
 
 
-def _read_mask(folder: Path, photo: str) -> Bool[Tensor, "h w"] | None:
+def _mask_file(folder: Path, photo: str) -> Path:
     path = find_mask(folder, f"{photo}.png")
     if path is None:
         raise UserError(f"{folder} holds no mask of the photo {photo}: add it, white = keep")
+    return path
+
+
+def _read_mask(path: Path) -> Bool[Tensor, "h w"]:
     return torch.from_numpy(np.asarray(read_gray(path, "mask")) >= 128)

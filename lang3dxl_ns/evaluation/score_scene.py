@@ -43,7 +43,7 @@ def score_scene(
     queries_shown = scorer.queries.taught(words)
     figures: dict[str, dict[str, float]] = {}
     for photo in tracked(photos, "evaluating"):
-        width, height = photo.file_size
+        width, height = photo.read_size
         size, keep = truth.scoring_size(height, width), photo.foreground()
         keep = None if keep is None else keep.to(scene.device)
         raw, published = (
@@ -88,15 +88,15 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
 
     - `mask_iou_{category}`: IoU of the mask of `Scene.matches` with the label, mean over photos.
     - `selection_iou_{category}`: IoU of the matching Gaussians with the labeled ones. A Gaussian is labeled
-      if the labels mark most of its pixels in the labeled photos. Gaussians are weighted by the pixels that
-      they fill.
+      if the labels mark most of its pixels in the labeled photos, and a training view shows it. Gaussians
+      are weighted by the pixels that they fill.
     - `box_iou_{category}`: IoU of the box of `Scene.find` with the labeled object's box that it matches best.
     """
     question = scene.ask([Prompt(category) for category in truth.categories])
     labels: list[tuple[Camera, Masks]] = []
     ious: dict[str, list[float]] = {category: [] for category in truth.categories}
     for photo in photos:
-        camera = photo.camera
+        camera = scene.camera(photo.name, max(photo.camera.height, photo.camera.width))
         truths = truths_of(truth, photo.photo(), (camera.height, camera.width))
         labels.append((camera, {category: found.mask for category, found in truths.items()}))
         matches = scene.matches(question, photo.name, max(camera.height, camera.width))
@@ -106,7 +106,8 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
     shares = lifted_labels(scene.splats, labels, truth.categories, scene.backend)
     figures: dict[str, float] = {}
     for category, found, share in zip(truth.categories, scene.places(question), shares.T, strict=True):
-        marked, mass = share > 0.5, scene.mass
+        mass = scene.mass
+        marked = (share > 0.5) & (mass > 0)
         if not ious[category] or not marked.any():
             continue
         chosen = torch.from_numpy(found.gaussians).to(marked.device)

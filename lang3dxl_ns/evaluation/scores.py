@@ -30,6 +30,8 @@ SMOOTHING = 30
 SMOOTH_THRESHOLD = 0.4
 """Threshold of LangSplat's masks, the same for all photos."""
 _VOTERS = 7
+_CHANNELS = 64
+"""Number of feature channels that are interpolated at a time."""
 
 
 def average_precision(score: Float[Array, "*shape"], truth: Bool[Array, "*shape"]) -> float | None:
@@ -272,11 +274,19 @@ class LanguageScorer(MapScorer):
         return dict(zip(self.truth.categories, resize_map(maps, size), strict=True))
 
     def teacher_maps(self, target: Float[Tensor, "hd wd c"], size: tuple[int, int]) -> Maps:
-        """Compute maps of a CLIP target, whose features are first interpolated to `size`, as in Lang3D-XL."""
-        features = resize_map(target.permute(2, 0, 1), size).permute(1, 2, 0)
-        queries, words = self.queries.to(features.device), self.yardstick.to(features.device)
+        """Compute maps of a CLIP target, whose features are first interpolated to `size`, as in Lang3D-XL.
+        A few channels at a time are: all of a large photo's would take gigabytes."""
+        queries, words = self.queries.to(target.device), self.yardstick.to(target.device)
+        dots = queries.vectors.new_zeros(*size, len(queries.vectors))
+        squares = queries.vectors.new_zeros(size)
+        channels = zip(target.split(_CHANNELS, -1), queries.vectors.split(_CHANNELS, -1), strict=True)
+        for part, vectors in channels:
+            features = resize_map(part.permute(2, 0, 1), size).float()
+            dots += features.permute(1, 2, 0) @ vectors.T
+            squares += features.square().sum(0)
         temperature = calibrated(TEMPERATURE, words.cosines(target.flatten(0, 1).float()))
-        return self.named(queries.relevancy_of_cosines(queries.cosines(features), temperature), size)
+        cosines = dots / squares.sqrt().clamp_min(1e-12)[..., None]
+        return self.named(queries.relevancy_of_cosines(cosines, temperature), size)
 
 
 def open_scorer(truth: GroundTruth, clip: str, device: torch.device | str) -> LanguageScorer:

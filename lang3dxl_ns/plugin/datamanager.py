@@ -37,7 +37,7 @@ from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, re
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
 from lang3dxl_ns.preparation.crop_sizes import CropPlan, plan_crops
 from lang3dxl_ns.preparation.encoders import usual_dense
-from lang3dxl_ns.preparation.foreground import FOREGROUND, with_foreground
+from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
@@ -225,7 +225,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         c, used = self.config, [PHOTOS, PHOTO_MASKS]
         used += [CLIP, FINE] if c.clip != "none" else []
         used += [DENSE] if c.dense != "none" else []
-        used += [FOREGROUND] if c.foreground == "text" else []
+        used += [foreground_kind(c)] if c.foreground == "text" else []
         used += [REGIONS] if self._region_source is not None else []
         names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
         return FeatureStore(self.cache_dir).clean(used, names)
@@ -237,7 +237,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     @cached_property
     def _region_source(self) -> RegionSource | None:
-        return region_source(self.config, self.data_folder, self.device)
+        return region_source(self.config, self.data_folder)
 
     @cached_property
     def needs(self) -> list[Need]:
@@ -292,7 +292,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Folder of prepared targets."""
         return expanded(self.config.cache_dir or self.data_folder / "lang3dxl_cache")
 
-    @property
+    @cached_property
     def reconstruction(self) -> Reconstruction:
         """The model in its own units: COLMAP's, or else one made from the dataparser's seed points."""
         own = getattr(self.dataparser, "reconstruction", None)

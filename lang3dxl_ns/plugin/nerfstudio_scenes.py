@@ -28,6 +28,8 @@ _PATHS = ("file_path", "mask_path", "depth_file_path")
 _NAMES = ("train_filenames", "val_filenames", "test_filenames")
 _MOST_BYTES = 1 << 30
 _NONE = np.zeros((0, 3))
+_MOST_POINTS = 5_000
+"""Evenly spaced seed points of which each photo keeps those in its view; more tell no more of distances."""
 
 
 def check_transforms(dataparser: DataParserConfig) -> None:
@@ -142,17 +144,17 @@ def photos_of(outputs: DataparserOutputs, data: Path) -> list[Photo]:
 
 def reconstruction_of(splits: list[DataparserOutputs]) -> Reconstruction:
     """Build a reconstruction in the scene's original units from cameras and seed points, for scenes without
-    tracks. A photo's points are the seed points that project into it."""
+    tracks. A photo's points are those of at most 5,000 seed points that project into it."""
     scale, metadata, points, colors = splits[0].dataparser_scale, splits[0].metadata, _NONE, _NONE
     if "points3D_xyz" in metadata:
         points = metadata["points3D_xyz"].double().numpy() / scale
         colors = metadata["points3D_rgb"].numpy() if len(points) else colors
-    photos = {}
+    photos, some_points = {}, points[:: -(-len(points) // _MOST_POINTS) or 1]
     for outputs in splits:
         poses = outputs.cameras.camera_to_worlds.double()
         for photo, pose in zip(outputs.metadata["photos"], poses, strict=True):
             camera_from_world = view_matrix(pose)[:3].numpy()
             camera_from_world[:, 3] /= scale
             tracked = TrackedPhoto(photo.name, photo.lens, camera_from_world, _NONE, _NONE[:, :2])
-            photos[photo.name] = replace(tracked, points=points_in_view(points, tracked))
+            photos[photo.name] = replace(tracked, points=points_in_view(some_points, tracked))
     return Reconstruction(dict(sorted(photos.items())), points, colors)

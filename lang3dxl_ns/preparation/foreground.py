@@ -6,6 +6,7 @@ Every source yields the file of a photo's mask (`Photo.mask_path`), or None if t
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +25,6 @@ from lang3dxl_ns.preparation.working_photos import kept_picture, mask_png
 from lang3dxl_ns.scene.companions import companion, named_folder
 from lang3dxl_ns.scene.photo import Photo
 
-FOREGROUND = "foreground"
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 _LONGER_SIDE = 1024
@@ -120,6 +120,12 @@ def find_mask(folder: Path, name: str, follow_links: bool = False) -> Path | Non
     return companion(folder, name, MASK_SUFFIXES, follow_links)
 
 
+def foreground_kind(config: PreparationConfig) -> str:
+    """Name the store's folder of masks made from these prompts: runs with others keep their own."""
+    words = [*sorted(config.foreground_prompts), config.foreground_model, config.sam]
+    return f"foreground-{hashlib.sha256(json.dumps(words).encode()).hexdigest()[:8]}"
+
+
 def _prompted(
     photos: Sequence[Photo],
     config: PreparationConfig,
@@ -135,7 +141,7 @@ def _prompted(
     made_with = {"prompts": sorted(config.foreground_prompts), "model": files.identity, "rule": _RULE}
     masked, missing = [], []
     for photo in photos:
-        path = store.path(FOREGROUND, photo.name).with_suffix(".png")
+        path = store.path(foreground_kind(config), photo.name).with_suffix(".png")
         try:
             settings = json.dumps({**made_with, "photo": photo.content_hash()})
         except UserError:

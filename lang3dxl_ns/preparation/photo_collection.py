@@ -159,11 +159,16 @@ def _transforms_lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
             width, height = image.size
     angle = None if "fl_x" in frame else float(frame["camera_angle_x"])
     fx = float(frame["fl_x"]) if angle is None else width / 2 / math.tan(angle / 2)
+    high = None if "fl_y" in frame else frame.get("camera_angle_y")
+    square = fx if high is None else height / 2 / math.tan(float(high) / 2)
     fisheye = model == "OPENCV_FISHEYE" or bool(frame.get("is_fisheye"))  # instant-ngp's form
+    if frame.get("k4") and not fisheye:
+        raise UserError(f"photo {name} has a {model} camera with a fisheye's k4: undistort it first")
     names = ["k1", "k2", "k3", "k4"] if fisheye else ["k1", "k2", "p1", "p2", *["k3"] * bool(frame.get("k3"))]
     distortion = tuple(float(frame.get(key, 0.0)) for key in names)
     fy, cx, cy = (
-        float(frame.get(key, usual)) for key, usual in (("fl_y", fx), ("cx", width / 2), ("cy", height / 2))
+        float(frame.get(key, usual))
+        for key, usual in (("fl_y", square), ("cx", width / 2), ("cy", height / 2))
     )
     lens = Lens(width, height, fx, fy, cx, cy, distortion if fisheye or any(distortion) else (), fisheye)
     lens.check()

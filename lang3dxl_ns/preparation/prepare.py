@@ -79,10 +79,10 @@ class _Task:
     """Number of crops with `--quality fast`."""
     grids: tuple[Grid, ...] | None
     """Grids of the map of patch features, coarse to fine; None if crops are encoded instead."""
-    kinds: set[str]
-    """Kinds of all the photo's targets."""
+    settings: dict[str, dict[str, Any]]
+    """Settings of all the photo's targets, by kind."""
     missing: dict[str, dict[str, Any]]
-    """Settings of the targets to make, by kind."""
+    """Those of the targets to make."""
 
     @property
     def clip(self) -> str | None:
@@ -142,16 +142,13 @@ def prepare(
         for task, trouble in tracked(made, "encoding photos", len(missing)):
             if trouble:
                 left_out[task.photo.name] = trouble
-    names = [task.photo.name for task in tasks if task.photo.name not in left_out]
-    if not names:
+    made_with = {t.photo.name: t.settings for t in tasks if t.photo.name not in left_out}
+    if not made_with:
         first = next(iter(left_out.values()), "the scene has none")
         raise UserError(f"no photo can be prepared; the first of {len(photos)}: {first}")
     if left_out:
         say(f"left out {len(left_out)} of {len(photos)} photos:", *(f"  {why}" for why in left_out.values()))
-    with_dense, with_regions = (
-        [task.photo.name for task in tasks if kind in task.kinds] for kind in (DENSE, REGIONS)
-    )
-    return TargetReader(store, names, with_dense, with_regions, fine)
+    return TargetReader(store, made_with)
 
 
 def _plan(
@@ -205,8 +202,8 @@ def _plan(
             settings[REGIONS] = {**source, **labels}
         missing = {kind: s for kind, s in settings.items() if not store.is_current(kind, photo.name, s)}
         fast_count = fast.count(photo.height, photo.width)
-        tasks.append(_Task(photo, crops, fast_count, grids, set(settings), missing))
-    without = [task.photo.name for task in tasks if REGIONS not in task.kinds]
+        tasks.append(_Task(photo, crops, fast_count, grids, settings, missing))
+    without = [task.photo.name for task in tasks if REGIONS not in task.settings]
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
     return tasks, left_out

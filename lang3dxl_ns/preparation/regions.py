@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -56,7 +56,7 @@ class RegionSource(Protocol):
         """Label `image`, the photo as read by `photo.read()`, at any size; negative for no region."""
 
 
-def region_source(config: PreparationConfig, data: Path, device: torch.device | str) -> RegionSource | None:
+def region_source(config: PreparationConfig, data: Path) -> RegionSource | None:
     """Create the source that `config.regions` names; None for "none", or "auto" without a folder regions/. A
     folder is relative to `data`. Raises UserError if it does not exist, or a network can't be found or
     downloaded, or is no SAM 3 where prompts name the regions."""
@@ -67,7 +67,7 @@ def region_source(config: PreparationConfig, data: Path, device: torch.device | 
         return FelzenszwalbRegions()
     if choice == "sam":
         files = find_sam(config.sam)
-        return MaskRegions(lambda: AutomaticSam(files, device).masks, regions="sam", model=files.identity)
+        return MaskRegions(partial(_masks_of_sam, files), regions="sam", model=files.identity)
     if choice == "text":
         found = find_text_segmenter(config.foreground_model, config.sam)
         prompts = sorted(config.region_prompts)
@@ -75,7 +75,7 @@ def region_source(config: PreparationConfig, data: Path, device: torch.device | 
             raise UserError(
                 f"regions text needs a SAM 3, and {found.words.name} is none: {TEXT_OPTION} facebook/sam3"
             )
-        load = partial(_masks_of_instances, found.words, prompts, device)
+        load = partial(_masks_of_instances, found.words, prompts)
         return MaskRegions(load, regions="text", prompts=prompts, model=found.identity)
     return FolderRegions(data / "regions" if choice == "auto" else named_folder(choice, data, "regions"))
 
@@ -96,16 +96,12 @@ class FelzenszwalbRegions:
 
 class MaskRegions:
     """Regions from a network's masks, which may overlap: a pixel of several gets the smallest. `load` loads
-    the network, when the first photo needs it, and returns its masks' function; `made_with` are the settings
-    of the masks, the network's identity among them."""
+    the network onto the first photo's device and returns its masks' function; `made_with` are the settings of
+    the masks, the network's identity among them. Processes get a source before its network is loaded."""
 
-    def __init__(self, load: Callable[[], FindMasks], **made_with: Any) -> None:
-        self._load = load
+    def __init__(self, load: Callable[[torch.device], FindMasks], **made_with: Any) -> None:
+        self._load, self._masks = load, None
         self._made_with = {**made_with, "level": "small", "rule": _RULE}
-
-    @cached_property
-    def _masks(self) -> FindMasks:
-        return self._load()
 
     def settings(self, photo: Photo) -> dict[str, Any]:
         """Return the network's identity and the settings of its masks."""
@@ -115,11 +111,16 @@ class MaskRegions:
         """Label `image` by the network's masks, at the size of a stored label map."""
         small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
         size = label_size(*small.shape[:2])
+        self._masks = self._masks or self._load(image.device)
         masks = [resize_nearest(mask, size) for mask in self._masks(small)]
         return label_map(torch.stack(masks)) if masks else torch.full(size, -1)
 
 
-def _masks_of_instances(files: ModelFiles, prompts: Sequence[str], device: torch.device | str) -> FindMasks:
+def _masks_of_sam(files: ModelFiles, device: torch.device) -> FindMasks:
+    return AutomaticSam(files, device).masks
+
+
+def _masks_of_instances(files: ModelFiles, prompts: Sequence[str], device: torch.device) -> FindMasks:
     sam = Sam3(files, device)
     return lambda image: [mask for masks, _ in sam.instances(image, prompts) for mask in masks]
 

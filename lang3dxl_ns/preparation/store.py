@@ -89,10 +89,17 @@ class FeatureStore:
                 "with --pipeline.datamanager.cache-dir DIR"
             ) from error
 
-    def read(self, kind: str, name: str) -> dict[str, Tensor]:
+    def read(self, kind: str, name: str, settings: dict[str, Any] | None = None) -> dict[str, Tensor]:
         """Map an entry's tensors into memory (CPU, float16): only the parts in use are read from disk. Raises
-        UserError if the entry is missing or damaged."""
-        with _opened(self.path(kind, name), f"{kind} of {name}") as file:
+        UserError if the entry is missing or damaged, or was made with other settings than the given ones."""
+        path = self.path(kind, name)
+        with _opened(path, f"{kind} of {name}") as file:
+            if settings is not None and file.metadata()["settings"] != _canonical(settings):
+                raise UserError(
+                    f"{path} was meanwhile made with other settings, by another command: repeat this one (a "
+                    "run goes on with --load-dir), and give the other a --pipeline.datamanager.cache-dir of "
+                    "its own"
+                )
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 
     def shapes(self, kind: str, name: str) -> dict[str, tuple[int, ...]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypedDict
 
@@ -44,34 +44,31 @@ class FeatureStatistics:
 
 
 class TargetReader:
-    """Reader of the prepared targets of a scene's photos, by photo name; they are loaded on access."""
+    """Reader of the prepared targets of a scene's photos, by photo name; they are loaded on access.
 
-    def __init__(
-        self,
-        store: FeatureStore,
-        names: Sequence[str],
-        with_dense: Collection[str] = (),
-        with_regions: Collection[str] = (),
-        fine: Collection[str] = (),
-    ) -> None:
-        self.names, self._fine = list(names), frozenset(fine)
-        self._store = store
-        self._with_dense, self._with_regions = frozenset(with_dense), frozenset(with_regions)
-        self.clip_dim: int = store.shapes(self._clip_kind(self.names[0]), self.names[0])["features"][-1]
-        first = next((name for name in self.names if name in self._with_dense), None)
-        self.dense_dim: int = 0 if first is None else store.shapes(DENSE, first)["features"][-1]
+    `made_with` are the settings of each photo's targets, by kind. Every access raises UserError for a target
+    that isn't prepared, or that another command has made with other settings since.
+    """
+
+    def __init__(self, store: FeatureStore, made_with: Mapping[str, Mapping[str, dict[str, Any]]]) -> None:
+        self.names, self._made_with = list(made_with), made_with
+        self._store, first = store, self.names[0]
+        self.clip_dim: int = store.shapes(self._clip_kind(first), first)["features"][-1]
+        dense = next((name for name in self.names if DENSE in made_with[name]), None)
+        self.dense_dim: int = 0 if dense is None else store.shapes(DENSE, dense)["features"][-1]
 
     def _clip_kind(self, name: str) -> str:
-        return FINE if name in self._fine else CLIP
+        return FINE if FINE in self._made_with[name] else CLIP
+
+    def _read(self, kind: str, name: str) -> dict[str, Tensor]:
+        return self._store.read(kind, name, self._made_with[name][kind])
 
     def clip(self, name: str) -> StoredClipTarget:
-        """Read a photo's CLIP target. Raises UserError if it isn't prepared."""
-        settings = self._store.settings(self._clip_kind(name), name)
-        width = settings["size"][0]
-        return StoredClipTarget(
-            **self._store.read(self._clip_kind(name), name),
-            crop_fractions=[side / width for side in settings["crop_sides"]],
-        )
+        """Read a photo's CLIP target."""
+        kind = self._clip_kind(name)
+        settings = self._made_with[name][kind]
+        fractions = [side / settings["size"][0] for side in settings["crop_sides"]]
+        return StoredClipTarget(**self._read(kind, name), crop_fractions=fractions)
 
     def clip_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "hd wd c"]]:
         """Yield the CLIP targets of photos, one at a time, float16."""
@@ -79,15 +76,15 @@ class TargetReader:
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
         """Read the dense features of the photo squashed to a square, float16; None for a photo without."""
-        return self._store.read(DENSE, name)["features"] if name in self._with_dense else None
+        return self._read(DENSE, name)["features"] if DENSE in self._made_with[name] else None
 
     def dense_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "t t d"]]:
         """Yield the dense features of those photos that have some, one at a time, float16."""
-        return (self._store.read(DENSE, name)["features"] for name in names if name in self._with_dense)
+        return (self._read(DENSE, name)["features"] for name in names if DENSE in self._made_with[name])
 
     def regions(self, name: str) -> Int[Tensor, "h w"] | None:
         """Read the photo's region labels, −1 for none; None (no file is read) for one without regions."""
-        return self._store.read(REGIONS, name)["labels"] if name in self._with_regions else None
+        return self._read(REGIONS, name)["labels"] if REGIONS in self._made_with[name] else None
 
     def feature_statistics(
         self, names: Sequence[str] | None = None, with_dense: bool = True, sample: int = 100

@@ -113,6 +113,10 @@ class PerPixel:
     temperature: float = TEMPERATURE
     head = None
 
+    @property
+    def known(self) -> Bool[Tensor, " n"]:
+        return self.codes.isfinite().all(1)
+
     def channels(self, queries: Queries, relevancy: Tensor | None = None) -> Float[Tensor, "n d"]:
         return self.codes
 

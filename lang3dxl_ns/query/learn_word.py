@@ -38,7 +38,7 @@ _ROWS = 20_000
 _AXES = 64
 """Number of principal components of the scene's features in which a word is fitted."""
 _TYPICAL = 4096
-"""Number of evenly spaced Gaussians from which the components are computed."""
+"""Number of evenly spaced known Gaussians from which the components are computed."""
 _LEAST_SPREAD = 1e-3
 """Smallest spread of a coordinate that takes part, relative to the largest spread."""
 _RIDGE, _LEAST_RIDGE = 0.3, 0.01
@@ -98,8 +98,11 @@ def learn(
     sample = engine.features(rows).double()
     # Margin of the text: the cosine minus the best competitor's.
     text = queries.relevancy_of_cosines(queries.cosines(sample.float()), 1.0)[0].logit().double()
-    everywhere = torch.linspace(0, len(weights[0].seen) - 1, _TYPICAL).long().to(rows.device)
-    axes = _axes(engine.features(everywhere).double(), engine.head)
+    known = engine.known.nonzero().squeeze(1)
+    if not len(known):
+        raise UserError(f"{name!r} can't be learned: no photo gave a Gaussian of this scene a meaning")
+    spaced = torch.linspace(0, len(known) - 1, _TYPICAL, dtype=torch.float64).long()
+    axes = _axes(engine.features(known[spaced.to(known.device)]).double(), engine.head)
     fit = partial(_fitted, name, sample, text, axes, engine.temperature)
     word = fit(photos)
     # Each photo is judged by a word that the others teach.

@@ -31,7 +31,9 @@ RIM = 0.25
 _DENSE = 0.002
 """Share of a match's weight that a neighborhood must hold to belong to a group."""
 _MOST_POINTS = 20_000
-"""Most Gaussians that are grouped, the heaviest ones: DBSCAN keeps all their neighborhoods in memory."""
+"""Most Gaussians that are grouped, the heaviest ones."""
+_CELL = 1 / 8
+"""Side of the cells in which Gaussians are grouped as one, relative to the gap between groups."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,7 +119,13 @@ def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float)
     points, share = means[heaviest].double().cpu().numpy(), weight[heaviest].double().cpu().numpy()
     from sklearn.cluster import DBSCAN  # imported here, since the import takes a second
 
-    found = DBSCAN(eps=gap, min_samples=1).fit_predict(points, sample_weight=share / (share.sum() * _DENSE))
+    # Gaussians in one cell count as one. DBSCAN keeps every neighborhood in memory, of a heap all pairs.
+    _, cell = np.unique(np.floor((points - points.min(0)) / (gap * _CELL)), axis=0, return_inverse=True)
+    cell = cell.reshape(-1)
+    sums = np.bincount(cell, share)
+    centers = np.stack([np.bincount(cell, share * axis) / sums for axis in points.T], axis=1)
+    whole = DBSCAN(eps=gap, min_samples=1).fit_predict(centers, sample_weight=sums / (sums.sum() * _DENSE))
+    found = whole[cell]
     if (found < 0).all():  # no place is dense: take the heaviest Gaussian
         found = np.where(np.arange(len(found)) == share.argmax(), 0, -1)
     totals = np.bincount(found[found >= 0], weights=share[found >= 0]) / share.sum()

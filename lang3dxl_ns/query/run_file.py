@@ -9,6 +9,7 @@ import io
 import json
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
@@ -52,9 +53,11 @@ class ScenePhoto:
     mask: str | bytes | None = None
     """Foreground mask of the photo: its file, or the bytes of a PNG with the undistorted mask."""
     size: tuple[int, int] | None = None
-    """Width and height of the file; None: the lens's."""
+    """Width and height at which the photo was read; None: the lens's."""
     quarter_turns: int = 0
     """Clockwise quarter turns that bring the file's pixels as stored upright."""
+    file: tuple[int, int] | None = None
+    """Width and height of the file, upright; None: as read."""
 
     @classmethod
     def of(
@@ -63,8 +66,10 @@ class ScenePhoto:
         """Describe a photo that is used at `scale` and seen from a pose."""
         mask = None if photo.mask_path is None else str(photo.mask_path.absolute())
         size = photo.width, photo.height
-        lens, turns = photo.lens.scaled(scale), photo.quarter_turns
-        return cls(photo.name, split, camera_to_world, lens, mask, size, turns)
+        lens, turns, file = photo.lens.scaled(scale), photo.quarter_turns, None
+        with suppress(UserError):  # the photo is gone or damaged
+            file = photo.file_size()
+        return cls(photo.name, split, camera_to_world, lens, mask, size, turns, file)
 
     def __repr__(self) -> str:
         width, height = self.file_size
@@ -74,6 +79,12 @@ class ScenePhoto:
     @property
     def file_size(self) -> tuple[int, int]:
         """Width and height of the photo's file in pixels."""
+        return self.file or self.read_size
+
+    @property
+    def read_size(self) -> tuple[int, int]:
+        """Width and height at which the photo was read, in pixels: the file's, unless that is larger than the
+        run's limit."""
         return self.size or (self.lens.width, self.lens.height)
 
     @property
@@ -83,8 +94,8 @@ class ScenePhoto:
 
     @property
     def full_camera(self) -> Camera:
-        """The camera at the file's resolution, for the rasterizer."""
-        return self.lens.resized(*self.file_size).camera(self.camera.view_matrix)
+        """The camera at the resolution at which the photo was read, for the rasterizer."""
+        return self.lens.resized(*self.read_size).camera(self.camera.view_matrix)
 
     @property
     def pose(self) -> Float64[Array, "4 4"]:
@@ -96,6 +107,11 @@ class ScenePhoto:
         mask = Path(self.mask) if isinstance(self.mask, str) else None
         mask = mask if mask is not None and mask.is_file() else None
         return Photo(self.name, folder / self.name, mask, self.lens, self.quarter_turns)
+
+    def mask_stamp(self) -> list[int] | None:
+        """Return size, modification time and inode of the mask's file; None without one."""
+        photo = self.photo()
+        return None if photo.mask_path is None else photo.stamp(photo.mask_path)
 
     def foreground(self, size: tuple[int, int] | None = None) -> Bool[Tensor, "h w"] | None:
         """Read the photo's undistorted foreground at a size (height and width in pixels; default: the stored
@@ -171,9 +187,10 @@ def scene_from_json(content: dict[str, Any]) -> SceneFile:
     return scene
 
 
-def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
-    lens, size = lens | {"distortion": tuple(lens["distortion"])}, None if size is None else tuple(size)
-    photo = ScenePhoto(lens=Lens(**lens), size=size, **rest)
+def _photo(lens: dict[str, Any], size: Any = None, file: Any = None, **rest: Any) -> ScenePhoto:
+    lens = lens | {"distortion": tuple(lens["distortion"])}
+    size, file = (None if pair is None else tuple(pair) for pair in (size, file))
+    photo = ScenePhoto(lens=Lens(**lens), size=size, file=file, **rest)
     expect(is_name(photo.name), f"a photo is called {photo.name!r}")
     expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
     expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
@@ -181,8 +198,8 @@ def _photo(lens: dict[str, Any], size: Any = None, **rest: Any) -> ScenePhoto:
     expect(len(photo.camera_to_world) == 3, f"{photo.name} has no pose")
     check_pose(photo.camera_to_world)
     photo.lens.check()
-    width, height = photo.file_size
-    replace(photo.lens, width=width, height=height).check()
+    for width, height in (photo.read_size, photo.file_size):
+        replace(photo.lens, width=width, height=height).check()
     return photo
 
 

@@ -33,7 +33,7 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, overview
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
-from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, texts_of
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, taught_prompt, texts_of
 from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
 from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, searched, shipped_vocabulary
 from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
@@ -397,7 +397,9 @@ class Scene:
         cameras = {photo.name: resized(photo.camera, side) for photo in chosen}
         key = ""
         if self.cache is not None:
-            key = fingerprint(vars(self.splats.gaussians), [asdict(self.file), count, side])
+            masks = [photo.mask_stamp() for photo in chosen]
+            how = [asdict(self.file), count, side, self.splats.antialiased, masks]
+            key = fingerprint(vars(self.splats.gaussians), how)
             if (kept := load_visible(self.cache, key, cameras, self.device)) is not None:
                 return kept
         views, what = dict[str, VisibleGaussians](), "measuring which Gaussians the photos show, once"
@@ -510,9 +512,7 @@ class Scene:
             UserError: the marks show nothing or everything, or lie outside their photos; or a prompt of this
                 word would mean something else.
         """
-        prompt, *more = parse_prompts(word)
-        if more or known_word(prompt.text) != known_word(word):
-            raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")
+        prompt = taught_prompt(word)
         listed = [examples] if isinstance(examples, Example) else list(examples)
         photos = [self.file.photo(example.photo) for example in listed]
         listed = [replace(e, photo=p.name, size=p.file_size) for e, p in zip(listed, photos, strict=True)]

@@ -18,7 +18,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.teach import TaughtWord
+from lang3dxl_ns.query.teach import TaughtWord, known_word
 from lang3dxl_ns.query.vocabulary import NEGATIVES, competitors, searched, synonyms_of
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
@@ -56,6 +56,14 @@ def texts_of(texts: Any, what: str) -> list[str]:
     if wrong := [text for text in listed if not isinstance(text, str)]:
         raise TypeError(f"{what} is a text, not {type(wrong[0]).__name__}: {wrong[0]!r:.40}")
     return [text.encode("utf-8", "ignore").decode() for text in listed]
+
+
+def taught_prompt(word: str) -> Prompt:
+    """Return the prompt of a word that is to be taught. Raises UserError if no prompt means this word."""
+    prompt, *more = parse_prompts(word)
+    if more or known_word(prompt.text) != known_word(word):
+        raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")
+    return prompt
 
 
 def parse_prompts(typed: str) -> list[Prompt]:

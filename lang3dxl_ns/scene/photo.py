@@ -57,6 +57,11 @@ class Photo(HasLens):
         _check_shape(tracked.name, path, size, (tracked.width, tracked.height))
         return cls(tracked.name, path, mask_path, tracked.lens.resized(*size), tracked.quarter_turns)
 
+    def file_size(self) -> tuple[int, int]:
+        """Read width and height of the upright file, which may be read smaller. Raises UserError for an
+        unreadable file."""
+        return _turned_size(stored_size(self.path, self.name)[0], self.quarter_turns)
+
     def at_most(self, longer_side: int) -> Photo:
         """Return the photo, to be read with at most `longer_side` pixels on its longer side."""
         shrink = longer_side / max(self.width, self.height)

@@ -13,6 +13,7 @@ from scenes import write_scene
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.known_frames import known_frames
+from lang3dxl_ns.attachment.learn import prepare_photos, settled
 from lang3dxl_ns.commands.attach import Attach, _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressionConfig
@@ -198,3 +199,20 @@ def test_mistakes_end_in_a_sentence_before_any_work(splat, data, out, message, t
     with pytest.raises(UserError, match=message):
         attach(tmp_path / splat, data, None if out is None else tmp_path / out, SETTINGS)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_settings_that_attaching_does_not_read_and_impossible_words_are_told_before_the_work(tmp_path):
+    for config in (replace(SETTINGS, crops="pyramid"), replace(SETTINGS, regions="felzenszwalb")):
+        with pytest.raises(UserError, match="leave --crops and --regions off"):
+            config.check()
+    config = replace(SETTINGS, segment=["door; window"])
+    with pytest.raises(UserError, match="no prompt means 'door; window'"):
+        attach(tmp_path / "a.ply", tmp_path, tmp_path / "a.scene", config)
+
+
+def test_large_photos_are_prepared_at_the_requested_size(tmp_path):
+    write_scene(tmp_path / "photos", size=(320, 240), photos=3, points=200, coarseness=4)
+    config = settled(replace(SETTINGS, longer_side=120))
+    photos, targets = prepare_photos(read_collection(tmp_path / "photos"), config, tmp_path / "cache", "cpu")
+    assert {(photo.width, photo.height) for photo in photos.photos} == {(120, 90)}
+    assert targets.clip(targets.names[0]).features.shape[0] < targets.clip(targets.names[0]).features.shape[1]

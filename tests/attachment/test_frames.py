@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from lang3dxl_ns.attachment import frames
 from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame
 from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.rendering import render
 
@@ -137,3 +138,19 @@ def test_few_photos_must_agree_better_than_many():
         return Fit("a frame", np.eye(4), score, (1.0,) * photos)
 
     assert fit(0.55, 12).fits and not fit(0.55, 3).fits and fit(0.7, 3).fits and not fit(0.45, 12).fits
+
+
+@pytest.mark.parametrize("damaged", ["images", "masks"])
+def test_a_damaged_photo_or_mask_is_not_compared(tmp_path, damaged):
+    write_scene(tmp_path, size=(120, 90), photos=8, points=400)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "photo_000.png").write_bytes(b"junk" if damaged == "masks" else b"")
+    photo = tmp_path / "images" / "photo_000.jpg"
+    if damaged == "images":
+        photo.write_bytes(photo.read_bytes()[:2000])
+    collection = read_collection(tmp_path)
+    assert find_frame(box_splat(), collection, tmp_path / "a.ply").fits
+    for photo in (tmp_path / "images").iterdir():
+        photo.write_bytes(photo.read_bytes()[:1500])
+    with pytest.raises(UserError, match="can't read"):
+        find_frame(box_splat(), collection, tmp_path / "a.ply")

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from lang3dxl_ns.evaluation.aggregate import average, pool
+from lang3dxl_ns.evaluation.aggregate import average, pool, pooled_table, scene_table
 
 PHOTOS = [
     {"psnr": 20.0, "ap_domes": 0.2, "iou_domes": 0.1, "located_domes": 1.0},
@@ -55,3 +55,13 @@ def test_pooled_images_and_means_of_scenes_differ_as_by_hand():
     assert pooled["scene_mean"]["ap_portals"] == pytest.approx(0.2)
     assert pooled["scene_mean"]["map"] == pytest.approx(0.35)  # over categories, not over the scenes' mAPs
     assert pooled["per_scene"]["st_paul"]["map"] == pytest.approx(0.25)
+
+
+def test_a_category_may_be_called_as_a_count_is():
+    photos = [{"ap_framed_photos": 0.5, "ap_domes": 0.9}, {"ap_framed_photos": 0.7, "ap_domes": 0.8}]
+    results = average(photos, with_deviation=True) | {"protocol": {}}
+    table = scene_table("scene", results)
+    assert "| framed_photos | 2 | 0.600" in table and "| framed |" not in table
+    pooled = pool({"one": photos, "two": photos[:1]})
+    assert pooled["scene_mean"]["map"] == pytest.approx((0.55 + 0.875) / 2)
+    assert "| framed_photos | 3 |" in pooled_table(pooled)

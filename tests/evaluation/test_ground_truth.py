@@ -40,6 +40,16 @@ def test_photos_are_found_with_and_without_their_folders(tmp_path):
     assert truth.masks("0003.jpg", (40, 60)) == {}
 
 
+def test_a_label_whose_name_has_a_dot_is_its_own(tmp_path):
+    write_plain(tmp_path, "dome", "tower", MASK)
+    write_plain(tmp_path, "dome", "tower.v2", ~MASK)
+    truth = GroundTruth(tmp_path)
+    assert [truth.key(name) for name in truth.labeled] == truth.labeled == ["tower", "tower.v2"]
+    assert truth.key("a/tower.v2.jpg") == "tower.v2"
+    assert np.array_equal(truth.masks("tower.v2", (40, 60))["dome"], ~MASK)
+    assert held_out_photos(truth) == truth.labeled
+
+
 @pytest.mark.parametrize("quality", [30, 75, 95])
 def test_masks_survive_jpeg_and_belong_to_their_photo_and_category(tmp_path, quality):
     write_holyscenes(tmp_path, "domes", "0001", MASK, quality=quality)

@@ -4,9 +4,10 @@ import numpy as np
 import torch
 from label_sets import write_plain
 
+from lang3dxl_ns.evaluation import scores
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.evaluation.scores import LanguageScorer, MapScorer
-from lang3dxl_ns.query.relevancy import CANONICAL
+from lang3dxl_ns.evaluation.scores import LanguageScorer, MapScorer, resize_map
+from lang3dxl_ns.query.relevancy import CANONICAL, TEMPERATURE, calibrated
 
 
 class OneHot:
@@ -55,3 +56,17 @@ def test_the_published_variant_alone_is_made_of_published_prompts(tmp_path):
     mixed = scorer.variants(ours, of_published_prompts=theirs)
     for prefix, maps in {"": ours, "raw_": ours, "authors_": theirs}.items():
         assert torch.equal(mixed[prefix]["domes"], scorer.variants(maps)[prefix]["domes"])
+
+
+def test_the_teachers_features_are_interpolated_and_then_compared_in_any_number_of_parts(
+    tmp_path, monkeypatch
+):
+    write_plain(tmp_path, "domes", "0001", np.ones((40, 60), bool))
+    scorer = LanguageScorer(GroundTruth(tmp_path), OneHot(["domes"]).encode_texts)
+    target = torch.randn(5, 7, 8, generator=torch.Generator().manual_seed(0))
+    features = resize_map(target.permute(2, 0, 1), (20, 30)).permute(1, 2, 0)
+    temperature = calibrated(TEMPERATURE, scorer.yardstick.cosines(target.flatten(0, 1)))
+    expected = scorer.queries.relevancy_of_cosines(scorer.queries.cosines(features), temperature)[0]
+    for channels in (3, 8, 64):
+        monkeypatch.setattr(scores, "_CHANNELS", channels)
+        torch.testing.assert_close(scorer.teacher_maps(target, (20, 30))["domes"], expected)

@@ -6,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from painted_scene import DOME, WINDOWS, painted_scene, painted_splats
+from painted_scene import DOME, WINDOWS, painted_file, painted_scene, painted_splats, photo
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import box_iou, score_scene, score_selections
 from lang3dxl_ns.query.places import Box
+from lang3dxl_ns.query.run_file import ScenePhoto
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.photo import Photo
 
 NAMES = ("dome", "window")
 
@@ -67,6 +70,37 @@ def test_a_label_that_fits_two_photos_of_a_scene_file_is_refused_and_one_that_fi
 
 def test_labels_elsewhere_get_none(tmp_path):
     assert max(scored(tmp_path, shift=-1.6).values()) < 0.3
+
+
+def test_photos_of_odd_sizes_that_training_halved_are_scored(tmp_path):
+    """From 203 × 125 pixels, both half of them and the picture as wide as that are rounded."""
+    file, (width, height) = painted_file(), (203, 125)
+    lens = Lens(width, height, 200, 200, width / 2, height / 2)
+    photos = [
+        ScenePhoto.of(Photo(p.name, Path(p.name), None, lens), p.split, p.camera_to_world, 0.5)
+        for p in file.photos
+    ]
+    scene = painted_scene(file=replace(file, photos=photos))
+    (tmp_path / "dome" / "all").mkdir(parents=True)
+    mask = np.zeros((height, width), np.uint8)
+    mask[20:50, 120:160] = 255
+    Image.fromarray(mask).save(tmp_path / "dome" / "all" / "0003.png")
+    truth = GroundTruth(tmp_path, "plain")
+    labeled = [photo for photo in photos if truth.key(photo.name)]
+    assert set(score_selections(scene, truth, labeled)) >= {"mask_iou_dome"}
+
+
+def test_a_word_that_only_photos_of_another_side_show_has_no_selection(tmp_path):
+    """No training view shows its Gaussians."""
+    places = [("left/0001.jpg", -1.5, -1, "train", 400), ("held/0004.jpg", 1.5, 1.5, "eval", 300)]
+    photos = [photo(name, x, y, split, focal=focal) for name, x, y, split, focal in places]
+    scene = painted_scene(file=replace(painted_file(), photos=photos))
+    (tmp_path / "dome" / "held").mkdir(parents=True)
+    mask = np.zeros((96, 96), np.uint8)
+    mask[30:60, 30:60] = 255
+    Image.fromarray(mask).save(tmp_path / "dome" / "held" / "0004.png")
+    truth = GroundTruth(tmp_path, "plain")
+    assert score_selections(scene, truth, photos[1:]) == {}
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,10 @@
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from scenes import view_of
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import lens_of, to_nerfstudio, to_rasterizer
 from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 
@@ -43,3 +45,10 @@ def test_a_camera_of_ours_is_the_same_one_in_nerfstudio(pose):
     torch.testing.assert_close(back.view_matrix, camera.view_matrix)
     torch.testing.assert_close(back.intrinsics, camera.intrinsics)
     assert (back.width, back.height) == (64, 48)
+
+
+def test_a_coefficient_that_the_lens_does_not_have_is_refused():
+    pose, distortion = torch.eye(4)[None, :3], torch.tensor([[0.1, 0, 0, 0.3, 0, 0.0]])
+    cameras = Cameras(pose, 100.0, 100.0, 50.0, 40.0, 100, 80, distortion_params=distortion)
+    with pytest.raises(UserError, match=r"k4 = 0\.3"):
+        lens_of(cameras, 0)

@@ -12,7 +12,7 @@ from tiny_models import make_tiny_clipseg
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import foreground
-from lang3dxl_ns.preparation.foreground import find_mask, with_foreground
+from lang3dxl_ns.preparation.foreground import find_mask, foreground_kind, with_foreground
 from lang3dxl_ns.preparation.segmentation import ClipSeg
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -198,3 +198,16 @@ def test_an_unreadable_photo_affects_no_other(photos, config, tmp_path, seen):
 def test_words_are_needed(photos, config, tmp_path):
     with pytest.raises(UserError, match="foreground-prompts"):
         run(photos, replace(config, foreground_prompts=()), tmp_path)
+
+
+def test_masks_of_other_prompts_stay(photos, config, tmp_path):
+    first = with_foreground(photos, config, tmp_path, tmp_path / "cache", "cpu", print)
+    kept = [photo.mask_path.read_bytes() for photo in first]
+    other = replace(config, foreground_prompts=("roof",))
+    second = with_foreground(photos, other, tmp_path, tmp_path / "cache", "cpu", print)
+    assert not {photo.mask_path for photo in first} & {photo.mask_path for photo in second}
+    assert [photo.mask_path.read_bytes() for photo in first] == kept
+    store = FeatureStore(tmp_path / "cache")
+    store.clean([foreground_kind(config)], NAMES)
+    assert all(photo.mask_path.is_file() for photo in first)
+    assert not any(photo.mask_path.is_file() for photo in second)

@@ -456,7 +456,8 @@ def test_statistics_are_numpys_in_float64(store):
         store.write("dense", str(index), {"features": features * 2 - 100}, {})
         maps[index] = store.read("clip", str(index))["features"].numpy().astype(np.float64).reshape(-1, 4)
     names = [str(index) for index in maps]
-    reader = TargetReader(store, names, names)
+    made_with = {"clip": settings, "dense": {}}
+    reader = TargetReader(store, dict.fromkeys(names, made_with))
     pixels = np.concatenate(list(maps.values()))
     found = reader.feature_statistics()
     np.testing.assert_allclose(found.clip.mean, pixels.mean(0), rtol=1e-6)
@@ -475,11 +476,29 @@ def test_the_deviation_of_a_constant_channel_is_floored(store):
     features = torch.stack(
         [torch.full((8, 8), 5.0), torch.randn(8, 8, generator=torch.manual_seed(0))], dim=-1
     )
-    store.write(
-        "clip", "a", {"features": features, "valid": torch.ones(8, 8)}, {"size": [9, 9], "crop_sides": [3]}
-    )
-    std = TargetReader(store, ["a"]).feature_statistics().clip.std
+    settings = {"size": [9, 9], "crop_sides": [3]}
+    store.write("clip", "a", {"features": features, "valid": torch.ones(8, 8)}, settings)
+    std = TargetReader(store, {"a": {"clip": settings}}).feature_statistics().clip.std
     assert std[0] == pytest.approx(0.01 * float(std[1]) / 2, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["clip", "dense"])
+def test_targets_that_another_command_makes_otherwise_meanwhile_are_refused(store, kind):
+    def write(content, settings):
+        features = torch.full((4, 4, 2), content)
+        store.write("clip", "a", {"features": features, "valid": torch.ones(4, 4)}, settings)
+        store.write("dense", "a", {"features": features}, settings)
+
+    settings = {"size": [9, 9], "crop_sides": [3], "encoder": "first"}
+    write(1.0, settings)
+    reader = TargetReader(store, {"a": {"clip": settings, "dense": settings}})
+    read = {"clip": lambda: reader.clip("a").features, "dense": lambda: reader.dense("a")}[kind]
+    assert (read() == 1).all()
+    write(2.0, {**settings, "encoder": "second"})
+    with pytest.raises(UserError, match=r"meanwhile made with other settings.*cache-dir"):
+        read()
+    write(1.0, settings)
+    assert (read() == 1).all()
 
 
 def test_a_long_run_shows_a_bar(photos, config, store, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -101,17 +102,19 @@ def test_sam_labels_are_made_of_its_masks(sam, monkeypatch):
     for name, value in settings.items():
         monkeypatch.setitem(segmentation._AUTOMATIC, name, value)
     image = torch.rand(60, 90, 3, generator=torch.manual_seed(0))
-    source = region_source(PreparationConfig(regions="sam", sam=sam), PHOTO.path, "cpu")
+    source = region_source(PreparationConfig(regions="sam", sam=sam), PHOTO.path)
     assert isinstance(source, MaskRegions)
+    source = pickle.loads(pickle.dumps(source))  # as a worker process gets it
+    labels = source.labels(PHOTO, image)
     masks = torch.stack(source._masks((image * 255).round().byte()))
-    assert torch.equal(source.labels(PHOTO, image), label_map(masks))
+    assert torch.equal(labels, label_map(masks))
     assert source.labels(PHOTO, torch.rand(300, 512, 3)).shape == (150, 256)
     monkeypatch.setitem(segmentation._AUTOMATIC, "pred_iou_thresh", 1e9)
     assert torch.equal(source.labels(PHOTO, image), torch.full((60, 90), -1))
 
 
 def test_sam_settings_name_weights_and_level(sam):
-    settings = region_source(PreparationConfig(regions="sam", sam=sam), None, "cpu").settings(PHOTO)
+    settings = region_source(PreparationConfig(regions="sam", sam=sam), None).settings(PHOTO)
     assert settings["level"] == "small" and settings["model"]
 
 
@@ -181,7 +184,7 @@ def test_a_file_that_is_not_a_label_map_is_a_user_error(tmp_path, file, content)
 
 def test_the_option_names_the_source(tmp_path):
     def kind(choice):
-        return type(region_source(PreparationConfig(regions=choice, sam="no/such-sam"), tmp_path, "cpu"))
+        return type(region_source(PreparationConfig(regions=choice, sam="no/such-sam"), tmp_path))
 
     assert kind("none") is kind("auto") is type(None)
     assert kind("felzenszwalb") is FelzenszwalbRegions

@@ -84,7 +84,7 @@ def test_nothing_found_is_an_empty_mask(segmenter, monkeypatch):
 
 def test_regions_are_instances_of_what_the_prompts_name(folder, monkeypatch):
     config = PreparationConfig(regions="text", foreground_model=folder, region_prompts=("tower", "sky"))
-    source = region_source(config, None, "cpu")
+    source = region_source(config, None)
     assert isinstance(source, MaskRegions)
     masks = torch.zeros(3, 60, 90, dtype=torch.bool)
     masks[0, :20], masks[1, 40:, :30], masks[2, 40:, 60:] = True, True, True
@@ -103,7 +103,7 @@ def test_regions_are_instances_of_what_the_prompts_name(folder, monkeypatch):
 def test_regions_by_text_need_a_network_that_tells_instances_apart(tmp_path):
     light = str(make_tiny_clipseg(tmp_path / "clipseg"))
     with pytest.raises(UserError, match="needs a SAM 3"):
-        region_source(PreparationConfig(regions="text", foreground_model=light), None, "cpu")
+        region_source(PreparationConfig(regions="text", foreground_model=light), None)
 
 
 def test_a_gated_model_names_the_way_in(monkeypatch):

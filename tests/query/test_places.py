@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from sklearn.cluster import DBSCAN
 
 from lang3dxl_ns.query.places import strongest_match
 
@@ -60,3 +61,20 @@ def test_a_tall_thing_that_matches_less_towards_its_foot_is_boxed_whole_and_what
     assert box.low[2] == pytest.approx(0.0, abs=0.1) and box.high[2] == pytest.approx(1.5, abs=0.1)
     scores[1_000:] = 0.74  # good matches now, joined with the minaret
     assert box_of(torch.cat([minaret, mosque]), scores).low[2] > 0.5
+
+
+def test_a_heap_of_points_in_one_place_is_grouped_as_those_around_it(monkeypatch):
+    """Each of 20,000 would have all others as neighbors."""
+    neighborhoods = []
+    fit_predict = DBSCAN.fit_predict
+
+    def counting(self, points, **given):
+        neighborhoods.append(int((torch.cdist(*[torch.from_numpy(points)] * 2) < self.eps).sum()))
+        return fit_predict(self, points, **given)
+
+    monkeypatch.setattr(DBSCAN, "fit_predict", counting)
+    heap = 0.1 * clouds(0.0, count=20_000)
+    both = torch.cat([heap, clouds(3.0, count=100)])
+    box = box_of(both, torch.full((len(both),), 0.8))
+    assert box.share == pytest.approx(20_000 / 20_100, rel=1e-3)
+    assert max(box.high) < 0.11 and max(neighborhoods) < 1e6

@@ -10,8 +10,11 @@ from painted_scene import painted_scene
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.learn_word import _marks
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
+from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.scene.camera import Lens, camera_to_world, posed, resized, view_matrix
+from lang3dxl_ns.scene.photo import Photo, turned_lens
 
 
 @pytest.fixture
@@ -40,6 +43,24 @@ def test_a_mask_of_a_turned_photo_is_that_of_training(quarters, tmp_path):
     (found,) = SceneFile.read(tmp_path / "scene.json").photos
     assert found == photo
     assert np.array_equal(found.foreground(), upright > 0)
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_marks_are_pixels_of_the_file_where_training_read_it_smaller(turns, tmp_path):
+    Image.fromarray(np.zeros((30, 40, 3), np.uint8)).save(tmp_path / "a.png")
+    lens = Lens(40, 30, 40, 40, 20, 15)
+    upright = Photo("a", tmp_path / "a.png", None, turned_lens(lens, turns), turns)
+    pose = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
+    described = ScenePhoto.of(upright.at_most(20), "train", pose, 0.5)
+    about = SceneFile([described], None, None, 1.0, pose, "data")
+    about.write(tmp_path / "scene.json")
+    (photo,) = SceneFile.read(tmp_path / "scene.json").photos
+    assert photo == described
+    width, height = photo.file_size
+    assert (width, height) == ((30, 40) if turns else (40, 30))
+    assert (photo.full_camera.width, photo.full_camera.height) == (width // 2, height // 2)
+    marks = _marks(Example("a", box=(width - 6, 0, width, 4)), photo, (height // 2, width // 2))
+    assert marks[0, :2, -3:].min() == 1 and marks[0].sum() == 6
 
 
 def test_a_missing_file_is_explained(tmp_path):

@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from painted_scene import Painted, painted_gaussians, painted_scene
+from painted_scene import Painted, painted_codes, painted_gaussians, painted_scene, painted_splats
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.learn_word import _logistic, _Photo
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import read_scene, write_scene
 from lang3dxl_ns.query.teach import Example, load_words, save_words
+from lang3dxl_ns.rendering import Splats
 
 ALL = "all/0003.jpg"
 
@@ -257,3 +258,25 @@ def test_separation_is_the_chance_to_rank_right():
     photo = _Photo("", word, 1 - word, 0.5, 1, True)
     assert photo.separation(score) == pytest.approx((1 + 0.5 + 1 + 1) / 4)
     assert photo.separation(-score) == pytest.approx(1 - 3.5 / 4)
+
+
+def test_gaussians_that_no_photo_shows_do_not_change_what_a_word_is(scene):
+    splats, codes = painted_splats(), painted_codes()
+    known = painted_gaussians()["words"] == 1
+    known |= torch.arange(len(known)) % 200 == 0
+    codes[~known] = torch.nan
+    mark = Example(ALL, box=(61, 61, 77, 77))
+    few = painted_scene(codes=codes).teach("thing", mark)
+    unseen = splats.select(torch.full((40_000,), len(splats) - 1))
+    both = {
+        name: torch.cat([getattr(splats, name), getattr(unseen, name)])
+        for name in ("means", "quats", "scales", "opacities", "harmonics")
+    }
+    nothing = codes.new_full((len(unseen), codes.shape[1]), torch.nan)
+    many = painted_scene(splats=Splats(**both), codes=torch.cat([codes, nothing])).teach("thing", mark)
+    assert float(few.relevancy("thing").max()) > 0.8
+    torch.testing.assert_close(
+        many.relevancy("thing")[: len(splats)], few.relevancy("thing"), atol=0.05, rtol=0
+    )
+    with pytest.raises(UserError, match="no photo gave a Gaussian"):
+        painted_scene(codes=torch.full_like(codes, torch.nan)).teach("thing", mark)

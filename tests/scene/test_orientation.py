@@ -115,3 +115,16 @@ def test_a_model_of_photos_that_were_turned_before_is_left_as_it_is(tmp_path):
 def test_damaged_exif_turns_nothing(tmp_path):
     Image.new("RGB", (60, 40)).save(tmp_path / "a.jpg", exif=b"Exif\0\0MM\0*damaged")
     assert stored_size(tmp_path / "a.jpg", "a") == ((60, 40), 0)
+
+
+@pytest.mark.parametrize(("given", "fy"), [({}, 1.0), ({"camera_angle_y": 0.8}, 0.75)])
+def test_an_angle_of_view_along_y_makes_pixels_that_are_not_square(given, fy, tmp_path):
+    Image.fromarray(np.zeros((120, 160, 3), np.uint8)).save(tmp_path / "a.png")
+    frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
+    content = {"camera_angle_x": 0.8, **given, "frames": [frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    (photo,) = read_transforms(tmp_path / "transforms.json")[0].values()
+    assert photo.lens.fy == pytest.approx(fy * photo.lens.fx)
+    (tmp_path / "transforms.json").write_text(json.dumps({**content, "k1": 0.1, "k4": 0.3}))
+    photos, left_out, _ = read_transforms(tmp_path / "transforms.json")
+    assert not photos and "fisheye's k4" in str(left_out)

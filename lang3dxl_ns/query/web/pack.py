@@ -30,6 +30,8 @@ _LOG_SCALES = (-12.0, 9.0)
 _MOST_PRODUCTS = 30_000
 """Most multiplications per Gaussian for which the page decodes codes itself; beyond, it gets decoded rows."""
 _MOST_ROW_BYTES = 200_000_000
+_FARTHEST, _MOST_BEYOND = 65_504.0, 0.01
+"""Largest number of half precision, and the share of Gaussians that may lie beyond it."""
 LEAST_PIXELS, PIXEL_STEPS = 0.05, 12
 """Pixels of a view that code 0 stands for, and codes per doubling; 12.75 would reach only 50,000 pixels."""
 
@@ -43,10 +45,17 @@ def pack_splats(
     """Pack splats into 16 bytes per Gaussian, in Spark's format: red, green, blue, opacity; half-precision
     means; two octahedral coordinates of the rotation's axis; three logarithmic scales; the rotation's angle.
     Gaussians with a NaN or infinite value become invisible, so that row numbers stay those of the scene. Half
-    precision is finest close to `center`, the origin of the packed means. Colors are those seen from `toward`
-    (both in world units)."""
+    precision is finest close to `center`, the origin of the packed means, and ends 65,504 units from it.
+    Colors are those seen from `toward` (both in world units). Raises UserError if more than a few Gaussians
+    lie farther out; those few become dots at the end."""
     sound = splats.sound()[:, None]
-    means = torch.where(sound, splats.means - center, 0.0).cpu().numpy().astype("<f2")
+    offsets = torch.where(sound, splats.means - center, 0.0)
+    if float((offsets.abs().amax(1) > _FARTHEST).float().mean()) > _MOST_BEYOND:
+        raise UserError(
+            f"a page holds Gaussians up to {_FARTHEST:,.0f} units from the scene's middle, and many of this "
+            "scene's lie beyond: make the splat smaller (from millimeters to meters, say), and attach again"
+        )
+    means = offsets.clamp(-_FARTHEST, _FARTHEST).cpu().numpy().astype("<f2")
     axes, angle = _octahedral(torch.where(sound, splats.quats, 0.0).cpu().double())
     lowest, highest = _LOG_SCALES
     logs = torch.where(sound, splats.scales, 1.0).clamp_min(1e-30).log()
