@@ -38,11 +38,11 @@ def scene_presets() -> list[str]:
 
 def train_flags(name: str) -> list[str]:
     """Return flags of `ns-train lang3dxl-paper`: a scene's crop range and schedule, or what the authors'
-    release does differently. Raises UserError for a preset that is not for training."""
+    release does differently. Raises UserError for another name."""
+    choices = [OFFICIAL, *scene_presets()]
+    if name not in choices:
+        raise UserError(f"{name!r} is no preset for training: choose one of {', '.join(choices)}")
     settings = load_preset(name)
-    if "train" not in settings:
-        choices = ", ".join([OFFICIAL, *scene_presets()])
-        raise UserError(f"{name} is no preset for training: choose one of {choices}")
     scale = {"pipeline.datamanager.scale-preset": name} if "scale_range" in settings else {}
     flags = scale | settings["train"]
     return [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]

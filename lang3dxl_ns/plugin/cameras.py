@@ -20,7 +20,9 @@ def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4
         return torch.tensor([kind(getattr(lens, name)) for lens in lenses])
 
     fx, fy, cx, cy = (column(name, float) for name in ("fx", "fy", "cx", "cy"))
-    return Cameras(camera_to_worlds, fx, fy, cx, cy, column("width", int), column("height", int))
+    width, height = column("width", int), column("height", int)
+    # `ns-export cameras` expects metadata.
+    return Cameras(camera_to_worlds, fx, fy, cx, cy, width, height, metadata={})
 
 
 def lens_of(cameras: Cameras, index: int) -> Lens:

@@ -44,7 +44,7 @@ from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, SceneFacts, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, ScenePhoto
@@ -99,10 +99,6 @@ _IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regi
 """Number types of targets in a step; in memory they are kept half as wide."""
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
 _OF_PARSER = {"scale_factor": (1e-9, 1e9), "scene_scale": (1e-9, 1e9), "train_split_fraction": (0, 1)}
-
-
-class PhotosGoneError(UserError):
-    """Raised when too many photos have vanished during training to continue."""
 
 
 MOST_GONE = 0.1
@@ -326,6 +322,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 with part("data"):
                     data = self._train_cache.get(index, self.train_unseen_cameras[: self.config.read_ahead])
                     camera, batch = self._batch(self.train_dataset, index, data)
+            except PhotosGoneError:
+                raise
             except UserError as reason:
                 _log(f"{self.train_dataset.photos[index].name} is left out of training: {reason}")
                 self._leave_out(index, reason)

@@ -35,7 +35,7 @@ from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
-from lang3dxl_ns.scene.reconstruct import reconstruct_scene
+from lang3dxl_ns.scene.reconstruct import reconstruct_scene, shows_these
 
 
 @without(*OF_COLMAP)
@@ -292,8 +292,9 @@ def parser_for(
         data = parser.data = extract_frames(data) if may_reconstruct else frames_folder(data)
     named, usual = parser.colmap_path, type(parser)().colmap_path
     folders = [named, *MODEL_FOLDERS, OWN_MODEL]
-    if cache_dir is not None:
-        folders.append(expanded(cache_dir).absolute() / "reconstruction/sparse/0")
+    work = None if cache_dir is None else expanded(cache_dir).absolute() / "reconstruction"
+    if work is not None and data.is_dir() and shows_these(work, data):
+        folders.append(work / "sparse/0")
     known = find_colmap_model(data, folders)
     if known is not None:
         parser.colmap_path = known

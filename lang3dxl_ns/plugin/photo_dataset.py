@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
+from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.photo import Photo
@@ -83,6 +84,8 @@ class EvalPhotos:
         for index in self._wanted:
             try:
                 item = read(index)
+            except PhotosGoneError:
+                raise
             except UserError as reason:
                 name = self.dataset.photos[index].name
                 CONSOLE.log(escape(f"{name} is left out: {reason}"))

@@ -34,11 +34,11 @@ from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
 from lang3dxl_ns.components.step_guard import StepGuard
-from lang3dxl_ns.plugin.datamanager import PhotosGoneError
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.preparation.needs import write_needs
+from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.query.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, replace_scene

@@ -311,6 +311,12 @@ class _Maker:
         largest = max(task.photo.width * task.photo.height for task in tasks)
         memory = config.workers * 3 * 4 * (3 * largest + 12 * config.crop_batch * crop_size**2)
         split = f" in {config.workers} processes" if config.workers > 1 else ""
+        replaced = sum(any(store.path(k, t.photo.name).exists() for k in t.missing) for t in tasks)
+        if replaced:
+            say(
+                f"targets of {replaced} photos were made with other settings, or of other files, and are "
+                f"replaced: {spoken('--pipeline.datamanager.cache-dir')} keeps both"
+            )
         say(
             f"preparing {len(tasks)} photos ({photos - len(tasks)} of {photos} are ready): "
             f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free",

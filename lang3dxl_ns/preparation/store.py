@@ -36,6 +36,10 @@ _READERS = 4
 """Number of threads that check photos."""
 
 
+class PhotosGoneError(UserError):
+    """Photos or targets that the work needs have vanished, or were replaced."""
+
+
 class FeatureStore:
     """Folder of safetensors files, `root/kind/photo.safetensors`, each with the settings that made it.
 
@@ -91,11 +95,12 @@ class FeatureStore:
 
     def read(self, kind: str, name: str, settings: dict[str, Any] | None = None) -> dict[str, Tensor]:
         """Map an entry's tensors into memory (CPU, float16): only the parts in use are read from disk. Raises
-        UserError if the entry is missing or damaged, or was made with other settings than the given ones."""
+        UserError if the entry is missing or damaged, PhotosGoneError if it was made with other settings than
+        the given ones."""
         path = self.path(kind, name)
         with _opened(path, f"{kind} of {name}") as file:
             if settings is not None and file.metadata()["settings"] != _canonical(settings):
-                raise UserError(
+                raise PhotosGoneError(
                     f"{path} was meanwhile made with other settings, by another command: repeat this one (a "
                     "run goes on with --load-dir), and give the other a --pipeline.datamanager.cache-dir of "
                     "its own"

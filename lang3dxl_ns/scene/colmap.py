@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 
 from lang3dxl_ns.common.checks import FARTHEST
-from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import open_file
 from lang3dxl_ns.scene.camera import HasLens, Lens, check_pose
@@ -106,7 +106,7 @@ def _name(number: int, image: pycolmap.Image) -> str | None:
     try:
         if is_plain(image.name):
             return image.name
-        say(f"photo {image.name} {left_out} has control characters; rename it")
+        say(f"photo {some([image.name])} {left_out} has control characters; rename it")
     except UnicodeDecodeError:
         say(
             f"photo {number} {left_out} is not UTF-8; rename its file (convmv -f latin1 -t utf8 --notest "

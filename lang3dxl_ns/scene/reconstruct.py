@@ -48,6 +48,7 @@ _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
 _CONVERTED = (".webp", ".gif", ".avif")  # formats that Pillow reads and COLMAP does not
 _CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar; a killed process loses one step
+_STAMP = "photos.json"
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
 
@@ -121,6 +122,18 @@ def model_in(folder: Path) -> bool:
     return any(folder.glob("images.*")) or any(folder.glob("*/images.*"))
 
 
+def shows_these(work: Path, data: Path) -> bool:
+    """Return whether most photos of the reconstruction in `work` are in the folder `data`, by name and size.
+    A cache may be another scene's. The answer is also yes if `work` doesn't tell its photos."""
+    try:
+        recorded = json.loads((work / _STAMP).read_text())["photos"]
+    except (OSError, ValueError):
+        return True
+    photos = find_photos(data)
+    here = {(name, (photos.folder / name).stat().st_size) for name in photos.names}
+    return 2 * sum((name, size) in here for name, size, _ in recorded) > len(recorded)
+
+
 def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     """Separate the readable photos, without duplicate files, from the others, for which reasons are given.
     Raises UserError if fewer than two photos are usable."""
@@ -184,7 +197,7 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
             "settings": [settings.max_size, settings.features, settings.one_camera, copies.names],
         }
     )
-    database, stamped = work / "database.db", work / "photos.json"
+    database, stamped = work / "database.db", work / _STAMP
     if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
         return database
     for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*")):

@@ -220,6 +220,7 @@ def test_names_of_photos_can_not_command_the_terminal(folder, capsys, name):
     assert set(used(folder)) == {"photo_000.jpg", "photo_002.jpg", "photo_003.jpg"}
     said = capsys.readouterr().out
     assert "control characters" in said and "\x1b" not in said and "\\x1b" in said
+    assert "\n_.jpg" not in said
 
 
 def test_messages_never_command_the_terminal(capsys):

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from fake_gpu import fake_gpu
 
 from lang3dxl_ns.evaluation.label_limit import label_limit
 from lang3dxl_ns.evaluation.layouts import Truth
 from lang3dxl_ns.evaluation.scores import average_precision, bounds
-from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.rendering import Splats, gathering
 from lang3dxl_ns.scene.camera import Camera
 
 SIZE = 24
@@ -71,3 +72,11 @@ def test_chance_is_the_share_of_positives(label):
     assert found["chance_ap_dome"] == pytest.approx(label.mean())
     assert average_precision(np.full(label.shape, 0.3), label) == pytest.approx(found["chance_ap_dome"])
     assert score(torch.zeros(SIZE, SIZE), np.zeros_like(label)) == {}
+
+
+def test_lifted_labels_are_where_the_scene_is_however_many(label, monkeypatch):
+    """Large results are gathered on the CPU."""
+    monkeypatch.setattr(gathering, "MEMORY", 4 * len(wall()) * 3)
+    with fake_gpu():
+        splats, view = wall().to("cuda"), camera()
+        assert label_limit(splats, [(view, {"dome": label})], ["dome"])(view).shape == (1, SIZE, SIZE)

@@ -76,6 +76,19 @@ def test_a_model_that_was_named_is_not_replaced_by_another(walk, tmp_path):
     assert not (data / "sparse").exists()
 
 
+def test_the_model_of_other_photos_in_a_shared_cache_is_not_used(walk, tmp_path):
+    """Their names are the same. A read-only folder's model lies in the cache."""
+    data, work = shutil.copytree(walk, tmp_path / "data"), tmp_path / "cache" / "reconstruction"
+    shutil.copytree(write_scene(tmp_path / "other", photos=3) / "sparse", work / "sparse")
+    parser, own = PhotoCollectionDataParserConfig(data=data), []
+    for folder in (tmp_path / "other" / "images", walk):
+        recorded = [[path.name, path.stat().st_size, 0] for path in folder.iterdir()]
+        (work / "photos.json").write_text(json.dumps({"photos": recorded}))
+        own.append(parser_for(parser, tmp_path / "cache", False).colmap_path == work / "sparse" / "0")
+        parser.colmap_path = PhotoCollectionDataParserConfig().colmap_path
+    assert own == [False, True]
+
+
 def test_a_folder_with_transforms_is_read_as_nerfstudio_does(tmp_path):
     data = tmp_path / "data"
     data.mkdir()

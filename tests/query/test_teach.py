@@ -267,7 +267,7 @@ def test_gaussians_that_no_photo_shows_do_not_change_what_a_word_is(scene):
     codes[~known] = torch.nan
     mark = Example(ALL, box=(61, 61, 77, 77))
     few = painted_scene(codes=codes).teach("thing", mark)
-    unseen = splats.select(torch.full((40_000,), len(splats) - 1))
+    unseen = splats.select(torch.full((100_000,), len(splats) - 1))
     both = {
         name: torch.cat([getattr(splats, name), getattr(unseen, name)])
         for name in ("means", "quats", "scales", "opacities", "harmonics")

@@ -605,3 +605,15 @@ def test_a_vocabulary_of_ones_own_is_offered_and_named(tmp_path):
         Page(painted_scene(), words=["lych gate"], more=["porch", "zoo"]).files()["vocabulary.json"]
     )
     assert described["words"][: described["naming"]] == [*shipped_vocabulary(), "lych gate"]
+
+
+def test_a_scene_that_is_wider_than_half_precision_is_refused_and_a_stray_gaussian_is_not():
+    splats = painted_splats()
+    means = splats.means.clone()
+    means[0, 0] = 1e6
+    stray = Page(painted_scene(splats=replace(splats, means=means))).files()["splats.bin"]
+    packed = np.frombuffer(stray, np.uint8).reshape(-1, 16)
+    assert np.isfinite(packed[:, 4:10].copy().view("<f2")).all()
+    wide = replace(splats, means=1e5 * splats.means, scales=1e5 * splats.scales)
+    with pytest.raises(UserError, match="make the splat smaller"):
+        Page(painted_scene(splats=wide)).files()
