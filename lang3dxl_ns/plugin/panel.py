@@ -31,8 +31,6 @@ INVITATION = (
     "A finished run has a richer page: `lang3dxl view`."
 )
 NO_SEMANTICS = "This run has no semantics (it was trained with clip none)."
-LEAST = (320, 180)
-"""Fewest pixels of a frame while the camera moves; on a CPU the time budget alone would leave 30 rows."""
 _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""
 
@@ -43,7 +41,6 @@ class AskPanel(ViewerControl):
 
     def __init__(self, pipeline: Any) -> None:
         guard_viewers()  # must precede the server that nerfstudio starts
-        keep_frames_recognizable()
         self._pipeline, self._model = pipeline, pipeline.model
         self._views: list[tuple[Found, int]] = []
         """Views to fly to: pairs of a match and its view's number, all best views before all second ones."""
@@ -216,33 +213,3 @@ def stand_of(
     half_width = max(k[0, 2], camera.width - k[0, 2]) / k[0, 0]
     fov = 2 * math.atan(max(half_height, half_width / aspect))
     return position, position + max(ahead, 0.05) * forward, fov
-
-
-# ── sizes of frames ─────────────────────────────────────────────────────────────────────────────────────────
-
-
-def keep_frames_recognizable() -> None:
-    """Give all further viewers of this process frames of at least `LEAST` pixels while the camera moves."""
-    from nerfstudio.viewer.render_state_machine import RenderStateMachine  # imports the models
-
-    chosen = RenderStateMachine._calculate_image_res
-    if getattr(chosen, "has_least", False):
-        return
-
-    def at_least(self: RenderStateMachine, aspect_ratio: float) -> tuple[int, int]:
-        # At rest the full size follows directly, without another small frame.
-        self.transitions["low_move"]["static"] = "high"
-        height, width = chosen(self, aspect_ratio)
-        if self.state == "high":
-            return height, width
-        return least_size(height, width, aspect_ratio, self.viewer.control_panel.max_res)
-
-    at_least.has_least = True  # type: ignore[attr-defined]
-    RenderStateMachine._calculate_image_res = at_least  # type: ignore[method-assign]
-
-
-def least_size(height: int, width: int, aspect_ratio: float, most: int) -> tuple[int, int]:
-    """Enlarge height and width to `LEAST`, if the longer side stays within `most`."""
-    rows = max(height, LEAST[1], round(LEAST[0] / aspect_ratio))
-    rows = min(rows, most, int(most / aspect_ratio))
-    return (rows, int(rows * aspect_ratio)) if rows > height else (height, width)

@@ -138,7 +138,7 @@ def prepare(
                 f"more: {spoken(CLIP_OPTION)} openai/clip-vit-base-patch32"
             )
         maker.announce(len(tasks), str(device))
-        made = workers.run(config, maker, missing, str(device))
+        made = workers.run(config, maker.start, missing, str(device))
         for task, trouble in tracked(made, "encoding photos", len(missing)):
             if trouble:
                 left_out[task.photo.name] = trouble
@@ -255,7 +255,7 @@ class _Maker:
         return self._models
 
     def start(self, device: str) -> Callable[[_Task], str | None]:
-        """Implement `workers.Maker.start`. The work returns why a photo cannot be read, or None."""
+        """Start a worker, as a `workers.Start`. The work returns why a photo cannot be read, or None."""
         self.models(device)
         photos = _ReadAhead(WorkingPhotos(self._store).read, self._tasks)
 

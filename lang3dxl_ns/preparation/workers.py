@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context, parent_process
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import torch
 
@@ -22,28 +22,24 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 
 PATIENCE_S = 30.0
 """Seconds to wait for a named Ray cluster to answer."""
-Item = TypeVar("Item", contravariant=True)
-Result = TypeVar("Result", covariant=True)
-
-
-class Maker(Protocol[Item, Result]):
-    """Setup of a worker, which can be sent to another process."""
-
-    def start(self, device: str) -> Callable[[Item], Result]:
-        """Load everything for the work onto a device, once per worker, and return the work function."""
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Start: TypeAlias = Callable[[str], Callable[[Item], Result]]
+"""Function that loads everything for the work onto a device, once per worker, and returns the work function.
+It can be sent to another process."""
 
 
 def run(
-    config: PreparationConfig, maker: Maker[Item, Result], items: Sequence[Item], device: str
+    config: PreparationConfig, start: Start[Item, Result], items: Sequence[Item], device: str
 ) -> Iterator[tuple[Item, Result]]:
     """Yield every item with its result, as they finish, from the configured workers. Raises the exceptions of
     the work, and UserError if a process dies; earlier results are kept."""
     if config.engine == "ray":
-        yield from _run_on_ray(config, maker, items, device)
+        yield from _run_on_ray(config, start, items, device)
     elif config.workers > 1 and len(items) > 1:
-        yield from _run_in_processes(config.workers, maker, items, device)
+        yield from _run_in_processes(config.workers, start, items, device)
     else:
-        work = maker.start(device)
+        work = start(device)
         for item in items:
             yield item, work(item)
 
@@ -52,11 +48,11 @@ _work: Any = None
 """Work function of this worker process."""
 
 
-def _run_in_processes(count: int, maker: Maker[Item, Result], items: Sequence[Item], device: str):
+def _run_in_processes(count: int, start: Start[Item, Result], items: Sequence[Item], device: str):
     context = get_context("spawn")  # a forked process can't use CUDA
     turn = context.Value("i", 0)
     pool = ProcessPoolExecutor(
-        count, mp_context=context, initializer=_start, initargs=(maker, device, count, turn)
+        count, mp_context=context, initializer=_start, initargs=(start, device, count, turn)
     )
     try:
         futures = {pool.submit(_do, item): item for item in items}
@@ -71,7 +67,7 @@ def _run_in_processes(count: int, maker: Maker[Item, Result], items: Sequence[It
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _start(maker: Maker, device: str, count: int, turn: Any) -> None:
+def _start(start: Start, device: str, count: int, turn: Any) -> None:
     """Set up a process for the work on its device, one of the GPUs, or a share of the CPU's cores."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -82,7 +78,7 @@ def _start(maker: Maker, device: str, count: int, turn: Any) -> None:
     else:
         torch.set_num_threads(max(torch.get_num_threads() // count, 1))
     global _work
-    _work = maker.start(device)
+    _work = start(device)
 
 
 def _end_with_parent() -> None:
@@ -100,14 +96,14 @@ def _do(item: Any) -> Any:
 class _Actor:
     """Worker on a Ray cluster. If it dies, Ray starts another and repeats its item."""
 
-    def __init__(self, maker: Maker, device: str) -> None:
-        self._work = maker.start(device)
+    def __init__(self, start: Start, device: str) -> None:
+        self._work = start(device)
 
     def do(self, item: Any) -> tuple[Any, Any]:
         return item, self._work(item)
 
 
-def _run_on_ray(config: PreparationConfig, maker: Maker[Item, Result], items: Sequence[Item], device: str):
+def _run_on_ray(config: PreparationConfig, start: Start[Item, Result], items: Sequence[Item], device: str):
     try:
         import ray
         from ray.util import ActorPool
@@ -120,7 +116,7 @@ def _run_on_ray(config: PreparationConfig, maker: Maker[Item, Result], items: Se
         resources = {"num_gpus": 1} if device.startswith("cuda") else {"num_cpus": 1}
         remote: Any = ray.remote(_Actor)
         actor = remote.options(max_restarts=-1, max_task_retries=-1, **resources)
-        pool: Any = ActorPool([actor.remote(maker, device) for _ in range(config.workers)])
+        pool: Any = ActorPool([actor.remote(start, device) for _ in range(config.workers)])
         yield from pool.map_unordered(lambda worker, item: worker.do.remote(item), items)
     finally:
         if started:

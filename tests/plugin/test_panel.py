@@ -16,7 +16,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
 from scenes import view_of, write_scene
 
-from lang3dxl_ns.plugin.panel import INVITATION, least_size, stand_of
+from lang3dxl_ns.plugin.panel import INVITATION, stand_of
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 from lang3dxl_ns.query import conversation as session
 from lang3dxl_ns.query.question import QueryConfig
@@ -256,10 +256,3 @@ def test_questions_leave_no_messages_behind(panel, viewer):
         frame(viewer)
         counts.append(len(kept))
     assert counts[1] == counts[-1]
-
-
-@pytest.mark.parametrize(("aspect", "size"), [(16 / 9, (180, 320)), (1.0, (320, 320)), (3.0, (180, 540))])
-def test_frames_while_moving_are_recognizable(aspect, size):
-    assert least_size(30, int(30 * aspect), aspect, most=1024) == size
-    assert least_size(400, 700, 1.75, most=1024) == (400, 700)
-    assert max(least_size(30, 50, aspect, most=100)) <= 100

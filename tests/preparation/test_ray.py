@@ -35,7 +35,7 @@ def cluster():
 
 def test_a_worker_that_is_killed_is_replaced_and_the_job_ends_complete(tmp_path):
     found = dict(
-        run(PreparationConfig(workers=2, engine="ray"), Squares(tmp_path, deadly=5), range(12), "cpu")
+        run(PreparationConfig(workers=2, engine="ray"), Squares(tmp_path, deadly=5).start, range(12), "cpu")
     )
     assert found == {item: item**2 for item in range(12)}
     assert (tmp_path / "sprung").exists()

@@ -16,7 +16,7 @@ def processes(folder):
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_every_item_comes_back_with_its_result(tmp_path, count):
-    found = dict(run(PreparationConfig(workers=count), Squares(tmp_path), range(12), "cpu"))
+    found = dict(run(PreparationConfig(workers=count), Squares(tmp_path).start, range(12), "cpu"))
     assert found == {item: item**2 for item in range(12)}
     assert len(list(tmp_path.glob("*.*"))) == 12
     assert len(processes(tmp_path)) <= count
@@ -24,11 +24,11 @@ def test_every_item_comes_back_with_its_result(tmp_path, count):
 
 def test_a_process_that_is_killed_ends_in_a_sentence_and_keeps_what_was_done(tmp_path):
     with pytest.raises(UserError, match="fewer --workers"):
-        dict(run(PreparationConfig(workers=2), Squares(tmp_path, deadly=5), range(12), "cpu"))
+        dict(run(PreparationConfig(workers=2), Squares(tmp_path, deadly=5).start, range(12), "cpu"))
     assert list(tmp_path.glob("*.*"))
 
 
 def test_without_ray_the_error_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"lang3dxl-ns\[ray\]"):
-        dict(run(PreparationConfig(workers=2, engine="ray"), Squares(tmp_path), range(3), "cpu"))
+        dict(run(PreparationConfig(workers=2, engine="ray"), Squares(tmp_path).start, range(3), "cpu"))
