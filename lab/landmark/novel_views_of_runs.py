@@ -43,7 +43,8 @@ def evaluate_novel_views(pipeline: Lang3DXLPipeline) -> Iterator[EvaluatedPhoto]
     if data.targets is not None:
         config = config if config.targets_in_steps else replace(config, dense="none")
         sizes, store = novel_pixel_sizes(data, views, dataset.photos), FeatureStore(data.cache_dir)
-        prepare(dataset.photos, sizes, config, data.crop_plan.scales, store, data.device)
+        views_of = prepare(dataset.photos, sizes, config, data.crop_plan.scales, store, data.device)
+        data.targets = data.targets.joined(views_of)
     if model.semantic_field is not None:
         scorer = open_scorer(views.truth, config.clip, model.device)
     for photo in pipeline.evaluation.evaluate_photos(data.evaluated(dataset), scorer):

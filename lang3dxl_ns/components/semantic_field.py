@@ -69,7 +69,7 @@ class SemanticFieldConfig:
     preset: Preset | Literal["auto"] = "auto"
     """Values of all unset options. `short`: for hundreds to a few thousand steps, and for codes that are
     learned after training. `paper`: as printed. `official`: as released by the authors. `auto`: `short` for
-    those and in runs of under 5,000 iterations, otherwise `paper`."""
+    those, in runs of under 5,000 iterations, and where the length is unknown; otherwise `paper`."""
     code_dim: int | None = None
     """Channels of the rendered code, 2 to 6 (2 to 5 with `indexed`). Each doubles the cost of a lookup."""
     code_std: float | None = None
@@ -110,7 +110,7 @@ class SemanticFieldConfig:
         """Return all settings, with unset ones taken from the preset. Raises UserError if the preset is
         unknown, the code has too many or too few channels for the grid, or the decoder has no hidden layer or
         no input."""
-        name = "paper" if self.preset == "auto" else self.preset
+        name = "short" if self.preset == "auto" else self.preset
         if name not in PRESETS:
             raise UserError(f"unknown field preset {name!r}: choose one of auto, {', '.join(PRESETS)}")
         given = {field.name: getattr(self, field.name) for field in fields(FieldSettings)}

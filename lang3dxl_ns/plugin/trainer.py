@@ -135,8 +135,12 @@ class Lang3DXLTrainer(Trainer):
         written into the run's folder, so that it can be queried without the photos."""
         # nerfstudio turns this on, and would then tune for photos of many sizes in nearly every step.
         torch.backends.cudnn.benchmark = False
-        with self.stages.stage("prepare"):
-            self._set_up(test_mode)
+        try:
+            with self.stages.stage("prepare"):
+                self._set_up(test_mode)
+        except UserError:
+            self._forget_folder()
+            raise
 
     def _set_up(self, test_mode: Literal["test", "val", "inference"]) -> None:
         data, self.config.data = self.config.data, None  # otherwise the viewer would write camera paths there
@@ -157,6 +161,15 @@ class Lang3DXLTrainer(Trainer):
         torch.manual_seed(self.config.machine.seed)
         if self._run_state is not None:
             _restore(self.pipeline, self._run_state)
+
+    def _forget_folder(self) -> None:
+        """Remove the folder of a run that could not start, if it holds nothing but its settings, and the
+        folders above that this leaves empty."""
+        with suppress(OSError):
+            if {path.name for path in self.base_dir.iterdir()} <= {"config.yml"}:
+                (self.base_dir / "config.yml").unlink(missing_ok=True)
+                for folder in (self.base_dir, *self.base_dir.parents[:3]):
+                    folder.rmdir()  # the first folder that is not empty raises, and ends the loop
 
     def _load_checkpoint(self) -> None:
         """Load the requested checkpoint, if any, as nerfstudio does, but keep the run state until everything

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.pyramid import ClipTarget
 from lang3dxl_ns.preparation.store import FeatureStore
 
@@ -57,8 +58,17 @@ class TargetReader:
         dense = next((name for name in self.names if DENSE in made_with[name]), None)
         self.dense_dim: int = 0 if dense is None else store.shapes(DENSE, dense)["features"][-1]
 
+    def joined(self, other: TargetReader) -> TargetReader:
+        """Return a reader of both readers' photos, from the same store."""
+        return TargetReader(self._store, {**self._made_with, **other._made_with})
+
+    def _settings(self, name: str) -> Mapping[str, dict[str, Any]]:
+        if name not in self._made_with:
+            raise UserError(f"targets of {name} are not prepared: run `lang3dxl prepare`")
+        return self._made_with[name]
+
     def _clip_kind(self, name: str) -> str:
-        return FINE if FINE in self._made_with[name] else CLIP
+        return FINE if FINE in self._settings(name) else CLIP
 
     def _read(self, kind: str, name: str) -> dict[str, Tensor]:
         return self._store.read(kind, name, self._made_with[name][kind])
@@ -76,15 +86,15 @@ class TargetReader:
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
         """Read the dense features of the photo squashed to a square, float16; None for a photo without."""
-        return self._read(DENSE, name)["features"] if DENSE in self._made_with[name] else None
+        return self._read(DENSE, name)["features"] if DENSE in self._settings(name) else None
 
     def dense_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "t t d"]]:
         """Yield the dense features of those photos that have some, one at a time, float16."""
-        return (self._read(DENSE, name)["features"] for name in names if DENSE in self._made_with[name])
+        return (self._read(DENSE, name)["features"] for name in names if DENSE in self._settings(name))
 
     def regions(self, name: str) -> Int[Tensor, "h w"] | None:
         """Read the photo's region labels, −1 for none; None (no file is read) for one without regions."""
-        return self._read(REGIONS, name)["labels"] if REGIONS in self._made_with[name] else None
+        return self._read(REGIONS, name)["labels"] if REGIONS in self._settings(name) else None
 
     def feature_statistics(
         self, names: Sequence[str] | None = None, with_dense: bool = True, sample: int = 100

@@ -140,7 +140,7 @@ def test_a_file_is_no_folder_and_a_folder_no_file(tmp_path):
 
 @pytest.mark.parametrize("place", ["/dev/null", "/dev/null/below", "/proc/none", "n" * 300])
 def test_a_store_that_can_be_none_is_one_line(place):
-    with pytest.raises(UserError, match="--cache-dir DIR"):
+    with pytest.raises(UserError, match="cache-dir DIR"):
         FeatureStore(Path(place)).make_folder()
 
 

@@ -499,6 +499,8 @@ def test_targets_that_another_command_makes_otherwise_meanwhile_are_refused(stor
         read()
     write(1.0, settings)
     assert (read() == 1).all()
+    with pytest.raises(UserError, match="targets of b are not prepared"):
+        {"clip": reader.clip, "dense": reader.dense}[kind]("b")
 
 
 def test_a_long_run_shows_a_bar(photos, config, store, monkeypatch, capsys):
