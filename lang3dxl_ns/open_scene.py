@@ -78,17 +78,19 @@ def train(
 
     usual = lang3dxl.config.pipeline.datamanager
     models = clip or usual.clip, dense or usual.dense  # type: ignore[attr-defined]
-    steps = iterations or lang3dxl.config.max_num_iterations
-    config = run_config(Path(data), Path(out), Path(data).stem, steps, *models)
+    steps = lang3dxl.config.max_num_iterations if iterations is None else iterations
+    config = run_config(Path(data), Path(out), expanded(data).absolute().stem, steps, *models)
     if scale is not None:
         config.pipeline.datamanager.camera_res_scale_factor = scale
     config.set_timestamp()
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    trainer.train()
-    if trainer.interrupted:
-        raise UserError(f"training was stopped; to resume: ns-train with --load-dir {trainer.checkpoint_dir}")
+    try:
+        trainer.train()
+    except SystemExit as error:
+        stopped = f"training was stopped; to resume: ns-train with --load-dir {trainer.checkpoint_dir}"
+        raise UserError(stopped) from error
     return load_scene(trainer.base_dir)
 
 

@@ -38,6 +38,14 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
         raise NoPictureError(str(error) or type(error).__name__) from error
 
 
+def gray_values(image: Image.Image, behind: int = 0) -> Image.Image:
+    """Convert an open picture to gray values 0…255, over the value `behind` where it is transparent."""
+    gray = eight_bits(image).convert("L")
+    if not image.has_transparency_data:
+        return gray
+    return Image.composite(gray, Image.new("L", gray.size, behind), image.convert("RGBA").getchannel("A"))
+
+
 def eight_bits(image: Image.Image) -> Image.Image:
     """Scale gray values of 16 bits, which `convert` would clip at 255, to 8 bits; others stay as they are.
     Raises ValueError for floating-point pixels."""

@@ -22,7 +22,7 @@ from PIL import Image, ImageDraw
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
-from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, gray_values, open_picture
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 """Suffixes of pictures, lower case."""
@@ -46,11 +46,7 @@ def read_gray(path: Path, what: str = "ground truth", behind: int = 0) -> Image.
     if it cannot be read."""
     problem, damage = f"{what} {path} can't be read", (OSError, NoPictureError)
     with readable(problem, "replace or remove it", damage), open_picture(path) as image:
-        gray = eight_bits(image).convert("L")
-        if image.has_transparency_data:
-            alpha = image.convert("RGBA").getchannel("A")
-            gray = Image.composite(gray, Image.new("L", gray.size, behind), alpha)
-        return gray
+        return gray_values(image, behind)
 
 
 def check_shape(path: Path, mine: tuple[int, int], other: tuple[int, int]) -> None:

@@ -16,11 +16,11 @@ from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4"]) -> Cameras:
     """Build pinhole cameras (photos are undistorted on reading) at nerfstudio's poses."""
 
-    def column(name: str, kind: type) -> Tensor:
-        return torch.tensor([kind(getattr(lens, name)) for lens in lenses])
+    def column(name: str, kind: torch.dtype) -> Tensor:
+        return torch.tensor([getattr(lens, name) for lens in lenses], dtype=kind)
 
-    fx, fy, cx, cy = (column(name, float) for name in ("fx", "fy", "cx", "cy"))
-    width, height = column("width", int), column("height", int)
+    fx, fy, cx, cy = (column(name, torch.float32) for name in ("fx", "fy", "cx", "cy"))
+    width, height = column("width", torch.int64), column("height", torch.int64)
     # `ns-export cameras` expects metadata.
     return Cameras(camera_to_worlds, fx, fy, cx, cy, width, height, metadata={})
 

@@ -48,6 +48,7 @@ from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, SceneFacts, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, ScenePhoto
+from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
 
@@ -142,6 +143,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 raise
             _log(f"The run's own cameras are used: {reason}")
             config.dataparser, config.camera_res_scale_factor = recorded, 1.0
+            config.longer_side = LONGEST_SIDE  # the recorded cameras have the size of training
             super().__init__(config, *args, **kwargs)
 
     def _check_recorded(self, scene: SceneFile) -> None:
@@ -195,6 +197,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         if self.targets is not None:
             prepared = set(self.targets.names)  # damaged photos are missing from it
             names = [photo.name for photo in self.train_dataset.photos if photo.name in prepared]
+            if not names:
+                raise UserError("none of the training photos can be used: see the reasons above")
             facts.statistics = self.targets.feature_statistics(names, self.config.targets_in_steps)
             facts.clip_targets = partial(self.targets.clip_features, names)
             if self.targets.dense_dim:

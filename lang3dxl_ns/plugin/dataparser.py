@@ -253,6 +253,7 @@ class RecordedSceneDataParser(DataParser):
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         scene = SceneFile.read(self.config.run / SCENE_FILE)
         chosen = [photo for photo in scene.photos if (photo.split == "train") == (split == "train")]
+        chosen = chosen or scene.photos  # with --eval-mode all, no photo is held out
         photos = [photo.photo(Path(scene.data)) for photo in chosen]
         poses = torch.tensor([photo.camera_to_world for photo in chosen], dtype=torch.float32)
         cameras = to_nerfstudio([photo.lens for photo in photos], poses)

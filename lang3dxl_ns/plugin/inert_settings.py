@@ -7,7 +7,6 @@ from types import MappingProxyType
 from typing import Any
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.plugin.optimizers import parameter_groups
 
 OF_SPLATFACTO = (
@@ -48,11 +47,6 @@ def check_inert(model: Any, data: Any, optimizers: Mapping[str, Any] = MappingPr
     if changed:
         raise UserError(f"{changed[0]} has no effect here: no method of this package reads it; leave it off")
     if model.decoder.learns_from_renderings:
-        if model.codes_from == "noise" and model.decoder.compression != CompressionConfig():
-            raise UserError(
-                "--pipeline.model.decoder.compression has no effect on codes that start from noise: leave "
-                "it off, or pass --pipeline.model.codes-from photos"
-            )
         return
     changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")
     changed += _changed(model.semantic_field, ("code_std",), "--pipeline.model.semantic-field.")

@@ -202,8 +202,10 @@ class RenderingModel(SplatfactoModel):
         return rendering, outputs
 
     def composite(self, camera: Cameras, features: Float[Tensor, "n d"]) -> Float[Tensor, "H W d"]:
-        """Composite values of Gaussians over black in a camera; differentiable only in the values."""
-        return composite(self.splats(), to_rasterizer(camera).detach(), features, self.backend)
+        """Composite values of Gaussians over black in a camera, refined in training like its photo's;
+        differentiable only in the values."""
+        view = to_rasterizer(camera, self._pose(camera)).detach()
+        return composite(self.splats(), view, features, self.backend)
 
     def _code_colors(self) -> Float[Tensor, "n 3"] | None:
         if self.carried is None:

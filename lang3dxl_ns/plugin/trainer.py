@@ -26,7 +26,7 @@ from rich.markup import escape
 from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, replace_durably
@@ -177,13 +177,10 @@ class Lang3DXLTrainer(Trainer):
         if (path := requested_checkpoint(self.config)) is None:
             return
         check_checkpoint(path)
-        if (before := path.parent.with_name(SCENE_FILE)).is_file():
-            new = self.pipeline.datamanager.train_dataparser_outputs
-            if not SceneFile.read(before).has_frame(new.dataparser_transform, new.dataparser_scale):
-                raise UserError(
-                    f"{path} is of other photos, or of another reconstruction of them: train anew"
-                )
         state = read_checkpoint(path)
+        if (before := path.parent.with_name(SCENE_FILE)).is_file():
+            corrected = any(name.endswith("pose_adjustment") for name in state["pipeline"])
+            self._check_photos(path, SceneFile.read(before), corrected)
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -199,6 +196,35 @@ class Lang3DXLTrainer(Trainer):
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
             ) from error
         CONSOLE.log(f"Loaded {path}")
+
+    def _check_photos(self, path: Path, before: SceneFile, corrected: bool) -> None:
+        """Check that a checkpoint's photos are this run's. Raises UserError for another frame, and, if the
+        cameras were `corrected` one by one, for other training photos."""
+        data = self.pipeline.datamanager
+        new = data.train_dataparser_outputs
+        if not before.has_frame(new.dataparser_transform, new.dataparser_scale):
+            raise UserError(f"{path} is of other photos, or of another reconstruction of them: train anew")
+        splits = [{p.name: p.split for p in file.photos} for file in (before, data.scene_file())]
+        trained = [[name for name, split in known.items() if split == "train"] for known in splits]
+        if corrected and trained[0] != trained[1]:
+            raise UserError(
+                f"{path} has corrections of other training photos' cameras: restore those, or train anew"
+            )
+        moved = [name for name, split in splits[1].items() if splits[0].get(name, split) != split]
+        if moved:
+            say(
+                f"{len(moved)} photos are on the other side of training and held-out ones than when this run "
+                f"began ({some(moved)}): figures of held-out photos will be too good"
+            )
+
+    def eval_iteration(self, step: int) -> None:
+        """Evaluate in between as nerfstudio does. Photos that can't be read don't end the training."""
+        try:
+            super().eval_iteration(step)
+        except PhotosGoneError:
+            raise
+        except UserError as error:
+            CONSOLE.log(escape(f"not evaluated at iteration {step}: {error}"))
 
     def setup_optimizers(self) -> Optimizers:
         """Build the optimizers, with the guard before them."""
@@ -365,10 +391,10 @@ class Lang3DXLTrainer(Trainer):
         words taught in an earlier file there, or in the folder of the run that this one resumed."""
         path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
         config = self.config.pipeline.model
-        how = f"{self.config.method_name}, {config.decoder.name}, {self.config.max_num_iterations} iterations"
+        how = f"{self.config.method_name}, {config.decoder.name}, {config.total_steps} iterations"
         scene, place = self.pipeline.model.scene(self.pipeline.scene_file), self.config.load_checkpoint
         checkpoints = self.config.load_dir or (place and place.parent)
-        earlier = [checkpoints.parent / path.name] if checkpoints else []
+        earlier = sorted(checkpoints.parent.glob(f"*{SUFFIX}")) if checkpoints else []  # may be renamed
         told = Provenance(title=path.stem, made_how=how)
         _, size = replace_scene(path, scene, told, *earlier)
         run = shlex.quote(os.path.relpath(self.base_dir))
@@ -433,7 +459,7 @@ def _run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
     """Collect densification statistics, whether codes have begun, the current round through the photos, and
     the random generators' states, all in types that torch's weights-only loader accepts."""
     return {
-        "strategy": dict(pipeline.model.strategy_state),
+        "strategy": {k: v for k, v in pipeline.model.strategy_state.items() if k != "rendered"},
         "codes_have_begun": pipeline.model.codes_have_begun,
         "photos": pipeline.datamanager.round_state(),
         "random": torch.get_rng_state(),

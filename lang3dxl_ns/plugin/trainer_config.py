@@ -37,6 +37,8 @@ from lang3dxl_ns.scene.photo_folder import check_data
 LONG_RUN_S = 3_600.0
 """Seconds of training on a slow GPU rasterizer above which a run is refused."""
 
+_OF_SCHEDULES = {**dict.fromkeys(("start", "end", "until"), (1e-9, 1e9)), "warm": (0, 1), "power": (0, 100)}
+
 
 @showing(
     *("data", "max_num_iterations", "output_dir", "experiment_name", "load_dir", "load_checkpoint", "vis"),
@@ -81,6 +83,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         for name, group in self.optimizers.items():
             option = f"--optimizers.{name.replace('_', '-')}.optimizer."
             check_numbers(group["optimizer"], {"lr": (1e-12, 1e3)}, option)
+            if isinstance(group["scheduler"], RunScheduleConfig):
+                check_numbers(group["scheduler"], _OF_SCHEDULES, option.replace("optimizer.", "scheduler."))
         self.pipeline.datamanager.check()
         check_data(self.pipeline.datamanager.data or self.data)
         if self.is_viewer_enabled():
@@ -167,7 +171,7 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         learned = self.pipeline.model.decoder.learns_from_renderings
         datamanager.settle_targets(learned, not learned or self.pipeline.model.codes_from == "photos")
         datamanager.data = _absolute(datamanager.data or self.data)
-        self.data = datamanager.data
+        self.data, datamanager.cache_dir = datamanager.data, _absolute(datamanager.cache_dir)
         self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)
         if isinstance(datamanager.dataparser, PhotoCollectionDataParserConfig):
             datamanager.dataparser.held_out = _absolute(datamanager.dataparser.held_out)

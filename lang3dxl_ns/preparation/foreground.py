@@ -17,7 +17,7 @@ import torch
 
 from lang3dxl_ns.common.console import some, tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.pictures import NoPictureError, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, gray_values, open_picture
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -110,7 +110,7 @@ def _state(photo: Photo) -> bool | str:
     assert photo.mask_path is not None
     try:
         with open_picture(photo.mask_path) as image:
-            return max(image.convert("L").tobytes()) >= 128
+            return gray_values(image).getextrema()[1] >= 128
     except (OSError, NoPictureError) as error:
         return f"{photo.mask_path} ({error})"
 

@@ -20,7 +20,7 @@ from lang3dxl_ns.scene.camera import Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
-from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video
+from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 
 MODEL_FOLDERS = (Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("dense/sparse"))
@@ -76,8 +76,8 @@ def find_colmap_model(data: Path, folders: Sequence[Path] = (*MODEL_FOLDERS, OWN
 
 
 def images_path(data: Path, named: Path = Path("images")) -> Path:
-    """Return the photos' folder relative to the scene's: `named` if it has files, else one with photos."""
-    if (data / named).is_dir() and any((data / named).iterdir()):
+    """Return the photos' folder relative to the scene's: `named` if it has photos, else one that has."""
+    if (data / named).is_dir() and any(photos_below(data / named)):
         return named
     return find_photos(data).folder.relative_to(data) if any(find_photos(data).names) else named
 

@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.pyramid import ClipTarget
-from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
 
 CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
 
@@ -81,16 +82,17 @@ class TargetReader:
         return StoredClipTarget(**self._read(kind, name), crop_fractions=fractions)
 
     def clip_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "hd wd c"]]:
-        """Yield the CLIP targets of photos, one at a time, float16."""
-        return (self.clip(name).features for name in names)
+        """Yield the CLIP targets of photos, one at a time, float16, without those that have vanished."""
+        return _readable(lambda name: self.clip(name).features, names)
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
         """Read the dense features of the photo squashed to a square, float16; None for a photo without."""
         return self._read(DENSE, name)["features"] if DENSE in self._settings(name) else None
 
     def dense_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "t t d"]]:
-        """Yield the dense features of those photos that have some, one at a time, float16."""
-        return (self._read(DENSE, name)["features"] for name in names if DENSE in self._settings(name))
+        """Yield the dense features of those photos that have some, one at a time, float16, without those that
+        have vanished."""
+        return (features for features in _readable(self.dense, names) if features is not None)
 
     def regions(self, name: str) -> Int[Tensor, "h w"] | None:
         """Read the photo's region labels, −1 for none; None (no file is read) for one without regions."""
@@ -105,6 +107,16 @@ class TargetReader:
         clip = _statistics(self.clip(name).features for name in names)
         dense = _statistics(self.dense_features(names)) if with_dense and self.dense_dim else None
         return FeatureStatistics(clip, dense)
+
+
+def _readable(read: Callable[[str], Any], names: Iterable[str]) -> Iterator[Any]:
+    for name in names:
+        try:
+            yield read(name)
+        except PhotosGoneError:
+            raise
+        except UserError as reason:
+            say(f"{name} is left out: {reason}")
 
 
 def _statistics(maps: Iterable[Float[Tensor, "h w c"]]) -> ChannelStatistics:

@@ -23,7 +23,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, gray_values, open_picture
 from lang3dxl_ns.scene.camera import HasLens, Lens, scaled_size
 
 if TYPE_CHECKING:
@@ -91,7 +91,8 @@ class Photo(HasLens):
             return None
         mask = np.ones((self.height, self.width), dtype=bool)
         if self.mask_path is not None:
-            gray = self._drawn_upright(_read_rgb(self.mask_path, self.name).convert("L"))
+            with _readable(self.mask_path, self.name), open_picture(self.mask_path) as image:
+                gray = self._drawn_upright(gray_values(image))
             mask = np.asarray(gray.resize((self.width, self.height), Image.Resampling.NEAREST)) >= 128
         if self.lens.distorts:
             mask = self._undistort(mask * np.uint8(255)) >= 128
@@ -224,7 +225,8 @@ def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) ->
 def _check_shape(name: str, path: Path, size: tuple[int, int], camera: tuple[int, int]) -> None:
     """Raise UserError unless a photo has its camera's aspect ratio, which cropped or rotated ones lack."""
     (width, height), (camera_width, camera_height) = size, camera
-    if abs(width * camera_height / (height * camera_width) - 1) > 0.01:
+    rounded = 0.5 / min(camera)  # the shorter side of a photo that is read small is a rounded number
+    if abs(width * camera_height / (height * camera_width) - 1) > 0.01 + rounded:
         raise UserError(
             f"photo {name}: {path} has {width} × {height} pixels, but its COLMAP camera {camera_width} × "
             f"{camera_height}, another aspect ratio: use the photos that the model was made from"

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif")
@@ -145,10 +145,15 @@ def check_data(data: Path | None) -> None:
 
 def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOST_FRAMES) -> Path:
     """Write the sharpest frame of every interval of 1/`rate` seconds to `frames_folder`/images, upright,
-    unless an earlier call did. Raises UserError without ffmpeg, and for a file that is no video or a very
-    short one."""
+    unless an earlier call did. Raises UserError without ffmpeg, for a file that is no video or a very short
+    one, and for a folder with the frames of another video."""
     folder = frames_folder(video)
+    made_of = folder / "video.json"
+    this = [video.name, video.stat().st_size if video.is_file() else None]
     if (folder / "images").is_dir():
+        known = read_json(made_of) if made_of.is_file() else this
+        if this[1] is not None and known != this:
+            raise UserError(f"{folder} holds frames of another video, {known[0]}: rename one, or remove them")
         return folder
     if shutil.which("ffmpeg") is None or shutil.which("ffprobe") is None:
         raise UserError(
@@ -162,6 +167,7 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     if len(sharpness) < 3:
         raise UserError(f"{video} has {len(sharpness)} frames: a scene needs a walk of some seconds")
     _write(video, folder, _sharpest(sharpness, min(stretches, len(sharpness))))
+    write_atomically(made_of, json.dumps(this))
     return folder
 
 

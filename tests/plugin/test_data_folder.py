@@ -15,6 +15,7 @@ from scenes import speckled, write_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
+from lang3dxl_ns.preparation.photo_collection import images_path
 from lang3dxl_ns.scene.photo_folder import _sharpest, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
@@ -122,6 +123,25 @@ def test_a_video_becomes_a_folder_of_frames_and_a_model(walk, tmp_path):
     video.unlink()  # a run goes on without it
     again = parser_for(PhotoCollectionDataParserConfig(data=video), None, False)
     assert (again.data, again.colmap_path) == (parser.data, parser.colmap_path)
+
+
+@needs_ffmpeg
+def test_frames_of_another_video_are_not_taken_for_this_ones(walk, tmp_path):
+    video = make_video(walk, tmp_path / "walk.mp4")
+    folder = extract_frames(video)
+    assert extract_frames(video) == folder
+    with pytest.raises(UserError, match=r"frames of another video, walk\.mp4"):
+        extract_frames(make_video(walk, tmp_path / "walk.mov"))
+    video.write_bytes(video.read_bytes() + b"more")
+    with pytest.raises(UserError, match="frames of another video"):
+        extract_frames(video)
+
+
+def test_an_empty_images_folder_does_not_hide_the_photos(walk, tmp_path):
+    data = shutil.copytree(walk, tmp_path / "data")
+    (data / "images").mkdir()
+    (data / "images" / ".DS_Store").touch()
+    assert images_path(data) == Path(".")
 
 
 @needs_ffmpeg

@@ -86,12 +86,3 @@ def test_rates_of_semantics_that_are_trained_with_the_scene_are_an_error_without
     others = deepcopy(lang3dxl.config)
     others.optimizers["means"]["optimizer"].lr = 0.5
     check_inert(others.pipeline.model, others.pipeline.datamanager, others.optimizers)
-
-
-def test_compression_is_an_error_for_codes_that_start_from_noise():
-    config = changed("pipeline.model.decoder.name", "paper")
-    config.pipeline.model.decoder.compression.steps = 7
-    with pytest.raises(UserError, match=r"decoder\.compression has no effect on codes that start from noise"):
-        check_inert(config.pipeline.model, config.pipeline.datamanager)
-    config.pipeline.model.codes_from = "photos"
-    check_inert(config.pipeline.model, config.pipeline.datamanager)

@@ -316,3 +316,19 @@ def test_a_distorted_photo_of_one_pixel_is_read(tmp_path, size):
     lens = Lens(*size, 20.0, 21.0, size[0] / 2, size[1] / 2, (0.1, 0.0, 0.0, 0.0))
     photo = Photo("a.png", tmp_path / "a.png", None, lens)
     assert photo.read().shape == (size[1], size[0], 3) and photo.read_mask().all()
+
+
+@pytest.mark.parametrize(("size", "side"), [((2000, 41), 160), ((160, 90), 4), ((3, 200), 100)])
+def test_a_long_photo_that_is_read_small_is_its_own_file(size, side, tmp_path):
+    """Its shorter side is a rounded number of a few pixels."""
+    Image.new("RGB", size).save(tmp_path / "a.png")
+    small = make_photo(tmp_path / "a.png", *size).at_most(side)
+    assert small.read().shape == (small.height, small.width, 3)
+
+
+def test_a_mask_ends_where_it_is_transparent(photo, tmp_path):
+    mask = np.full((30, 40, 4), 255, np.uint8)
+    mask[:, 20:, 3] = 0
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    found = replace(photo, mask_path=tmp_path / "m.png").read_mask()
+    assert found[:, :20].all() and not found[:, 20:].any()

@@ -1,0 +1,169 @@
+"""Runs whose photos change, vanish or are damaged between their parts."""
+
+import os
+import shutil
+import signal
+from copy import deepcopy
+
+import pytest
+import torch
+from scenes import write_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.open_scene import train as train_scene
+from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
+from lang3dxl_ns.plugin.trainer_config import open_run, read_config
+from lang3dxl_ns.query.run_file import SceneFile
+from lang3dxl_ns.query.scene_file import describe_scene_file, read_scene
+from lang3dxl_ns.query.scene_file import write_scene as write_scene_file
+from lang3dxl_ns.query.teach import TaughtWord
+
+PARSER = "pipeline__datamanager__dataparser__"
+
+
+def held_out(folder, *names):
+    path = folder / f"held_out_{names[0]}.txt"
+    path.write_text("\n".join(names))
+    return {f"{PARSER}held_out": path}
+
+
+def test_a_frame_that_is_meters_away_on_a_map_is_another_one():
+    """Its shift is small beside coordinates of millions of meters."""
+    pose = [[1.0, 0, 0, -5e5], [0, 1.0, 0, -5.4e6], [0, 0, 1.0, 0]]
+    moved = [[1.0, 0, 0, -5e5], [0, 1.0, 0, -5.4e6 - 100], [0, 0, 1.0, 0]]
+    file = SceneFile([], None, None, 0.01, pose, "data")
+    assert file.has_frame(pose, 0.01) and not file.has_frame(moved, 0.01)
+
+
+def test_photos_that_change_sides_are_told_on_resume(train, tmp_path, capsys):
+    data = write_scene(tmp_path / "scene", photos=6, points=60)
+    first = train(data, 2, semantics=False, **held_out(tmp_path, "photo_000"))
+    capsys.readouterr()
+    train(data, 3, semantics=False, load_dir=first.checkpoint_dir, **held_out(tmp_path, "photo_005"))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "2 photos are on the other side" in said and "photo_000.jpg, photo_005.jpg" in said
+
+
+def test_corrections_of_cameras_are_not_given_to_other_photos(train, tmp_path):
+    data = write_scene(tmp_path / "scene", photos=6, points=60)
+    refined = {"pipeline__model__camera_optimization": "on"}
+    first = train(data, 2, semantics=False, **refined, **held_out(tmp_path, "photo_000"))
+    with pytest.raises(UserError, match="corrections of other training photos' cameras"):
+        train(
+            data, 3, semantics=False, load_dir=first.checkpoint_dir, **refined,
+            **held_out(tmp_path, "photo_005"),
+        )  # fmt: skip
+
+
+def test_features_are_gathered_at_the_cameras_that_training_refined(train, tmp_path):
+    data = write_scene(tmp_path / "scene", photos=4, points=60)
+    pipeline = train(data, 2, semantics=False, pipeline__model__camera_optimization="on").pipeline
+    model = pipeline.model.train()
+    camera, _ = next(iter(pipeline.datamanager.train_photos()))
+    places = model.means.detach()
+    before = model.composite(camera, places)
+    with torch.no_grad():
+        model.camera_optimizer.pose_adjustment[camera.metadata["cam_idx"], :3] = 0.5
+    refined = model.composite(camera, places)
+    assert not torch.allclose(refined, before, atol=0.05)
+    assert torch.allclose(model.eval().composite(camera, places), before, atol=0.05)
+
+
+def test_words_stay_if_the_data_folder_is_renamed(train, tmp_path):
+    data = write_scene(tmp_path / "castle", photos=4, points=60)
+    first = train(data, 2, tmp_path / "out")
+    path = first.base_dir / "castle.scene"
+    scene = read_scene(path)
+    word = TaughtWord(
+        "gizmo", torch.ones(scene.decoder.clip_dim), 0.0, 0.0, 0.1, clip=scene.file.clip_identity
+    )
+    write_scene_file(path, scene.with_words([word]))
+    data = data.rename(tmp_path / "schloss")
+    second = train(data, 4, tmp_path / "out", load_dir=first.checkpoint_dir)
+    resumed = second.base_dir / "schloss.scene"
+    assert list(read_scene(resumed).words) == ["gizmo"]
+    assert "4 iterations" in describe_scene_file(resumed)["provenance"].made_how
+
+
+def test_a_held_out_photo_that_is_gone_does_not_end_the_training(train, tmp_path, monkeypatch, capsys):
+    data = write_scene(tmp_path / "scene", photos=4, points=60)
+    begin = Lang3DXLTrainer.train
+
+    def without_it(self):
+        for photo in self.pipeline.datamanager.eval_dataset.photos:
+            photo.path.unlink()
+        begin(self)
+
+    monkeypatch.setattr(Lang3DXLTrainer, "train", without_it)
+    trainer = train(data, 6, semantics=False, steps_per_eval_image=3)
+    assert trainer.step == 5
+    assert "not evaluated at iteration 3" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_run_without_held_out_photos_opens_when_its_photos_are_gone(train, tmp_path):
+    data = write_scene(tmp_path / "photos", photos=4, points=60)
+    run = train(data, 2, tmp_path / "out", semantics=False, **{f"{PARSER}eval_mode": "all"}).base_dir
+    shutil.rmtree(data)
+    assert open_run(run)[1].datamanager.train_dataset.photos
+
+
+def test_a_training_photo_that_is_the_only_one_and_damaged_is_told(train, tmp_path):
+    data = write_scene(tmp_path / "scene", photos=2, points=80, size=(192, 144))
+    path = data / "images" / "photo_001.jpg"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(UserError, match="none of the training photos can be used"):
+        train(data, 2)
+
+
+def test_a_target_that_vanishes_does_not_end_the_learning_of_words(train, tmp_path, monkeypatch):
+    data = write_scene(tmp_path / "scene", photos=5, points=60)
+    begin = Lang3DXLTrainer.train
+
+    def without_one(self):
+        targets = self.pipeline.datamanager.targets
+        name = self.pipeline.datamanager.train_dataset.photos[0].name
+        targets._store.path("dense", name).unlink()
+        begin(self)
+
+    monkeypatch.setattr(Lang3DXLTrainer, "train", without_one)
+    assert train(data, 2).words_are_learned
+
+
+def test_ctrl_c_in_training_from_python_is_the_error_that_it_promises(tmp_path, monkeypatch):
+    step = Lang3DXLTrainer.train_iteration
+
+    def stopped(self, number):
+        if number == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, number)
+
+    monkeypatch.setattr(Lang3DXLTrainer, "train_iteration", stopped)
+    data = write_scene(tmp_path / "scene", photos=4, points=60)
+    with pytest.raises(UserError, match="training was stopped; to resume"):
+        train_scene(data, tmp_path / "out", iterations=6, clip="none", dense="none")
+
+
+def test_a_relative_cache_is_found_from_any_folder(train, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    data = write_scene(tmp_path / "scene", photos=4, points=60)
+    run = train(
+        data, 1, semantics=False, pipeline__datamanager__cache_dir=tmp_path.relative_to(tmp_path) / "c"
+    )
+    assert read_config(run.base_dir / "config.yml").pipeline.datamanager.cache_dir == tmp_path / "c"
+
+
+def test_a_checkpoint_has_no_rendering_in_it(train, tmp_path):
+    data = write_scene(tmp_path / "scene", photos=4, points=60)
+    (path,) = train(data, 1, semantics=False).checkpoint_dir.glob("*.ckpt")
+    assert "rendered" not in torch.load(path, weights_only=True)["run"]["strategy"]
+
+
+@pytest.mark.parametrize("name", ["until", "start", "end"])
+def test_schedules_out_of_range_are_told(train, tmp_path, name):
+    data = write_scene(tmp_path / "scene", photos=4, points=60)
+    config = deepcopy(lang3dxl.config)
+    config.data, config.output_dir = data, tmp_path
+    setattr(config.optimizers["means"]["scheduler"], name, 0.0)
+    with pytest.raises(UserError, match=rf"--optimizers\.means\.scheduler\.{name} is 0"):
+        config.set_timestamp()
