@@ -110,7 +110,7 @@ def _state(photo: Photo) -> bool | str:
     assert photo.mask_path is not None
     try:
         with open_picture(photo.mask_path) as image:
-            return gray_values(image).getextrema()[1] >= 128
+            return max(gray_values(image).tobytes()) >= 128
     except (OSError, NoPictureError) as error:
         return f"{photo.mask_path} ({error})"
 

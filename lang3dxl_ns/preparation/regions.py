@@ -100,7 +100,8 @@ class MaskRegions:
     the masks, the network's identity among them. Processes get a source before its network is loaded."""
 
     def __init__(self, load: Callable[[torch.device], FindMasks], **made_with: Any) -> None:
-        self._load, self._masks = load, None
+        self._load = load
+        self._masks: FindMasks | None = None
         self._made_with = {**made_with, "level": "small", "rule": _RULE}
 
     def settings(self, photo: Photo) -> dict[str, Any]:
@@ -111,7 +112,8 @@ class MaskRegions:
         """Label `image` by the network's masks, at the size of a stored label map."""
         small = (_shrunk(image, _SAM_SIDE) * 255).round().to(torch.uint8)
         size = label_size(*small.shape[:2])
-        self._masks = self._masks or self._load(image.device)
+        if self._masks is None:
+            self._masks = self._load(image.device)
         masks = [resize_nearest(mask, size) for mask in self._masks(small)]
         return label_map(torch.stack(masks)) if masks else torch.full(size, -1)
 

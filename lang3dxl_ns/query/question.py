@@ -51,7 +51,7 @@ class QueryConfig:
     """How prompts become vectors: synonyms, their combination, and negatives."""
     temperature: float = TEMPERATURE
     """Softmax temperature of the relevancy, for an encoder whose cosines spread like the built-in CLIP's;
-    cosines of other encoders are scaled. It changes neither the ranking of Gaussians nor what matches."""
+    cosines of other encoders are scaled. It does not change the ranking of Gaussians."""
     threshold: float | None = None
     """Relevancy above which Gaussians match. Default: set by what stands out in the scene, at most 0.5."""
     min_alpha: float = 0.3
