@@ -125,7 +125,9 @@ def common_words() -> tuple[str, ...]:
     """Return the words that a scene file can search for without its CLIP: the shipped vocabulary, also as it
     is searched for, its single words in the plural too, and the phrases that every query needs."""
     words = shipped_vocabulary()
-    plurals = [_plural(word) for word in words if " " not in word]
+    # A word whose singular is listed as well is a plural itself.
+    alone = [word for word in words if " " not in word and len({*singulars(word)} & {*words}) == 1]
+    plurals = [_plural(word) for word in alone]
     needed = [*NEGATIVES, *CANONICAL, *UNRELATED]
     return tuple(dict.fromkeys([*needed, *words, *map(searched, words), *plurals]))
 

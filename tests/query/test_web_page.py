@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 import threading
 from contextlib import contextmanager
@@ -28,9 +29,10 @@ from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.doubt import LEAST_PEAK, peaks
 from lang3dxl_ns.query.question import QueryConfig
+from lang3dxl_ns.query.scene import NO_SEMANTICS
 from lang3dxl_ns.query.scene_file import Provenance
 from lang3dxl_ns.query.teach import TaughtWord
-from lang3dxl_ns.query.vocabulary import shipped_vocabulary, whole_words
+from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary, whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -189,13 +191,22 @@ def desk(browser, address):
 @pytest.fixture
 def page(desk):
     """The page, without prompts and at the overview."""
-    desk.keyboard.press("Escape")
+    desk.locator("#frame").press("Escape")
     desk.evaluate("document.getElementById('near').replaceChildren()")
     desk.emulate_media(reduced_motion="reduce")  # no second of flight
     desk.get_by_role("button", name="Overview").click()
     rest(desk)
     desk.emulate_media(reduced_motion="no-preference")
     return desk
+
+
+PRESS = """((key, held = {}) => document.getElementById("frame").dispatchEvent(
+  new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true, ...held })))"""
+"""A key pressed on the picture; false if the page took it."""
+
+
+def prompts_of(page) -> list[str]:
+    return page.locator("#prompts strong").all_inner_texts()
 
 
 def rest(page) -> None:
@@ -452,6 +463,152 @@ def test_at_the_width_of_a_phone_everything_is_in_reach(browser, address):
     page.close()
 
 
+@pytest.mark.slow
+def test_a_phone_opens_at_the_search_box_and_scrolls_to_what_is_asked(browser, address):
+    page = opened(browser, address + "#ask=dome&ask=windows&ask=wall", PHONE)
+    page.get_by_text("wall", exact=True).wait_for()
+    scrolled = "document.getElementById('panel').scrollTop"
+    assert page.evaluate(scrolled) == 0
+    page.evaluate("lang3dxl.ask('wall')")
+    assert page.evaluate(scrolled) > 0
+    page.close()
+
+
+@pytest.mark.slow
+def test_escape_in_an_input_keeps_prompts_and_elsewhere_drops_the_running_answer_too(page):
+    page.evaluate("lang3dxl.ask('dome')")
+    page.get_by_role("combobox", name="Look for").press("Escape")
+    assert prompts_of(page) == ["dome"]
+    page.evaluate(f"Promise.all([lang3dxl.ask('windows; wall'), {PRESS}('Escape')])")
+    assert prompts_of(page) == [] and "ask=" not in page.url
+
+
+@pytest.mark.slow
+def test_shortcuts_of_the_browser_do_not_steer(page):
+    steered = f"""[{{ ctrlKey: true }}, {{ metaKey: true }}, {{ altKey: true }}, {{}}].map((held) =>
+      !{PRESS}("-", held) || !{PRESS}("ArrowLeft", held))"""
+    assert page.evaluate(steered) == [False, False, False, True]
+
+
+@pytest.mark.slow
+def test_the_same_prompt_asked_twice_at_once_has_one_card(page):
+    page.evaluate("Promise.all(['dome', 'dome', 'windows'].map((text) => lang3dxl.ask(text)))")
+    assert prompts_of(page) == ["dome", "windows"]
+    colors = (
+        "[...document.querySelectorAll('#prompts li')].map((card) => card.style.getPropertyValue('--color'))"
+    )
+    assert len(set(page.evaluate(colors))) == 2
+
+
+@pytest.mark.slow
+def test_of_two_addresses_the_later_one_is_shown(page):
+    page.evaluate("location.hash = 'ask=windows&ask=wall&ask=belfry&not=sky'")
+    page.evaluate("location.hash = 'ask=dome'")
+    page.wait_for_timeout(1500)
+    assert prompts_of(page) == ["dome"] and "ask=%22dome%22" in page.url and "wall" not in page.url
+
+
+@pytest.mark.slow
+def test_an_unknown_word_in_but_not_is_replaced_by_the_one_chosen(page):
+    page.evaluate("lang3dxl.ask('windows')")
+    page.evaluate("document.getElementById('more').open = true")
+    common = page.get_by_role("textbox", name="But not")
+    common.fill("sky, belfrey")
+    page.locator("#near button").first.wait_for()
+    page.evaluate("lang3dxl.ask('dome')")
+    assert prompts_of(page) == ["windows"]
+    page.locator("#near").get_by_role("button", name="belfry", exact=True).click()
+    page.locator("#prompts strong", has_text="dome").wait_for()
+    assert common.input_value() == "sky, belfry" and page.locator("#near").inner_text() == ""
+    page.evaluate("document.getElementById('not').value = ''")
+    page.evaluate("""lang3dxl.ask('"dome" not "belfrey"')""")
+    page.locator("#near").get_by_role("button", name="belfry", exact=True).click()
+    page.get_by_text("dome not belfry").wait_for()
+
+
+@pytest.mark.slow
+def test_a_new_example_takes_a_number_that_is_free(page, scene):
+    camera = scene.overview.full_camera
+    x, y, z = camera.intrinsics.numpy() @ camera.view_matrix[:3].numpy() @ [1.5, 1.5, 0, 1]
+    corner = page.locator("#frame canvas").bounding_box()
+    names = page.get_by_role("textbox", name="Name")
+
+    def like_the_dome():
+        page.mouse.click(corner["x"] + SIDE * x / z / camera.width, corner["y"] + SIDE * y / z / camera.width)
+        page.get_by_role("button", name="Like this", exact=True).click()
+        page.get_by_text("1 example:").wait_for()
+        page.get_by_role("button", name="Done").click()
+        return [one.input_value() for one in names.all()]
+
+    assert like_the_dome() == ["like this 1"] and like_the_dome() == ["like this 1", "like this 2"]
+    page.get_by_role("button", name="Remove like this 1").click()
+    assert like_the_dome() == ["like this 2", "like this 3"]
+
+
+@pytest.mark.slow
+def test_the_legend_of_a_still_picture_is_light_on_dark(page):
+    page.evaluate("lang3dxl.ask('dome')")
+    rest(page)
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Still picture").click()
+    still = np.asarray(Image.open(saved.value.path()))
+    legend = still[SIDE:]
+    assert still.shape[2] == 3 or (still[..., 3] == 255).all()
+    assert len(legend) > 10 and (legend[-1, :, :3] < 64).all() and legend[..., :3].max() > 200
+
+
+@pytest.mark.slow
+def test_a_lost_picture_comes_back(page):
+    page.evaluate("lang3dxl.ask('dome')")
+    before = picture(page)
+    page.evaluate("""async () => {
+      window.loss = lang3dxl.view.renderer.getContext().getExtension("WEBGL_lose_context");
+      lang3dxl.view.wake();
+      await new Promise(requestAnimationFrame);
+      loss.loseContext();
+      lang3dxl.view.wake();
+    }""")
+    page.wait_for_timeout(500)
+    page.evaluate("loss.restoreContext()")
+    assert np.abs(picture(page) - before).max() <= 2
+
+
+@pytest.mark.slow
+def test_without_webgl_it_says_what_helps(browser, address):
+    page = browser.new_page()
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.goto(address)
+    page.evaluate("lang3dxl.ready.catch(() => true)")
+    assert "hardware acceleration" in page.locator("#status").inner_text()
+    page.close()
+
+
+@pytest.mark.slow
+def test_colors_alone_cant_be_typed_to(browser, tmp_path):
+    write_page(Page(painted_scene(decoder=None, codes=None)), tmp_path)
+    with served(tmp_path) as address:
+        page = opened(browser, address + "#ask=dome&like=it~1", DESK)
+        assert page.get_by_role("combobox", name="Look for").is_disabled()
+        assert page.get_by_role("button", name="Ask").is_disabled() and prompts_of(page) == []
+        assert "colors alone" in page.locator("#status").inner_text() and page.complaints == []
+        page.close()
+
+
+@pytest.mark.slow
+def test_an_over_long_phrase_is_cut_before_it_is_sent(browser, address):
+    page = browser.new_page()
+    page.goto(address + "LICENSES.txt")
+    sent = page.evaluate("""async () => {
+      const { Vocabulary } = await import("/vocabulary.js"), sent = [];
+      const described = { words: [], negatives: [], taught: {}, special: {} };
+      window.fetch = async (address) => (sent.push(address), { ok: true, json: async () => ({}) });
+      await new Vocabulary(described, new ArrayBuffer(0), 3, true).phrase("𝒙".repeat(5000));
+      return decodeURIComponent(sent[0]);
+    }""")
+    assert sent == "api/encode?text=" + 2000 * "𝒙"
+    page.close()
+
+
 def test_a_page_of_other_people_is_not_replaced(scene, tmp_path):
     for name in ("index.html", "scene.json", "page.css", "views.bin", "look0.bin", "vocabulary.json"):
         folder = tmp_path / name.partition(".")[0]
@@ -570,6 +727,8 @@ def test_a_decoder_too_wide_for_a_page_is_refused_in_a_sentence(monkeypatch, sce
 def test_colors_alone_make_a_page_that_cant_be_asked(scene):
     bare = painted_scene(decoder=None, codes=None)
     assert json.loads(Page(bare).files()["scene.json"])["words"] is None
+    with pytest.raises(UserError, match=re.escape(NO_SEMANTICS)):
+        Page(bare, ["dome"])
 
 
 def test_broken_gaussians_keep_their_rows(scene):
@@ -594,6 +753,12 @@ def test_the_words_of_a_tokenizer_are_whole_and_plain(tmp_path):
     unigram = [["▁tower", -1.0], ["tower", -2.0], ["▁to", -3.0], ["▁Tow", -1.0]]
     (tmp_path / "tokenizer.json").write_text(json.dumps({"model": {"vocab": unigram}}))
     assert whole_words(tmp_path) == ("tower",)
+
+
+def test_plurals_have_no_plural():
+    words = {*common_words()}
+    assert {"windows", "arches", "columns", "domes", "buses"} <= words
+    assert not {"windowses", "archeses", "columnses", "pillarses"} & words
 
 
 def test_a_vocabulary_of_ones_own_is_offered_and_named(tmp_path):

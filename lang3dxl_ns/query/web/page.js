@@ -4,10 +4,10 @@ import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
 const MOST_KEPT = 20, TYPING = 500; // most earlier prompts or named words; milliseconds until negatives take effect
-const UNNAMED = /^like this \d+$/;
+const UNNAMED = /^like this (\d+)$/;
 const $ = (id) => document.getElementById(id);
 const prompts = [];
-let about, view, latest = null, read = "", settled = false; // settled: the address has been read
+let about, view, latest = null, read = "", settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
 
 // ── the worker ──
 
@@ -42,6 +42,16 @@ async function answer(prompt) {
   return Object.assign(prompt, found, { views: null, box: null, finding: null });
 }
 
+/** Answer all prompts anew, once the common negatives have changed. */
+async function answerAll() {
+  $("near").replaceChildren();
+  for (const prompt of prompts) {
+    const found = await answer(prompt);
+    if (!found.known) offerClosest(found, prompt);
+  }
+  draw();
+}
+
 /** Find the views that show prompts best, once their heat is drawn. */
 function findPlaces() {
   for (const prompt of prompts.filter((one) => one.relevancy && !one.finding)) {
@@ -55,30 +65,45 @@ function findPlaces() {
   }
 }
 
-/** Ask prompts as if typed, separated by `;`. Resolves to the answer to the last one. */
-async function ask(typed) {
+/** Remove all prompts, and drop the answers that are still awaited. */
+function clear() {
+  prompts.length = 0;
+  return ++cleared;
+}
+
+/** Ask prompts as if typed, separated by `;`. Resolves to the answer to the last one. turn: what `clear` returned last. */
+async function ask(typed, turn = cleared) {
   await reading;
   $("near").replaceChildren();
   let found = null;
   for (const { text, negatives } of about.words ? parsePrompts(String(typed)) : []) {
     const word = namedWord(text) ?? { text };
-    const old = prompts.find((prompt) => prompt.text === word.text && String(prompt.negatives) === String(negatives));
-    const prompt = old ?? { negatives, color: unusedColor(), ...word };
+    const same = () => prompts.find((prompt) => prompt.text === word.text && String(prompt.negatives) === String(negatives));
+    const old = same(), prompt = old ?? { negatives, ...word };
     found = await answer(prompt);
+    if (turn !== cleared) break;
     if (!found.known) {
-      offerClosest(found);
+      offerClosest(found, { text, negatives });
       continue;
     }
-    if (!old) prompts.push(prompt);
+    const card = old ?? same() ?? prompt; // the same prompt may have been answered in the meantime
+    if (!card.color) prompts.push(Object.assign(card, { color: unusedColor() }));
     remember(text);
-    draw(prompt);
+    draw(settled ? card : null);
   }
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
 }
 
-function offerClosest({ unknown, closest }) {
-  const words = closest.map((word) => element("button", { className: "small", onclick: () => attempt(() => ask(word)) }, word));
+/** Offer the words closest to an unknown one; a click puts a word in its place, in the prompt and in "But not". */
+function offerClosest({ unknown, closest }, { text, negatives }) {
+  async function mend(word) {
+    const mended = (one) => (one === unknown ? word : one), common = commonNegatives();
+    $("not").value = common.map(mended).join(", ");
+    if (common.includes(unknown)) await answerAll();
+    return ask(asTyped({ text: mended(text), negatives: negatives.map(mended) }));
+  }
+  const words = closest.map((word) => element("button", { className: "small", onclick: () => attempt(() => mend(word)) }, word));
   $("near").replaceChildren(`This page doesn't know “${shown(unknown)}”: it answers ${about.known.toLocaleString("en")} words by itself. `,
     words.length ? "Closest: " : "", ...words); // prettier-ignore
 }
@@ -178,7 +203,7 @@ async function tell({ x, y, without }) {
 
 /** Highlight what looks like the place clicked last; further clicks add examples. */
 function likeThis() {
-  const number = prompts.filter((prompt) => prompt.examples).length + 1;
+  const number = 1 + Math.max(0, ...prompts.map((prompt) => Number(UNNAMED.exec(prompt.text)?.[1] ?? 0)));
   const prompt = { text: `like this ${number}`, negatives: [], examples: [], color: unusedColor() };
   prompts.push(prompt);
   teach(prompt, true);
@@ -245,18 +270,23 @@ function writeAddress() {
   history.replaceState(null, "", read);
 }
 
-async function readAddress() {
+async function readAddress(turn = clear()) {
   const fields = new URLSearchParams(location.hash.slice(1));
   if (fields.has("view")) view.address = fields.get("view");
   $("not").value = fields.get("not") ?? "";
-  [prompts.length, settled] = [0, false];
+  settled = false;
+  const likes = about.words ? fields.getAll("like") : [];
   try {
-    for (const typed of fields.getAll("ask").slice(0, 20)) await ask(typed);
-    for (const like of about.words ? fields.getAll("like").slice(0, 20) : []) await readExamples(like);
+    for (const typed of fields.getAll("ask").slice(0, 20)) if (turn === cleared) await ask(typed, turn);
+    for (const like of likes.slice(0, 20)) if (turn === cleared) await readExamples(like);
   } finally {
-    settled = true;
-    draw();
+    if (turn === cleared) settle();
   }
+}
+
+function settle() {
+  settled = true;
+  draw();
 }
 
 async function readExamples(like) {
@@ -304,16 +334,10 @@ function listen() {
     $("word").value = "";
     if (tidy(typed)) attempt(() => ask(typed));
   });
-  for (const kind of ["input", "focus"]) $("word").addEventListener(kind, () => about.words && reading.then(offer));
+  for (const kind of ["input", "focus"]) $("word").addEventListener(kind, () => reading.then(offer));
   $("not").addEventListener("input", () => {
     clearTimeout(typing);
-    typing = setTimeout(() => attempt(async () => {
-      for (const prompt of prompts) {
-        const found = await answer(prompt);
-        if (!found.known) offerClosest(found);
-      }
-      draw();
-    }), TYPING); // prettier-ignore
+    typing = setTimeout(() => attempt(answerAll), TYPING);
   });
   $("boxed").addEventListener("change", drawBoxes);
   $("overview").addEventListener("click", () => view.overview());
@@ -327,22 +351,22 @@ function listen() {
     clearTimeout(moving);
     moving = setTimeout(writeAddress, 300);
   });
-  addEventListener("hashchange", () => location.hash !== read && attempt(readAddress));
   addEventListener("keydown", (event) => {
-    if (event.key === "/" && !event.target.matches("input")) {
+    if (event.target.matches("input, select")) return; // Escape empties a search box, or closes its list
+    if (event.key === "/") {
       event.preventDefault();
       $("word").focus();
     }
     if (event.key === "Escape") {
-      prompts.length = 0;
+      clear();
       $("here").hidden = true;
-      draw();
+      settle();
     }
   });
 }
 
 async function saveStill() {
-  const lines = prompts.map((prompt) => [prompt.text, `rgb(${prompt.color})`]);
+  const lines = prompts.map((prompt) => [shown(prompt.text), `rgb(${prompt.color})`]);
   const link = element("a", { download: "scene.png", href: URL.createObjectURL(await view.picture(lines)) });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
@@ -375,6 +399,7 @@ async function open() {
   $("credit").textContent = [about.credit, about.license, about.made, ...about.left_out].filter(Boolean).join("\n");
   $("lighting").hidden = !Object.keys(about.looks).length;
   $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
+  for (const control of [...$("ask").elements, $("not")]) control.disabled = !about.words;
   const splats = await (await fetched("splats.bin")).arrayBuffer();
   view = new View(about, $("frame"));
   await view.show(splats);
@@ -392,16 +417,17 @@ async function readMeaning(splats) {
 
 /** Show the prompts in the address, or else those that the page opens with. */
 async function begin() {
-  if (location.hash.length > 1) await readAddress();
-  else for (const [text, ...negatives] of about.prompts) await ask(asTyped({ text, negatives }));
-  settled = true;
-  writeAddress();
+  const turn = cleared;
+  addEventListener("hashchange", () => location.hash !== read && attempt(() => readAddress()));
+  if (location.hash.length > 1) return readAddress(turn);
+  for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
+  if (turn === cleared) settle();
 }
 
 const drawing = open(), reading = drawing.then(readMeaning);
 window.lang3dxl = {
   ready: reading.then(begin),
-  ask,
+  ask: (typed) => ask(typed),
   whatIs,
   get view() {
     return view;
@@ -410,4 +436,4 @@ window.lang3dxl = {
     return about.seconds;
   },
 };
-window.lang3dxl.ready.catch((error) => location.protocol !== "file:" && say(error.message));
+window.lang3dxl.ready.catch((error) => "told" in $("status").dataset || say(error.message)); // start.js may have said why

@@ -73,6 +73,11 @@ export class View extends EventTarget {
       for (let k = 0; k < 3; k++) this.bytes[16 * i + k] = this.plain[4 * i + k] * (1 - share) + (chosen?.color[k] ?? 0) * share;
       this.bytes[16 * i + 3] = this.plain[4 * i + 3];
     }
+    this.upload();
+  }
+
+  upload() {
+    if (!this.splats) return;
     this.packed.needsUpdate = true;
     this.splats.updateVersion();
     this.wake();
@@ -157,6 +162,7 @@ export class View extends EventTarget {
 
   step(now) {
     this.asked = false;
+    if (this.lost) return; // until the browser restores the context
     if (!this.splats || !this.drawn()) return this.splats && this.request();
     if (this.flight) this.advance(now);
     this.controls.update();
@@ -165,6 +171,11 @@ export class View extends EventTarget {
       this.dispatchEvent(new Event("moved"));
     } else if (!this.sharp && !this.held && now - this.moved > Math.max(STILL, this.cost / 4)) this.draw(1);
     if (!this.resting) this.request();
+  }
+
+  /** Whether the browser has taken the picture's WebGL context away. */
+  get lost() {
+    return this.renderer.getContext().isContextLost();
   }
 
   /** Return whether the last frame has been drawn. Its time determines how many pixels a fluent frame may have. */
@@ -183,6 +194,7 @@ export class View extends EventTarget {
 
   /** Draw with this share of the screen's pixels along each side. */
   draw(share) {
+    if (this.lost) return;
     const gl = this.renderer.getContext(), ratio = share * Math.min(devicePixelRatio, 2), start = performance.now();
     if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
     this.renderer.render(this.scene, this.camera);
@@ -236,11 +248,14 @@ export class View extends EventTarget {
       const [x, y] = [event.clientX - corner.left, event.clientY - corner.top];
       this.dispatchEvent(new CustomEvent("click", { detail: { x, y, without: event.altKey } }));
     });
+    this.canvas.addEventListener("webglcontextlost", () => (this.drawing = null));
+    this.canvas.addEventListener("webglcontextrestored", () => this.upload());
     this.frame.addEventListener("keydown", (event) => this.steer(event));
   }
 
   /** Steer by keys: arrows turn, + and − go closer and away, Home shows the overview. */
   steer(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return; // a shortcut of the browser
     const turns = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
     const zoom = { "+": 0.9, "=": 0.9, "-": 1.1 }[event.key], { target } = this.controls;
     if (event.key === "Home") this.overview();
@@ -263,6 +278,8 @@ export class View extends EventTarget {
     const canvas = document.createElement("canvas"), size = Math.max(this.canvas.width / 48, 14);
     [canvas.width, canvas.height] = [this.canvas.width, this.canvas.height + lines.length * 1.6 * size];
     const pen = canvas.getContext("2d");
+    pen.fillStyle = getComputedStyle(this.frame).getPropertyValue("--panel");
+    pen.fillRect(0, 0, canvas.width, canvas.height);
     pen.drawImage(this.canvas, 0, 0);
     pen.font = `${size}px system-ui, sans-serif`;
     lines.forEach(([text, color], k) => {
@@ -270,7 +287,7 @@ export class View extends EventTarget {
       pen.fillStyle = color;
       pen.fillRect(size / 2, top, size, size);
       pen.fillStyle = "#fff";
-      pen.fillText(text, 2 * size, top + 0.85 * size);
+      pen.fillText(text, 2 * size, top + 0.85 * size, canvas.width - 2.5 * size);
     });
     return new Promise((done) => canvas.toBlob(done, "image/png"));
   }

@@ -1,6 +1,8 @@
 // Words that this scene knows, in its own numbers, and phrases that a live server encodes.
 import { floats } from "./decode.js";
 
+const MOST_TEXT = 2000; // most characters of a phrase
+
 export const tidy = (text) => text.replace(/["\0]/g, " ").split(/\s+/).filter(Boolean).join(" ");
 
 /** Parse prompts separated by `;`, each with optional negatives: `"windows" not "doors"; dome`. */
@@ -37,7 +39,7 @@ export class Vocabulary {
 
   /** Look up any phrase in the same way; null if this page doesn't know it. */
   async phrase(text) {
-    const plain = tidy(text), known = this.index.get(plain.toLowerCase());
+    const plain = [...tidy(text)].slice(0, MOST_TEXT).join(""), known = this.index.get(plain.toLowerCase());
     if (!this.live || this.taught[known]) return known === undefined ? null : this.word(known);
     if (!this.encoded.has(plain)) {
       const answer = await fetch(`api/encode?text=${encodeURIComponent(plain)}`);

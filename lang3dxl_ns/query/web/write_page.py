@@ -76,7 +76,8 @@ class Page:
     """Sentences about what the files leave out because of its size."""
 
     def __post_init__(self) -> None:
-        """Parse prompts, and pack what Gaussians mean. Raises UserError if that is too large for a page."""
+        """Parse prompts, and pack what Gaussians mean. Raises UserError if that is too large for a page, or
+        if a scene with colors alone is asked for texts."""
         scene, within = self.scene, self.scene.config.foreground
         self.prompts = scene.prompts(list(self.texts)) if self.texts else []
         self._foreground = scene.prompts(within) if within else []
@@ -85,6 +86,8 @@ class Page:
         self._meaning: PackedMeaning | None = None
         if scene.decoder is not None and scene.codes is not None:
             self._meaning = pack_meaning(scene.decoder, scene.codes)
+        elif self.texts:
+            raise UserError(NO_SEMANTICS)
 
     def files(self) -> dict[str, bytes]:
         """Build the content of every file, by name."""
