@@ -180,9 +180,9 @@ def test_a_read_only_folder_says_how_to_keep_the_targets_elsewhere(tmp_path, mon
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(UserError, match="--cache-dir DIR"):
+    with pytest.raises(UserError, match="cache-dir DIR"):
         FeatureStore(tmp_path / "store").make_folder()
-    with pytest.raises(UserError, match="--cache-dir DIR"):
+    with pytest.raises(UserError, match="cache-dir DIR"):
         FeatureStore(tmp_path / "store").write("clip", "a.jpg", {"x": torch.ones(1)}, {})
 
 
